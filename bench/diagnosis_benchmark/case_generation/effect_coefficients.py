@@ -8,6 +8,7 @@ from strength to coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +36,45 @@ SIGNED_EFFECTS += ("clock.skew", "spring.cubic", "restitution.speed")
 MAX_STRENGTH = 2.0  # maximum strength: twice the plausible range
 
 
+class BaseMotion:
+    """Scales of the motion without hidden causes, from which shapes are drawn.
+
+    Args:
+        setting: recording conditions.
+    """
+
+    def __init__(self, setting: RecordingConditions) -> None:
+        """Keep the conditions; the motion is simulated when a scale of it is needed."""
+        self.setting, self.system = setting, setting.system
+        self.rate, self.seconds, self.scenarios = setting.rate, setting.seconds, setting.scenarios
+
+    @cached_property
+    def peak(self) -> float:
+        """Largest absolute value of the input."""
+        return float(max(np.abs(s.inputs["u"]).max() for s in self.scenarios))
+
+    @cached_property
+    def paths(self) -> Array:
+        """Noise-free motion: the first channel of every run, (R, T)."""
+        return simulate_observations(self.setting, {})[:, :, 0]
+
+    @property
+    def path(self) -> Array:
+        """Positions of all runs, (R T,)."""
+        return np.concatenate(self.paths)
+
+    @property
+    def travel(self) -> float:
+        """Median travel of a run."""
+        return float(np.median([np.ptp(path) for path in self.paths]))
+
+    @property
+    def speed(self) -> float:
+        """Median absolute speed, by finite differences."""
+        speeds = np.concatenate([np.diff(path) for path in self.paths]) * self.rate
+        return float(np.median(np.abs(speeds)))
+
+
 def draw_effect_shape(
     name: str, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
@@ -56,7 +96,7 @@ def draw_effect_shape(
         abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind)
     )
     if name in SHAPE_SAMPLERS:
-        return SHAPE_SAMPLERS[name](coefficient_scale, setting, rng)
+        return SHAPE_SAMPLERS[name](coefficient_scale, BaseMotion(setting), rng)
     sign = float(rng.choice([-1, 1])) if name in SIGNED_EFFECTS else 1.0
     return lambda s: (sign * coefficient_scale * s,)
 
@@ -70,9 +110,9 @@ def get_max_strength(name: str) -> float:
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, MAX_STRENGTH)
 
 
-def _draw_direction(
+def draw_direction(
     coefficient_scale: float,
-    setting: RecordingConditions,
+    motion: BaseMotion,
     rng: np.random.Generator,
     *further_coefficients: float,
 ) -> CoefficientFunction:
@@ -80,7 +120,7 @@ def _draw_direction(
 
     Args:
         coefficient_scale: magnitude at strength 1.
-        setting: recording conditions; unused here.
+        motion: motion without hidden causes; unused here.
         rng: random generator.
         *further_coefficients: coefficients that do not depend on the strength, such as a
             period.
@@ -98,26 +138,26 @@ def _draw_direction(
 
 
 def _draw_horizontal_direction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a horizontal direction: along x, and along y if the system has it.
 
     Args:
         coefficient_scale: magnitude at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to the components along x and y, or along x alone.
     """
-    if setting.system == "ball":
-        return _draw_direction(coefficient_scale, setting, rng)
+    if motion.system == "ball":
+        return draw_direction(coefficient_scale, motion, rng)
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * coefficient_scale * s,)
 
 
 def _draw_ripple(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a ripple whose period the motion passes several times.
 
@@ -126,19 +166,19 @@ def _draw_ripple(
 
     Args:
         coefficient_scale: amplitude at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to sine amplitude, cosine amplitude and period.
     """
-    travel = np.median(_compute_travel_ranges(setting))
-    period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
-    return _draw_direction(coefficient_scale, setting, rng, float(period))
+    travel = motion.travel
+    period = min(travel / rng.uniform(2.0, 8.0), 1.0 if motion.system == "slider" else 6.28)
+    return draw_direction(coefficient_scale, motion, rng, float(period))
 
 
 def _draw_periodic_force(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a periodic force with at least 1.5 periods in a run.
 
@@ -146,20 +186,20 @@ def _draw_periodic_force(
 
     Args:
         coefficient_scale: amplitude at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to sine amplitude, cosine amplitude and frequency.
     """
-    low, high = 1.5 / setting.seconds, 4.0
-    return _draw_direction(
-        coefficient_scale, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    low, high = 1.5 / motion.seconds, 4.0
+    return draw_direction(
+        coefficient_scale, motion, rng, float(np.exp(rng.uniform(np.log(low), np.log(high))))
     )
 
 
 def _draw_wind(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw quadratic drag in moving air: the air velocity is fixed, the drag grows with s.
 
@@ -168,13 +208,13 @@ def _draw_wind(
 
     Args:
         coefficient_scale: drag coefficient at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength s to the drag coefficient and the air velocity, m/s.
     """
-    if setting.system == "slider":
+    if motion.system == "slider":
         speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
         return lambda s: (coefficient_scale * s, speed)
     speed, angle = rng.uniform(2.0, 8.0), rng.uniform(0, 2 * np.pi)
@@ -186,7 +226,7 @@ def _draw_wind(
 
 
 def _draw_stribeck(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw Stribeck friction with a large static part, at speeds that often occur in the motion.
 
@@ -195,20 +235,20 @@ def _draw_stribeck(
 
     Args:
         coefficient_scale: Coulomb friction at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
         speed.
     """
-    extra, median_speed = rng.uniform(2.0, 6.0), np.median(np.abs(_compute_speeds(setting)))
+    extra, median_speed = rng.uniform(2.0, 6.0), motion.speed
     speed = float(np.clip(median_speed * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (coefficient_scale * s, extra * coefficient_scale * s, speed)
 
 
 def _draw_saturation(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return an input limit: at strength 0 the peak of the input, at strength 1 zero.
 
@@ -216,24 +256,24 @@ def _draw_saturation(
 
     Args:
         coefficient_scale: unused here.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to the limit.
     """
-    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    peak = motion.peak
     return lambda s: (float(peak * (1 - s)),)
 
 
 def _draw_direction_dependent_friction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction that is several times larger in one direction.
 
     Args:
         coefficient_scale: coefficient of the larger direction at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
@@ -245,7 +285,7 @@ def _draw_direction_dependent_friction(
 
 
 def _draw_power_law(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a power law of the input that keeps the peak of the input unchanged.
 
@@ -253,35 +293,35 @@ def _draw_power_law(
 
     Args:
         coefficient_scale: unused here.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to gain and power.
     """
-    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    peak = motion.peak
     return lambda s: (float(peak**-s - 1), s)
 
 
 def _draw_rate_limit(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength.
 
     Args:
         coefficient_scale: unused here.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to the maximum rate of the input.
     """
-    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    peak = motion.peak
     return lambda s: (float(peak / (0.8 * s)),)
 
 
 def _draw_quadratic_friction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction whose quadratic part exceeds the linear one at the peak force.
 
@@ -289,19 +329,19 @@ def _draw_quadratic_friction(
 
     Args:
         coefficient_scale: linear coefficient at strength 2.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to the linear and the quadratic coefficient.
     """
-    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    peak = motion.peak
     square = float(coefficient_scale * rng.uniform(2.0, 6.0) / peak)
     return lambda s: (0.5 * coefficient_scale * s, square * s)
 
 
 def _draw_position_friction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw position-dependent friction whose period the motion passes one to four times.
 
@@ -309,14 +349,14 @@ def _draw_position_friction(
 
     Args:
         coefficient_scale: friction at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to constant part, sine and cosine amplitude, and period.
     """
-    travel = float(np.median(_compute_travel_ranges(setting)))
-    low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
+    travel = motion.travel
+    low, high = (0.2, 5.0) if motion.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
     sine, cosine = (
@@ -327,7 +367,7 @@ def _draw_position_friction(
 
 
 def _draw_warm_up_friction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous.
 
@@ -335,21 +375,19 @@ def _draw_warm_up_friction(
 
     Args:
         coefficient_scale: Coulomb friction at the begin, at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to Coulomb friction, viscous friction and time constant.
     """
-    time = float(setting.seconds * rng.uniform(0.2, 0.8))
-    viscous = float(
-        coefficient_scale * rng.uniform(0.0, 1.0) / np.median(np.abs(_compute_speeds(setting)))
-    )
+    time = float(motion.seconds * rng.uniform(0.2, 0.8))
+    viscous = float(coefficient_scale * rng.uniform(0.0, 1.0) / motion.speed)
     return lambda s: (coefficient_scale * s, viscous * s, max(time, 0.5))
 
 
 def _draw_sensor_slip(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a sensor slip at a time well within each run.
 
@@ -357,18 +395,18 @@ def _draw_sensor_slip(
 
     Args:
         coefficient_scale: shift at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to shift and time, s.
     """
-    sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
+    sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * motion.seconds)
     return lambda s: (sign * coefficient_scale * s, instant)
 
 
 def _draw_flexible_load(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate.
 
@@ -376,37 +414,37 @@ def _draw_flexible_load(
 
     Args:
         coefficient_scale: share of the load at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to share of the load, frequency in rad/s, and damping ratio.
     """
-    low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
+    low, high = 2 * np.pi * 4 / motion.seconds, 2 * np.pi * min(0.2 * motion.rate, 40.0)
     frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
     return lambda s: (min(coefficient_scale * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
 
 
 def _draw_backlash(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw backlash between drive and load: at strength 1 the gap is 0.3 of the travel.
 
     Args:
         coefficient_scale: unused here.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to gap and share of the load.
     """
-    share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_compute_travel_ranges(setting)))
+    share, travel = float(rng.uniform(0.2, 0.8)), motion.travel
     return lambda s: (0.3 * travel * s, share)
 
 
 def _draw_hysteresis(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel.
 
@@ -414,25 +452,25 @@ def _draw_hysteresis(
 
     Args:
         coefficient_scale: friction limit at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to friction limit and deflection.
     """
-    travel = float(np.median(_compute_travel_ranges(setting)))
+    travel = motion.travel
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     return lambda s: (coefficient_scale * s, deflection)
 
 
 def _draw_end_stop(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw an end stop near an end of the travel: 5 to 20 % of the samples are beyond it.
 
     Args:
         coefficient_scale: stiffness at strength 1.
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
@@ -442,11 +480,11 @@ def _draw_end_stop(
     side, share_beyond = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     stop_position = float(
         np.quantile(
-            np.concatenate(_simulate_base_motion(setting)),
+            motion.path,
             1 - share_beyond if side > 0 else share_beyond,
         )
     )
-    loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
+    loss = float(rng.uniform(0.0, 0.4)) / (5.0 if motion.system == "pendulum" else 1.0)
     return lambda s: (side * coefficient_scale * s, stop_position, loss)
 
 
@@ -463,30 +501,15 @@ SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
     "friction.warming": _draw_warm_up_friction,
     "input.power": _draw_power_law,
     "input.rate": _draw_rate_limit,
-    "sensor.eccentricity": _draw_direction,
+    "sensor.eccentricity": draw_direction,
     "gravity.tilt": _draw_horizontal_direction,
-    "lift.magnus": _draw_direction,
+    "lift.magnus": draw_direction,
     "force.ripple": _draw_ripple,
     "force.periodic": _draw_periodic_force,
     "wind": _draw_wind,
     "friction.stribeck": _draw_stribeck,
     "input.saturation": _draw_saturation,
 }
-
-
-def _simulate_base_motion(setting: RecordingConditions) -> list[Array]:
-    """Simulate the noise-free motion without hidden causes: the first channel (T,) of every run."""
-    return list(simulate_observations(setting, {})[:, :, 0])
-
-
-def _compute_travel_ranges(setting: RecordingConditions) -> list[float]:
-    """Return the travel of the first channel in each run, without hidden causes."""
-    return [np.ptp(path) for path in _simulate_base_motion(setting)]
-
-
-def _compute_speeds(setting: RecordingConditions) -> Array:
-    """Return the speeds of the first channel at all samples of all runs, by finite differences."""
-    return np.concatenate([np.diff(path) for path in _simulate_base_motion(setting)]) * setting.rate
 
 
 def draw_unmodelled_cause(
@@ -502,98 +525,90 @@ def draw_unmodelled_cause(
     Returns:
         Numbers of the cause as a function of the strength.
     """
-    return UNMODELLED_SAMPLERS[(setting.system == "ball", name)](setting, rng)
+    return UNMODELLED_SAMPLERS[(setting.system == "ball", name)](BaseMotion(setting), rng)
 
 
-def _draw_onsets(
-    setting: RecordingConditions, duration: float, rng: np.random.Generator
-) -> list[float]:
+def _draw_onsets(motion: BaseMotion, duration: float, rng: np.random.Generator) -> list[float]:
     """Draw the time at which a gust begins in each run, s; always `MAX_RUNS` numbers.
 
     The strength is found from the runs for fitting, but the recording has held-out runs too. A
     begin for every possible run serves both.
     """
-    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - duration)) for _ in range(MAX_RUNS)]
+    return [float(rng.uniform(0.1, 0.9) * (motion.seconds - duration)) for _ in range(MAX_RUNS)]
 
 
-def _draw_friction_patch(
-    setting: RecordingConditions, rng: np.random.Generator
-) -> CoefficientFunction:
+def _draw_friction_patch(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide.
 
     Args:
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to friction limit, centre and half width of the region.
     """
-    low, high = np.quantile(np.concatenate(_simulate_base_motion(setting)), [0.1, 0.9])
+    low, high = np.quantile(motion.path, [0.1, 0.9])
     half_width = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half_width, high - half_width))
-    return lambda s: (_get_unit_force(setting) * s, centre, half_width)
+    return lambda s: (_get_unit_force(motion) * s, centre, half_width)
 
 
-def _get_unit_force(setting: RecordingConditions) -> float:
+def _get_unit_force(motion: BaseMotion) -> float:
     """Return the force of an unmodelled cause at strength 1: N m for a pendulum, N for a slider."""
-    return 0.5 if setting.system == "pendulum" else 5.0
+    return 0.5 if motion.system == "pendulum" else 5.0
 
 
-def _draw_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_gust(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a temporary force of 0.1 to 0.3 s in each run, in either direction.
 
     Returns:
         Function from the strength to force, duration (s), and the begin in each run (s).
     """
     duration, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
-    start_times = _draw_onsets(setting, duration, rng)
-    return lambda s: (sign * _get_unit_force(setting) * s, duration, *start_times)
+    start_times = _draw_onsets(motion, duration, rng)
+    return lambda s: (sign * _get_unit_force(motion) * s, duration, *start_times)
 
 
-def _draw_growing_damping(
-    setting: RecordingConditions, rng: np.random.Generator
-) -> CoefficientFunction:
+def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw damping that grows in proportion to time, up to a value at the end of the run.
 
     At strength 1 this value is 0.1 N m s/rad for a pendulum and 5 N s/m for a slider.
     """
-    max_growth = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
+    max_growth = (0.1 if motion.system == "pendulum" else 5.0) / motion.seconds
     return lambda s: (max_growth * s,)
 
 
-def _draw_soft_stop(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_soft_stop(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a soft stop in every other run, which the motion reaches for a short time.
 
     It is a spring beyond a place that 15 to 30 % of the samples pass.
 
     Args:
-        setting: recording conditions.
+        motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
         Function from the strength to stiffness (N m/rad or N/m) and place.
     """
-    place = float(
-        np.quantile(np.concatenate(_simulate_base_motion(setting)), rng.uniform(0.7, 0.85))
-    )
-    max_stiffness = 10.0 if setting.system == "pendulum" else 2000.0
+    place = float(np.quantile(motion.path, rng.uniform(0.7, 0.85)))
+    max_stiffness = 10.0 if motion.system == "pendulum" else 2000.0
     return lambda s: (max_stiffness * s, place)
 
 
-def _draw_updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_updraft(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a region of rising air that the balls pass; at strength 1 it accelerates by 10 m/s^2.
 
     Returns:
         Function from the strength to acceleration (m/s^2), centre and half width of the region (m).
         The centre lies between the 10 % and 90 % quantiles of x over all runs.
     """
-    positions = np.concatenate(_simulate_base_motion(setting))
+    positions = motion.path
     half_width = float(rng.uniform(0.3, 0.8))
     centre = float(rng.uniform(*np.quantile(positions, [0.1, 0.9])))
     return lambda s: (10.0 * s, centre, half_width)
 
 
-def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_ball_gust(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a gust of 0.1 to 0.4 s in each run; at strength 1 it accelerates the ball by 20 m/s^2.
 
     Its direction is drawn in the vertical plane along x.
@@ -603,7 +618,7 @@ def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> C
         (s), and the begin in each run (s).
     """
     duration, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
-    start_times = _draw_onsets(setting, duration, rng)
+    start_times = _draw_onsets(motion, duration, rng)
     return lambda s: (
         20.0 * s * float(np.cos(angle)),
         20.0 * s * float(np.sin(angle)),
@@ -612,17 +627,15 @@ def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> C
     )
 
 
-def _draw_changing_restitution(
-    setting: RecordingConditions, rng: np.random.Generator
-) -> CoefficientFunction:
+def _draw_changing_restitution(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw restitution that changes linearly with time: at strength 1 by all its value in a run."""
     sign = float(rng.choice([-1, 1]))
-    return lambda s: (sign * s / setting.seconds,)
+    return lambda s: (sign * s / motion.seconds,)
 
 
-def _draw_drag_layer(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_drag_layer(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a height above most bounces and below most drops, from which drag acts."""
-    height = float(min(s.initial["z"] for s in setting.scenarios) * rng.uniform(0.55, 0.8))
+    height = float(min(s.initial["z"] for s in motion.scenarios) * rng.uniform(0.55, 0.8))
     return lambda s: (2.0 * s, height)
 
 

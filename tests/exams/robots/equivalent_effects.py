@@ -59,7 +59,8 @@ class CompetingCauses:
         known = planted_effects.effects(machine.name)
         places = planted_effects.places(machine, effect) if effect in known else []
         chosen = [p for p in places if (p if place == "*" else p == place)]
-        draws = SHAPES if effect in planted_effects.SHAPES else 1
+        shaped = {**planted_effects.SHAPES, **planted_effects.SHARED_SHAPES}
+        draws = SHAPES if effect in shaped else 1
         for draw in range(draws if chosen else 0):
             rng = np.random.default_rng(list(" ".join(("rival", name, str(draw))).encode()))
             shapes = {p: planted_effects.shape(effect, p, self.setting, rng)(1.0) for p in chosen}

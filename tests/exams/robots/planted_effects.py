@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.effect_coefficients import (
+    SHAPE_SAMPLERS,
+    draw_direction,
+)
 from bench.diagnosis_benchmark.machine_cases.hidden_causes import MOTION_SCALED_EFFECTS
 
 JOINT = (
@@ -108,6 +112,11 @@ def shape(effect, place, setting, rng):
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
     if effect in SHAPES:
         return SHAPES[effect](place, setting, rng)
+    if effect == "gravity.tilt":
+        return draw_direction(FAR[effect], PlaceMotion(setting, place), rng)
+    if effect in SHARED_SHAPES:
+        scale = SHARED_SHAPES[effect](_at(setting, place))
+        return SHAPE_SAMPLERS[effect](scale, PlaceMotion(setting, place), rng)
     far = FAR[effect] if effect in FAR else SCALES[effect](place, setting)
     return lambda s: (sign * far * float(s),)
 
@@ -138,95 +147,16 @@ SCALES = {
 }
 
 
-def _tilt(place, setting, rng):
-    angle = rng.uniform(0, 2 * np.pi)
-    x, y = FAR["gravity.tilt"] * float(np.cos(angle)), FAR["gravity.tilt"] * float(np.sin(angle))
-    return lambda s: (x * s, y * s)
-
-
 def _offset(place, setting, rng):
     way = rng.normal(size=3)
     way *= FAR["mass.offset"] / np.linalg.norm(way)
     return lambda s: tuple((way * s).tolist())
 
 
-def _saturation(place, setting, rng):
-    """Return limits below the peak of the command: the peak at strength 0, zero at strength 1."""
-    peak = float(np.abs(_command(setting, place)).max())
-    return lambda s: (peak * (1 - s),)
-
-
-def _rate(place, setting, rng):
-    """Return rate limits: a jump over the command's range takes 0 s to 1 s."""
-    range_ = float(np.ptp(_command(setting, place)))
-    return lambda s: (range_ / s,)
-
-
 def _profile(place, setting, rng):
     """Return acceleration limits: a jump over the command's range takes two samples to 1 s."""
     range_, least = float(np.ptp(_command(setting, place))), 2 * setting.fitted[0].times[1]
     return lambda s: (4.0 * range_ / float(least + s) ** 2,)
-
-
-def _power(place, setting, rng):
-    """Return exponents above 1, normalised so that the peak of the command does not change."""
-    peak = float(np.abs(_command(setting, place)).max())
-    return lambda s: (peak ** (-2 * s) - 1, 2.0 * s)
-
-
-def _direction(place, setting, rng):
-    """Return different damping for the two directions; one is at most 0.3 times the other."""
-    (far,) = shape("drag.linear", place, setting, rng)(1.0)
-    shares = [1.0, float(rng.uniform(0.0, 0.3))]
-    rng.shuffle(shares)
-    return lambda s: (far * shares[0] * s, far * shares[1] * s)
-
-
-def _uneven(place, setting, rng):
-    """Return friction that varies sinusoidally by 50 to 95 % of its mean over the position.
-
-    The period is drawn so that the travel contains one to four periods, within 0.5 to 6.28 rad.
-    """
-    typical, angle = _at(setting, place), rng.uniform(0, 2 * np.pi)
-    period = float(np.clip(typical["travel"] / rng.uniform(1.0, 4.0), 0.5, 6.28))
-    far, share = typical["force"], float(rng.uniform(0.5, 0.95))
-    sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
-    return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
-
-
-def _warming(place, setting, rng):
-    """Return friction that decays with a time constant of 20 to 80 % of a run."""
-    typical, lasting = _at(setting, place), float(setting.fitted[0].times[-1])
-    time = max(lasting * float(rng.uniform(0.2, 0.8)), 0.5)
-    viscous = float(rng.uniform(0.0, 1.0)) * typical["force"] / typical["speed"]
-    return lambda s: (typical["force"] * s, viscous * s, time)
-
-
-def _by_side(place, setting, rng):
-    """Return load friction whose coefficients differ: one is at most 0.3 times the other."""
-    shares = [1.0, float(rng.uniform(0.0, 0.3))]
-    rng.shuffle(shares)
-    return lambda s: (0.5 * shares[0] * s, 0.5 * shares[1] * s)
-
-
-def _square(place, setting, rng):
-    """Return load friction with a quadratic term 2 to 6 times the linear one at typical forces."""
-    square = float(rng.uniform(2.0, 6.0)) / _at(setting, place)["force"]
-    return lambda s: (0.25 * s, 0.5 * square * s)
-
-
-def _eccentric(place, setting, rng):
-    angle = rng.uniform(0, 2 * np.pi)
-    sine, cosine = 0.3 * float(np.sin(angle)), 0.3 * float(np.cos(angle))
-    return lambda s: (sine * s, cosine * s)
-
-
-def _slip(place, setting, rng):
-    """Return a jump at the same time in every run."""
-    times = setting.runs[0].times
-    instant = float(rng.uniform(0.15, 0.85) * times[-1])
-    sign = float(rng.choice([-1.0, 1.0]))
-    return lambda s: (sign * 0.1 * s, instant)
 
 
 def _stop(place, setting, rng):
@@ -238,13 +168,6 @@ def _stop(place, setting, rng):
     stiffness = 20.0 * typical["force"] / typical["travel"]
     loss = float(rng.uniform(0.0, 0.3)) / typical["speed"]
     return lambda s: (side * stiffness * s, stands, loss)
-
-
-def _hysteresis(place, setting, rng):
-    """Return hysteresis over 2 to 15 % of the travel, limited to 0.01 to 0.2 rad or m."""
-    typical = _at(setting, place)
-    way = float(np.clip(typical["travel"] * rng.uniform(0.02, 0.15), 0.01, 0.2))
-    return lambda s: (typical["force"] * s, way)
 
 
 def _rotor(rng):
@@ -269,24 +192,49 @@ def _play(place, setting, rng):
 
 
 SHAPES = {
-    "friction.hysteresis": _hysteresis,
     "joint.flexibility": _flexible,
     "joint.backlash": _play,
     "state.limit": _stop,
-    "sensor.slip": _slip,
-    "friction.direction": _direction,
-    "friction.load_direction": _by_side,
-    "friction.load_quadratic": _square,
-    "friction.position": _uneven,
-    "friction.warming": _warming,
-    "input.rate": _rate,
     "servo.profile": _profile,
-    "input.power": _power,
-    "sensor.eccentricity": _eccentric,
-    "gravity.tilt": _tilt,
     "mass.offset": _offset,
-    "input.saturation": _saturation,
 }
+"""Functions that draw the shape of an effect from its place, the setting and a generator."""
+
+
+class PlaceMotion:
+    """Scales of the motion at a place, from which shapes of effects on any system are drawn."""
+
+    system = "robot"
+
+    def __init__(self, setting, place):
+        self.seconds = float(setting.fitted[0].times[-1])
+        if not place:
+            return
+        typical = _at(setting, place)
+        self.travel, self.speed = typical["travel"], typical["speed"]
+        # The peak of a command, or a typical force of a joint.
+        is_command = place in setting.runs[0].commands
+        self.peak = (
+            float(np.abs(_command(setting, place)).max()) if is_command else typical["force"]
+        )
+
+
+SHARED_SHAPES = {
+    "friction.direction": lambda typical: 2.0 * typical["force"] / typical["speed"],
+    "friction.hysteresis": lambda typical: typical["force"],
+    "friction.load_direction": lambda typical: 0.5,
+    "friction.load_quadratic": lambda typical: 0.5,
+    "friction.position": lambda typical: typical["force"],
+    "friction.warming": lambda typical: typical["force"],
+    "input.power": lambda typical: 1.0,
+    "input.rate": lambda typical: 1.0,
+    "input.saturation": lambda typical: 1.0,
+    "sensor.eccentricity": lambda typical: 0.3,
+    "sensor.slip": lambda typical: 0.1,
+}
+"""Coefficient at strength 1, from the typical scales of the joint, of effects whose shape is drawn
+as for ball, pendulum and slider.
+"""
 
 
 def family(effect, setting, rng):
