@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.diagnosis_benchmark.case_generation import case_sampling
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
+    BenchmarkCase,
     RequestedConditions,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (

@@ -31,7 +31,7 @@ from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process
 from bench.diagnosis_benchmark.case_catalogue import render_recording
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
 from bench.diagnosis_benchmark.case_set import CaseSpec
 from sims.core.simulator import Array, InputError
 

@@ -12,22 +12,20 @@ import pandas as pd
 from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.storage.result_folder import FolderConfiguration
 from bench.diagnosis_benchmark import diagnoser_figures
-from bench.diagnosis_benchmark.answer_rows import SKIPPED_STATUS, build_answer_rows
-from bench.diagnosis_benchmark.answer_store import AnswersByCase
+from bench.diagnosis_benchmark.answer_store import SKIPPED_STATUS, AnswersByCase, build_answer_rows
 from bench.diagnosis_benchmark.case_set import CaseSpec
-from bench.diagnosis_benchmark.confusion_figure import draw_confusion_matrices
-from bench.diagnosis_benchmark.report_page.diagnoser_conclusion import summarise_unsupported
-from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page
-from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
+from bench.diagnosis_benchmark.diagnoser_figures import draw_confusion_matrices
+from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
+from bench.diagnosis_benchmark.report_page.diagnoser_charts import DiagnoserReportData
+from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page, summarise_unsupported
 from bench.diagnosis_benchmark.result_tables import (
     PRIMARY_METRIC,
     build_all_tables,
+    build_failure_table,
     index_by_diagnoser,
     select_fully_answered_cases,
     select_single_effects,
 )
-from bench.diagnosis_benchmark.training_costs import read_training_costs
-from bench.diagnosis_benchmark.wrong_answers import build_failure_table
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
 from bench.figures.style import add_trust_note
 from sims.core.files import write_atomically

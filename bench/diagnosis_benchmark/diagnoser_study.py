@@ -48,15 +48,23 @@ from bench.benchmark.storage.run_status import (
 from bench.core.plugin_registries import PartUnavailableError, diagnosers, simulators
 from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.diagnosis_benchmark.answer_store import AnswersByCase, AnswerStore, read_answers
-from bench.diagnosis_benchmark.benchmark_config import BenchmarkConfig, read_config
 from bench.diagnosis_benchmark.case_evaluation import (
     AnswerLimits,
     EvaluatedDiagnoser,
     evaluate_case,
 )
-from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set
-from bench.diagnosis_benchmark.diagnoser_training import TrainedDiagnoser, train_or_load
-from bench.diagnosis_benchmark.training_costs import TrainingCost, write_training_costs
+from bench.diagnosis_benchmark.case_set import (
+    BenchmarkConfig,
+    CaseSpec,
+    build_case_set,
+    read_config,
+)
+from bench.diagnosis_benchmark.diagnoser_training import (
+    TrainedDiagnoser,
+    TrainingCost,
+    train_or_load,
+    write_training_costs,
+)
 from sims.core.simulator import InputError
 
 PrintLine = Callable[[str], None]

@@ -1,12 +1,15 @@
-"""Train diagnosers and cache the result in the user's cache folder.
+"""Train diagnosers, cache the results in the user's cache folder, and store costs in training.csv.
 
 The cache key contains everything that the result depends on.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +25,7 @@ from bench.benchmark.runner.tuner_process_reuse import retry_if_killed
 from bench.benchmark.runner.tuner_training import get_weights_folder
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark.case_evaluation import train_isolated
-from sims.core.files import atomic_replacement
+from sims.core.files import atomic_replacement, write_atomically
 
 CACHE_SUBFOLDER = "diagnosers"
 """Subfolder of the cache of trained weights."""
@@ -121,3 +124,51 @@ def _read_training_cost(path: Path) -> tuple[int, float] | None:
         return int(used_simulations), float(seconds)
     except (OSError, ValueError, TypeError):
         return None
+
+
+TRAINING_COSTS_FILE = "training.csv"
+TRAINING_COST_COLUMNS = ("diagnoser", "system", "simulations", "seconds", "fault")
+
+
+class TrainingCost(NamedTuple):
+    """Cost of training one diagnoser for one system.
+
+    Attributes:
+        diagnoser: label of the diagnoser.
+        system: name of the system.
+        simulations: number of simulations used.
+        seconds: elapsed time.
+        fault: error message if the training failed, otherwise empty.
+    """
+
+    diagnoser: str
+    system: str
+    simulations: int
+    seconds: float
+    fault: str = ""
+
+
+def write_training_costs(folder: Path, costs: Iterable[TrainingCost]) -> None:
+    """Write training.csv; write no file if no diagnoser was trained.
+
+    Args:
+        folder: result folder.
+        costs: training costs, one per diagnoser and system.
+    """
+    rows = [cost._asdict() for cost in costs]
+    if not rows:
+        return
+    text = io.StringIO()
+    writer = csv.DictWriter(text, TRAINING_COST_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(folder / TRAINING_COSTS_FILE, text.getvalue())
+
+
+def read_training_costs(folder: Path) -> list[dict[str, str]]:
+    """Read the rows of training.csv; return an empty list if the file does not exist."""
+    path = folder / TRAINING_COSTS_FILE
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.diagnosis_benchmark.case_catalogue import find_equivalent_effects, list_coefficient_names
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
 
 NamedSets = list[tuple[str, ...]]
 CoverageCheck = Callable[[str, tuple[str, ...]], bool]

@@ -9,9 +9,9 @@ import pandas as pd
 
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
-from bench.diagnosis_benchmark.case_generation.benchmark_case import CASE_KINDS
+from bench.diagnosis_benchmark.case_generation.recording_conditions import CASE_KINDS
+from bench.diagnosis_benchmark.result_tables import FAILURE_COLUMNS as FAILED
 from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC
-from bench.diagnosis_benchmark.wrong_answers import FAILURE_COLUMNS as FAILED
 
 
 def _declare_text_column(name: str) -> ColumnSpec:

@@ -13,7 +13,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from tests.exams import exam_report
-from tests.exams.answer_rows import write_table
+from tests.exams.exam import write_table
 from tests.exams.explain_calls import ExplainCall, version_of
 from tests.exams.runner import run_exam, select_questions
 

@@ -17,8 +17,7 @@ from concurrent.futures import as_completed
 from fnmatch import fnmatch
 from pathlib import Path
 
-from tests.exams.answer_rows import read_rows
-from tests.exams.exam import UndrawableError
+from tests.exams.exam import UndrawableError, read_rows
 from tests.exams.explain_calls import (
     ONE_THREAD,
     WALL_FACTOR,

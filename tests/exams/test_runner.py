@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 import pandas as pd
 import pytest
 
-from tests.exams import answer_rows, exam_figures, exam_report, explain_calls, runner
+from tests.exams import exam, exam_report, explain_calls, runner
 from tests.exams.__main__ import EXAMS, main
 from tests.exams.exam import Exam, Target
 from tests.exams.explain_calls import ExplainCall
@@ -79,7 +79,7 @@ def test_an_interrupted_exam_continues_and_versions_share_a_folder(tmp_path, cap
     assert main([*clean, "--version", "one", "--count", "2"]) == 0
     assert calls.read_text() == "xx"
     assert main([*clean, "--version", "two", "--count", "1"]) == 0
-    rows = answer_rows.read_rows(out / "items.jsonl")
+    rows = exam.read_rows(out / "items.jsonl")
     assert [row["version"] for row in rows] == ["one", "one", "two"]
     assert {row["mark"]["outcome"] for row in rows} == {"right"}
     assert rows[0]["digest"] == rows[2]["digest"]
@@ -102,12 +102,12 @@ def test_an_unknown_case_name_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("name", EXAMS)
 def test_case_names_are_unique_and_any_part_of_the_order_is_balanced(name):
     pytest.importorskip("pinocchio", reason="pin has no wheel here")
-    exam = resolve_name(EXAMS[name])
-    questions = runner.select_questions(exam)
+    chosen = resolve_name(EXAMS[name])
+    questions = runner.select_questions(chosen)
     assert len({q.name for q in questions}) == len(questions) >= 40
     kinds = {q.kind for q in questions}
     assert {q.kind for q in questions[:40]} >= kinds - {"numerics", "family", "double"}
-    few = runner.select_questions(exam, only=questions[0].name, count=3)
+    few = runner.select_questions(chosen, only=questions[0].name, count=3)
     assert few == questions[:1]
 
 
@@ -118,7 +118,7 @@ EXAM = Exam(
 
 def row(number, outcome="right", kind="single", version="one", **more):
     is_good = outcome == "right"
-    mark = Mark(outcome, "drag.linear@elbow", 1, **dict.fromkeys(answer_rows.LEVELS, is_good))
+    mark = Mark(outcome, "drag.linear@elbow", 1, **dict.fromkeys(exam.LEVELS, is_good))
     case = {
         "hidden": "drag.linear@elbow=1",
         "size": 3.0,
@@ -135,8 +135,8 @@ def row(number, outcome="right", kind="single", version="one", **more):
 def test_tables_count_good_answers_and_undrawn_questions(tmp_path):
     rows = [row(1), row(2), row(3, "failed"), row(4, "alarm", "clean"), row(5, case=None)]
     rows[0]["mark"]["covered"] = {"a": True, "b": False, "c": None}
-    table = answer_rows.write_table(tmp_path / "items.csv", rows)
-    assert list(table.columns[: len(answer_rows.COLUMNS)]) == list(answer_rows.COLUMNS)
+    table = exam.write_table(tmp_path / "items.csv", rows)
+    assert list(table.columns[: len(exam.COLUMNS)]) == list(exam.COLUMNS)
     summary = exam_report.summarise(EXAM, table).set_index(["group", "value"])
     assert summary.loc[("kind", "single"), ["items", "strict", "no_answer"]].tolist() == [3, 2, 1]
     assert summary.loc[("all", ""), ["intervals_held", "intervals"]].tolist() == [1, 2]
@@ -153,7 +153,7 @@ def test_the_page_keeps_text_outside_its_marks(tmp_path):
         f"# Mine\n\n{exam_report.BEGIN}\nold\n{exam_report.END}\nEnd.\n"
     )
     rows = [row(1), row(2, "wrong"), row(3, case=None)]
-    table = answer_rows.write_table(tmp_path / "items.csv", rows)
+    table = exam.write_table(tmp_path / "items.csv", rows)
     exam_report.write_report(tmp_path, EXAM, table)
     page = (tmp_path / "README.md").read_text()
     assert page.startswith("# Mine\n\n<!-- results -->\n| criterion |")
@@ -169,7 +169,7 @@ def test_the_page_keeps_text_outside_its_marks(tmp_path):
 
 
 def test_the_page_omits_criteria_without_cases(tmp_path):
-    table = answer_rows.write_table(tmp_path / "items.csv", [row(1, "right", "clean")])
+    table = exam.write_table(tmp_path / "items.csv", [row(1, "right", "clean")])
     page = exam_report.format_page(EXAM, table)
     assert "| named |" not in page
     assert "| clean recordings: false alarms | at most 1% | 0/1 = 0.0%" in page
@@ -179,8 +179,8 @@ def test_answers_without_a_verdict_have_no_cause_in_the_confusion(tmp_path):
     rows = [row(1, "failed"), row(2, "right", "clean"), row(3, "unnamed")]
     for answer in rows:
         answer["mark"]["causes"] = ""
-    table = answer_rows.write_table(tmp_path / "items.csv", rows)
-    counts = exam_figures.count_confusion(table)
+    table = exam.write_table(tmp_path / "items.csv", rows)
+    counts = exam_report.count_confusion(table)
     assert counts.loc["(clean)", "(no cause)"] == 1
     assert counts.loc["drag.linear", ["(failed)", "(no cause)"]].tolist() == [1, 1]
 

@@ -195,7 +195,7 @@ class Experiment:
         shot: where the experiment is a bounce shot, its scene (`bounce_shot.shot_config`); targets
             are then shots a ball.
         diagnosis: where the experiment compares diagnosers, what is asked of whom
-            (`diagnosis_benchmark.benchmark_config`); `budget`, `timeout` and `memory` are then
+            (`diagnosis_benchmark.case_set`); `budget`, `timeout` and `memory` are then
             those of an answer, and there are no tuners.
         isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
             one seed that a worker makes share one.

@@ -13,7 +13,7 @@ from bench.diagnosis_benchmark.case_generation.joint_reference import (
     SOLVER_TOLERANCES,
     compute_region_indicator,
 )
-from bench.diagnosis_benchmark.case_generation.true_system import TrueSystem
+from bench.diagnosis_benchmark.case_generation.reference_signals import TrueSystem
 from sims.core.simulator import Array, Scenario
 
 REST_SPEED = 1e-5  # m/s: after slower rebounds the ball rests

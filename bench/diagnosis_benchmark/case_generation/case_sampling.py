@@ -14,18 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation import (
-    competing_effects,
-    effect_coefficients,
-    effect_sizing,
-)
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
+from bench.diagnosis_benchmark.case_generation import effect_coefficients, effect_sizing
 from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_for_size
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
+    BenchmarkCase,
     RecordingConditions,
     RequestedConditions,
     draw_conditions,
+    make_case_rng,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
@@ -251,7 +248,7 @@ def _draw_single(
     if name in SIMPLER_EFFECTS and target_size >= 1.0:
         observed = effect_sizing.simulate_observations(setting, {name: c})
         unexplained = min(
-            competing_effects.compute_refitted_residual(setting, observed, simpler_effect)
+            effect_sizing.compute_refitted_residual(setting, observed, simpler_effect)
             for simpler_effect in SIMPLER_EFFECTS[name]
         )
         if unexplained < MIN_SIMPLER_RESIDUAL:
@@ -320,7 +317,7 @@ def _draw_pair(
     if not np.isfinite(observed).all():
         return None
     unexplained = min(
-        competing_effects.compute_refitted_residual(setting, observed, name, effects[name])
+        effect_sizing.compute_refitted_residual(setting, observed, name, effects[name])
         for name in effects
     )
     return (
@@ -381,7 +378,7 @@ def _draw_unmodelled(
     if found is None:
         return None
     strength, _ = found
-    _, unexplained = competing_effects.find_best_effect(setting, observed(strength))
+    _, unexplained = effect_sizing.find_best_effect(setting, observed(strength))
     hidden_case = replace(
         case,
         effects={name: compute_coefficients(strength)},

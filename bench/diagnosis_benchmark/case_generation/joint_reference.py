@@ -21,9 +21,9 @@ from scipy.optimize import brentq
 
 from bench.diagnosis_benchmark.case_generation.reference_signals import (
     InputSegment,
+    TrueSystem,
     compute_applied_input,
 )
-from bench.diagnosis_benchmark.case_generation.true_system import TrueSystem
 from sims.core.simulator import Array, Scenario
 
 SOLVER_TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}

@@ -1,15 +1,37 @@
-"""Laws of inputs and sensors in the reference simulations: commands as applied, and readings."""
+"""True system of a case, and the laws of its inputs and sensors in the reference simulations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import copysign, exp, inf
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients
 from sims.core.simulator import Array, Scenario
+
+EffectCoefficients = Mapping[str, Sequence[float]]
+"""Coefficients of effects, by the name of the effect."""
+
+
+@dataclass(frozen=True)
+class TrueSystem:
+    """True system of a case, with hidden causes.
+
+    Attributes:
+        system: name of the system.
+        parameters: values of the base parameters, by name.
+        constants: values of the constants, by name.
+        effects: coefficients of effects of the library, in the order in which a signal passes them.
+        foreign: numbers of causes that the library does not contain.
+    """
+
+    system: str
+    parameters: Mapping[str, float]
+    constants: Mapping[str, float]
+    effects: EffectCoefficients = field(default_factory=dict)
+    foreign: EffectCoefficients = field(default_factory=dict)
+
 
 SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant
 SUBDIVISIONS = 10  # number of parts of an interval in which a linear command is held constant

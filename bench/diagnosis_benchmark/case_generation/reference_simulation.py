@@ -25,8 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.diagnosis_benchmark.case_generation import ball_reference, joint_reference
-from bench.diagnosis_benchmark.case_generation.reference_signals import SENSOR_EFFECTS
-from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients, TrueSystem
+from bench.diagnosis_benchmark.case_generation.reference_signals import (
+    SENSOR_EFFECTS,
+    EffectCoefficients,
+    TrueSystem,
+)
 from sims import effects as library
 from sims.core.simulator import Array, Scenario
 from sims.system_simulator import SystemSimulator

@@ -1,17 +1,71 @@
-"""Files of a machine case: recording, its description and the model file."""
+"""Files of a machine case: recording, its description and the correct model file of an arm."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
 from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import record_case
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES
 from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
     MachineRecordingConditions,
 )
-from bench.diagnosis_benchmark.machine_cases.model_file import MODEL_FILE_NAME, render_arm_mjcf
 from sims.core.simulator import Array
+
+MODEL_FILE_NAME = "robot.xml"
+"""Name of the model file, in the folder of the recording."""
+
+
+def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
+    """Render the MJCF text of an arm.
+
+    Args:
+        numbers: parameters; see `machine_dynamics.ArmDynamics`.
+    """
+    links = [
+        (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
+        for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
+    ]
+    inner_link, outer_link = (_render_link(*link) for link in links)
+    return f"""<mujoco model="arm2">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body name="upper_arm">
+      {inner_link}
+      <body name="forearm" pos="0 0 {-numbers["length"]!r}">
+        {outer_link}
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="m_shoulder" joint="shoulder" gear="1"/>
+    <motor name="m_elbow" joint="elbow" gear="1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def _render_link(body: str, joint: str, n: Mapping[str, float]) -> str:
+    """Render the inertia and joint of a link; it is slender along its own axis.
+
+    The moment of inertia about that axis is a tenth of the others. It does not matter, because the
+    link never turns about it.
+
+    Args:
+        body: name of the link.
+        joint: name of its joint.
+        n: mass, centre, inertia, damping and armature of the link.
+    """
+    moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
+    return (
+        f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'
+        f'      <joint name="{joint}" type="hinge" axis="0 1 0" damping="{n["damping"]!r}" '
+        f'armature="{n["armature"]!r}"/>'
+    )
 
 
 def build_description(

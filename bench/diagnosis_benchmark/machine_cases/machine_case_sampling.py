@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
 from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     compute_orthonormal_basis,
     compute_rms,
@@ -20,7 +19,9 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import (
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
+    BenchmarkCase,
     RequestedConditions,
+    make_case_rng,
 )
 from bench.diagnosis_benchmark.machine_cases import hidden_causes
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES, Effects

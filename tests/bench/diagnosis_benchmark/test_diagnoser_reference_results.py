@@ -5,9 +5,9 @@ import re
 
 import pandas as pd
 
+from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
 from bench.diagnosis_benchmark.result_tables import build_all_tables
 from bench.diagnosis_benchmark.table_columns import read_table
-from bench.diagnosis_benchmark.training_costs import read_training_costs
 from tests.docs.documentation_pages import ROOT, section
 
 FOLDER = ROOT / "results/reference/diagnosis"

@@ -12,12 +12,11 @@ from bench.benchmark.problem.experiment import load_experiment
 from bench.cli import main as cli
 from bench.core.plugin_registries import REGISTRIES
 from bench.diagnosis_benchmark.answer_store import ANSWERS_FILE, AnswerStore, read_answers
-from bench.diagnosis_benchmark.benchmark_config import read_config
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RequestedConditions,
 )
-from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set
+from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set, read_config
 from sims.core.simulator import InputError
 
 PLUGIN = Path(__file__).with_name("plugin.py")

@@ -16,7 +16,7 @@ from sims.core.toml_validation import read_toml
 from tests.benchmarks.vision_error_bound import BOUND
 from tests.docs.documentation_pages import ROOT, tables
 from tests.exams import exam_report
-from tests.exams.answer_rows import read_table
+from tests.exams.exam import read_table
 from tests.sims.test_engines import TOLERANCE
 
 __all__ = ["STIFF_SIGMA_THRESHOLD", "TOLERANCE", "hypot"]

@@ -29,7 +29,7 @@ from tests.docs.page_numbers.page_values import (
 )
 from tests.exams import exam_report
 from tests.exams.__main__ import EXAMS
-from tests.exams.answer_rows import read_table
+from tests.exams.exam import read_table
 
 
 def names_below(table, tuner, threshold=0.05):

@@ -14,8 +14,6 @@ import mujoco
 import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text, hidden_text, number
 from tests.exams.contacts.contact_robots import (
     NAMES,
     draw_numbers,
@@ -23,7 +21,16 @@ from tests.exams.contacts.contact_robots import (
     replay,
     write_model,
 )
-from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.exam import (
+    Case,
+    Exam,
+    Question,
+    Target,
+    UndrawableError,
+    conditions_text,
+    hidden_text,
+    number,
+)
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.planted.planted_cases import position_unit
 from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES
@@ -50,7 +57,7 @@ CLEAN = 10
 
 
 @dataclass(frozen=True)
-class ContactQuestion(exam.Question):
+class ContactQuestion(Question):
     """Specification of a case: robot, effect and number of the draw."""
 
     kind: str
@@ -112,7 +119,7 @@ def _draw(question, seed):
 
 
 @dataclass(frozen=True)
-class ContactCase(exam.Case):
+class ContactCase(Case):
     """One recording with contacts.
 
     Attributes:

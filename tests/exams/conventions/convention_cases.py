@@ -5,10 +5,8 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text
 from tests.exams.conventions.convention_logs import BROKEN, CAUSES, Log, write_log
-from tests.exams.exam import Exam, Target
+from tests.exams.exam import Case, Exam, Question, Target, conditions_text
 from tests.exams.explain_calls import Outcome
 from tests.exams.marking import Mark
 
@@ -26,7 +24,7 @@ WORDS = {
 
 
 @dataclass(frozen=True)
-class ConventionQuestion(exam.Question):
+class ConventionQuestion(Question):
     """Specification of a log: its convention is broken, or it is sound and has a cause."""
 
     kind: str
@@ -47,7 +45,7 @@ class ConventionQuestion(exam.Question):
 
 
 @dataclass
-class ConventionCase(exam.Case):
+class ConventionCase(Case):
     """A log, which is drawn while it is written."""
 
     kind: str

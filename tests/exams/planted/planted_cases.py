@@ -19,9 +19,16 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     compute_rms,
     find_strength_for_size,
 )
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text, hidden_text, number
-from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.exam import (
+    Case,
+    Exam,
+    Question,
+    Target,
+    UndrawableError,
+    conditions_text,
+    hidden_text,
+    number,
+)
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.planted.equivalent_causes import held_out_ratios
 from tests.exams.planted.planted_motion import (
@@ -67,7 +74,7 @@ MAX_FRICTION = 0.8  # Multiple of the largest torque at the joint.
 
 
 @dataclass(frozen=True)
-class PlantedQuestion(exam.Question):
+class PlantedQuestion(Question):
     """Specification of a case: robot, kind of the changed number, and number of the draw."""
 
     system: str
@@ -104,7 +111,7 @@ def questions(seed=0):
 
 
 @dataclass(frozen=True)
-class PlantedCase(exam.Case):
+class PlantedCase(Case):
     """One recording with a planted cause.
 
     Attributes:

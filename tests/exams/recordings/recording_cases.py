@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sims.core.toml_validation import tomllib
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text
-from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.exam import Case, Exam, Question, Target, UndrawableError, conditions_text
 from tests.exams.explain_calls import Outcome
 from tests.exams.marking import Mark
 
@@ -89,7 +87,7 @@ SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "share
 
 
 @dataclass(frozen=True)
-class RecordingQuestion(exam.Question):
+class RecordingQuestion(Question):
     """A measured recording."""
 
     name: str
@@ -115,7 +113,7 @@ class RecordingQuestion(exam.Question):
 
 
 @dataclass(frozen=True)
-class RecordingCase(exam.Case):
+class RecordingCase(Case):
     """A measured recording, and the right answer as far as it is known."""
 
     expected: dict

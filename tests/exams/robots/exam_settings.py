@@ -11,11 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
-from tests.exams.robots import command_signals, floating_robots, reference_answers, robot_models
+from tests.exams.robots import exam_robots, floating_robots, robot_models, robot_signals
 from tests.exams.robots.exam_robots import Machine
-from tests.exams.robots.excitation_signals import Drives
 from tests.exams.robots.reference_world import COARSE, Run, World
-from tests.exams.robots.sensor_models import NOISES
+from tests.exams.robots.robot_signals import NOISES, Drives
 
 RATE, SECONDS, FLOATING_SECONDS = 100, 4.0, 2.5
 FITTED, HELD_OUT = 4, 2
@@ -81,7 +80,7 @@ def setting(name, rng, coarse=False, noise=None):
     models, draw = (floating_robots, _floating_run) if floats else (robot_models, _run)
     machine = models.machine(name, rng)
     times = np.arange(round(RATE * (FLOATING_SECONDS if floats else SECONDS)) + 1) / RATE
-    forms = [str(rng.choice(command_signals.FORMS)) for _ in range(FITTED + HELD_OUT)]
+    forms = [str(rng.choice(robot_signals.FORMS)) for _ in range(FITTED + HELD_OUT)]
     runs, motions = zip(*(draw(machine, form, times, rng) for form in forms), strict=True)
     sigma = float(np.exp(rng.uniform(np.log(5e-4), np.log(1e-3))))
     channels, by_channel = _channels(machine, motions, sigma, rng)
@@ -102,7 +101,7 @@ def _run(machine, form, times, rng):
     pose, plant = np.array(machine.pose), World(machine).plant
     hold, moved = plant.needed(pose, 0 * pose), plant.moved_inertia(pose)
     servo = machine.drives[0].kind == "position"
-    waves = {d.name: command_signals.wave(form, times, rng) for d in machine.drives}
+    waves = {d.name: robot_signals.wave(form, times, rng) for d in machine.drives}
     shares = {d.name: float(rng.uniform(0.5, 1.0)) for d in machine.drives}
     start = pose if servo else pose + rng.uniform(-0.3, 0.3, pose.size)
     travel = _compute_free_travel(machine, pose)
@@ -135,7 +134,7 @@ def _floating_run(machine, form, times, rng):
     q, v = np.concatenate([start, pose]), np.concatenate([np.zeros(hinges), rate])
     world = World(machine, step=COARSE)
     moved = world.plant.moved_inertia(q)
-    waves = {drive.name: command_signals.wave(form, times, rng) for drive in machine.drives}
+    waves = {drive.name: robot_signals.wave(form, times, rng) for drive in machine.drives}
     sizes = {drive.name: float(rng.uniform(0.5, 1.0)) for drive in machine.drives}
     scale = 1.0
     for _ in range(8):
@@ -255,7 +254,7 @@ def _missed(machine, moved, noises):
     """
     drives, gaps = Drives.of(machine), []
     for run, motion in moved:
-        q, v = reference_answers.moved(machine, run)
+        q, v = exam_robots.moved(machine, run)
         u = np.zeros_like(q)
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             u[:, joint] = run.commands[drive.name]

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.exams.robot_files import signal_unit, write_robot_recording
-from tests.exams.robots.command_signals import wave
 from tests.exams.robots.exam_robots import Drive, Machine, plain
 from tests.exams.robots.reference_world import Run, World
+from tests.exams.robots.robot_signals import wave
 
 RATE, NOISE = 100, 1e-3
 

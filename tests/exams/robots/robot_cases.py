@@ -12,9 +12,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text, hidden_text, number
-from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.exam import (
+    Case,
+    Exam,
+    Question,
+    Target,
+    UndrawableError,
+    conditions_text,
+    hidden_text,
+    number,
+)
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.robot_files import signal_unit, write_robot_recording
 from tests.exams.robots import (
@@ -23,13 +30,11 @@ from tests.exams.robots import (
     floating_robots,
     planted_effects,
     reference_plant,
-    unmodelled_causes,
 )
-from tests.exams.robots.cause_sizing import Gauge
-from tests.exams.robots.equivalent_effects import CompetingCauses
+from tests.exams.robots.cause_sizing import CompetingCauses, Gauge
 from tests.exams.robots.reference_world import World
 from tests.exams.robots.robot_models import NAMES
-from tests.exams.robots.sensor_models import observed
+from tests.exams.robots.robot_signals import observed
 
 KINDS = ("clean", "single", "family", "double", "foreign", "numerics")
 CLEAN, DOUBLE, FOREIGN, FAMILY, NUMERICS = 24, 4, 2, 2, 2
@@ -57,7 +62,7 @@ STANDARD = Standard(max_set=4, equal_below=1.05)
 
 
 @dataclass(frozen=True)
-class RobotQuestion(exam.Question):
+class RobotQuestion(Question):
     """Specification of a case; `index` distinguishes questions of the same kind."""
 
     kind: str
@@ -80,7 +85,7 @@ class RobotQuestion(exam.Question):
 
 
 @dataclass(frozen=True)
-class RobotCase(exam.Case):
+class RobotCase(Case):
     """One case of a robot.
 
     Attributes:
@@ -175,7 +180,7 @@ def record(case, setting):
     rng, world = rng_of(case.name, "noise"), World(setting.machine, case.effects)
     values = []
     for number_of_run, run in enumerate(setting.runs):
-        slips = unmodelled_causes.slips_of(case.effects, number_of_run)
+        slips = planted_effects.slips_of(case.effects, number_of_run)
         values.append(setting.noise.add_to(observed(world, run, setting.channels, slips), rng))
     return values
 
@@ -315,7 +320,7 @@ def _foreign(item, setting, effect, rng):
     """Draw an unmodelled cause that no effect at the same joint explains completely."""
     cause = str(rng.choice(planted_effects.FOREIGN)) if effect == "any" else effect
     joint = int(rng.choice(setting.machine.driven))
-    of, gauge = unmodelled_causes.drawn(cause, joint, setting, rng), gauge_of(item.name)
+    of, gauge = planted_effects.drawn(cause, joint, setting, rng), gauge_of(item.name)
     found = cause_sizing.sized(lambda s: gauge.gap(of(s)), draw_size(rng))
     if found is None:
         return None

@@ -6,12 +6,11 @@ import pytest
 from sims.core.simulator import Scenario
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
-from tests.exams.robots import reference_answers, robot_models
+from tests.exams.robots import exam_robots, robot_models
 from tests.exams.robots.exam_robots import Drive, Machine
-from tests.exams.robots.excitation_signals import Drives
-from tests.exams.robots.friction_laws import held
 from tests.exams.robots.reference_plant import Cogging
-from tests.exams.robots.reference_world import Run, World, _Course
+from tests.exams.robots.reference_world import Run, World, _Course, held
+from tests.exams.robots.robot_signals import Drives
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 STAMPS = np.arange(401) / 100
@@ -155,7 +154,7 @@ def test_joints_that_stick_together_in_an_arm_do_not_creep():
 def test_a_clean_robot_moves_as_mujoco_says_at_a_tenth_of_its_step(name):
     machine = robot_models.machine(name, np.random.default_rng(5))
     run = driven(machine, 0.2, stamps=np.arange(201) / 100)
-    expected, _ = reference_answers.moved(machine, run, step=2e-4, integrator="RK4")
+    expected, _ = exam_robots.moved(machine, run, step=2e-4, integrator="RK4")
     np.testing.assert_allclose(World(machine).move(run, run.times).q, expected, atol=1e-4)
     assert np.ptp(expected, axis=0).max() > 0.03
 

@@ -11,14 +11,10 @@ pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
-from tests.exams.robots import (
-    planted_effects,
-    robot_cases,
-    unmodelled_causes,
-)
-from tests.exams.robots.equivalent_effects import CompetingCauses
+from tests.exams.robots import planted_effects, robot_cases
+from tests.exams.robots.cause_sizing import CompetingCauses
 from tests.exams.robots.reference_world import Run, World
-from tests.exams.robots.sensor_models import observed
+from tests.exams.robots.robot_signals import observed
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +95,8 @@ def test_every_effect_can_be_drawn_at_every_place(item):
 
 def test_a_slipping_encoder_jumps_and_stays(item):
     setting = robot_cases.setting_of(item.name)
-    of = unmodelled_causes.drawn("slip", 1, setting, np.random.default_rng(0))
-    slips = unmodelled_causes.slips_of(of(0.5), 0)
+    of = planted_effects.drawn("slip", 1, setting, np.random.default_rng(0))
+    slips = planted_effects.slips_of(of(0.5), 0)
     assert 1 <= len(slips) <= 2
     gauge = robot_cases.gauge_of(item.name)
     jump = gauge.seen(of(0.5))[0][:, 1] - gauge.base[0][:, 1]

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.diagnosis_benchmark.case_catalogue import find_equivalent_effects
-from bench.diagnosis_benchmark.case_generation import competing_effects, effect_sizing
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation import effect_sizing
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     SUBTHRESHOLD_SIZES,
     SYSTEMS,
@@ -19,15 +18,23 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     restore_conditions,
     write_case,
 )
+from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
 )
 from bench.diagnosis_benchmark.grading import MAX_SET_SIZE, grade_answer
 from sims import effects as library
-from tests.exams import exam
-from tests.exams.answer_rows import conditions_text, hidden_text, number
-from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.exam import (
+    Case,
+    Exam,
+    Question,
+    Target,
+    UndrawableError,
+    conditions_text,
+    hidden_text,
+    number,
+)
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 
 # Questions per system, effect, system and unmodelled cause.
@@ -46,7 +53,7 @@ QUICK = (
 
 
 @dataclass(frozen=True)
-class SystemQuestion(exam.Question):
+class SystemQuestion(Question):
     """Specification of a case.
 
     `part` is "marks", or "power" for the power curve only; `index` distinguishes questions of the
@@ -75,7 +82,7 @@ class SystemQuestion(exam.Question):
 
 
 @dataclass(frozen=True)
-class SystemCase(exam.Case):
+class SystemCase(Case):
     """A benchmark case whose recording is written without its name, which reveals the cause."""
 
     item: BenchmarkCase
@@ -116,8 +123,7 @@ class SystemCase(exam.Case):
         phi = setting.noise.phi if item.noise == "ar1" else 0.0
         samples = observed.size * (1 - phi) / (1 + phi)  # Effective number with AR(1) noise.
         return {
-            name: competing_effects.compute_refitted_residual(setting, observed, name)
-            * samples**0.5
+            name: effect_sizing.compute_refitted_residual(setting, observed, name) * samples**0.5
             for name in names[:MAX_COMPETING_CAUSES]
         }
 

@@ -5,7 +5,7 @@ import pytest
 
 from sims import effects
 from sims.core.effect import Signal
-from tests.exams.robots.excitation_signals import profiled
+from tests.exams.robots.robot_signals import profiled
 from tests.sims.effects.effect_systems import batch_coefficients
 
 

@@ -1,4 +1,4 @@
-"""Effects on commands, and the actuator forces that result."""
+"""Signals of robots: commands, effects on them, forces of actuators, and sensor readings."""
 
 from __future__ import annotations
 
@@ -7,8 +7,57 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.reference_signals import apply_input_effects
+from bench.diagnosis_benchmark.case_generation.reference_signals import (
+    SENSOR_EFFECTS,
+    apply_input_effects,
+)
 from bench.diagnosis_benchmark.machine_cases.reference_motion import select_signal_effects
+
+FORMS = ("multisine", "ramps", "steps", "chirp")
+
+
+def wave(form, times, rng):
+    """Return a signal (T,) whose largest amplitude is 1."""
+    signal = SIGNALS[form](times, rng)
+    eased = np.clip(times / 0.4, 0.0, 1.0)
+    return signal / max(np.abs(signal).max(), 1e-12) * eased**2 * (3 - 2 * eased)
+
+
+def _multisine(times, rng):
+    tones = np.exp(rng.uniform(np.log(0.25), np.log(2.5), 5))
+    phases, heights = rng.uniform(0, 2 * np.pi, 5), rng.uniform(0.3, 1.0, 5) / tones**0.5
+    return np.sin(2 * np.pi * tones * times[:, None] + phases) @ heights
+
+
+def _levels(times, rng):
+    """Draw random levels: (start times, levels)."""
+    count = int(rng.integers(4, 8))
+    begins = np.sort(rng.uniform(0.1, times[-1] - 0.3, count))
+    return begins, rng.uniform(-1.0, 1.0, count)
+
+
+def _ramps(times, rng):
+    """Return ramps of constant rate between random levels, with a hold after each."""
+    begins, levels = _levels(times, rng)
+    ends = np.minimum(begins + rng.uniform(0.2, 0.8, begins.size), [*begins[1:], times[-1]])
+    knots = np.column_stack([begins, ends]).ravel()
+    heights = np.column_stack([[0.0, *levels[:-1]], levels]).ravel()
+    return np.interp(times, knots, heights)
+
+
+def _steps(times, rng):
+    begins, levels = _levels(times, rng)
+    return np.array([0.0, *levels])[np.searchsorted(begins, times, side="right")]
+
+
+def _chirp(times, rng):
+    low, high = rng.uniform(0.15, 0.4), rng.uniform(1.5, 3.0)
+    phase = 2 * np.pi * (low * times + (high - low) * times**2 / (2 * times[-1]))
+    return np.sin(phase + rng.uniform(0, 2 * np.pi))
+
+
+SIGNALS = {"multisine": _multisine, "ramps": _ramps, "steps": _steps, "chirp": _chirp}
+
 
 COUPLING = "joint.coupling@"
 INPUTS = ("input.", "servo.derivative", "servo.profile")
@@ -179,3 +228,39 @@ def _shafts(machine, effects):
         row = machine.joints.index(joint)
         shafts[row, above.parents[row + 1] - 1] = c
     return shafts
+
+
+NOISES = ("white", "ar1", "quantised")
+
+
+def observed(world, run, channels, slips=()):
+    """Return noise-free sensor readings of a run, (T, C).
+
+    Args:
+        world: `reference_world.World`.
+        run: `reference_world.Run`.
+        channels: names such as q.elbow.
+        slips: (joint, time, jump) of a slipping encoder, an unmodelled cause.
+    """
+    skew = world.effects.get("clock.skew", (0.0,))[0]
+    effects = {name: select_signal_effects(world.effects, "sensor.", name) for name in channels}
+    instants = {}
+    for name in channels:
+        late = effects[name].get("sensor.delay", (0.0,))[0]
+        instants[name] = np.maximum(run.times * (1 + skew) - late, 0.0)
+    grid = np.unique(np.concatenate(list(instants.values())))
+    motion = world.move(run, grid)
+    columns = []
+    for name in channels:
+        kind, _, joint = name.partition(".")
+        source = {"q": motion.q, "qd": motion.v, "tau": motion.force}[kind]
+        index = world.machine.joints.index(joint)
+        column = source[np.searchsorted(grid, instants[name]), index]
+        for slipping, instant, jump in slips if kind == "q" else ():
+            if slipping == index:
+                column = column + jump * (run.times >= instant)
+        for effect, c in effects[name].items():
+            if effect in SENSOR_EFFECTS:
+                column = SENSOR_EFFECTS[effect](column, c, run.times, run.times)
+        columns.append(column)
+    return np.column_stack(columns)
