@@ -309,20 +309,44 @@ class FollowedRuns:
             self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
         )
 
-    def compute_whitened_innovations(self, theta: Array) -> Array:
-        """Return the whitened innovations (R, T, C) of a model with similar parameters.
+    def compute_parameter_responses(self, places: Sequence[int], sizes: Array) -> SingleArray:
+        """Return how a change of each parameter changes the whitened innovations of the filter.
 
-        The model is linearised about the same motion and filtered with the same process noise.
+        The model is linearised about the same motion, so that a change of a parameter changes the
+        defects of the motion and the predicted readings. They pass through the filter as those of
+        a candidate do, eq. (1) of the module docstring. Jacobians, gains and process noise stay
+        the same.
+
+        Args:
+            places: indices of n parameters in theta.
+            sizes: (n,) finite changes of the parameters.
+
+        Returns:
+            Minus the derivatives of the whitened innovations (R, T, C, n) by the parameters.
         """
-        maps = [
-            _linearise_run(
-                self.evaluator, theta, self.noise, run, neighbour.trajectory, neighbour
-            ).interval_maps()
-            for run, neighbour in enumerate(self.linear)
-        ]
-        runs = LinearRuns.stacked(maps, self.evaluator.observed, self.runs.prior)
-        coloured, white = add_noise_states(runs, self.noise)
-        return filter_runs(coloured, self.force, white).whitened
+        run_count, samples, channels = self.runs.residuals.shape
+        pushed = np.zeros(
+            (run_count, samples - 1, self.runs.prior.size, len(places)), dtype=np.float32
+        )
+        readings = np.zeros((run_count, samples, channels, len(places)), dtype=np.float32)
+        for column, (place, size) in enumerate(zip(places, sizes.tolist(), strict=True)):
+            self.evaluator.search_control.check_not_stopped()
+            theta = self.theta.copy()
+            theta[place] += size
+            for run, linear in enumerate(self.linear):
+                displaced = _linearise_run(
+                    *(self.evaluator, theta, self.noise, run, linear.trajectory, linear),
+                    reuses_loads=True,
+                )
+                defects, predicted = displaced.compute_changes(linear)
+                with np.errstate(all="ignore"):
+                    pushed[run, : len(defects), :, column] = -defects / size
+                    readings[run, : len(predicted), :, column] = predicted / size
+        readings[~self.runs.recorded] = 0.0
+        # A step in which the model diverges gives no information on the next one.
+        for values in (pushed, readings):
+            values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
+        return self._propagate_through_filter(pushed, readings)
 
     @property
     def log_likelihood(self) -> float:
@@ -649,6 +673,7 @@ def _linearise_run(
     neighbour: MeasuredLinear | None,
     simulator: RobotSimulator | None = None,
     reuses_jacobians: bool = True,
+    reuses_loads: bool = False,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
@@ -662,7 +687,8 @@ def _linearise_run(
         states = estimate_measured_states(evaluator, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
     return MeasuredLinear(
-        robot, theta, scenario, start, trajectory, None, neighbour, reuses_jacobians
+        *(robot, theta, scenario, start, trajectory, None, neighbour),
+        *(reuses_jacobians, reuses_loads),
     )
 
 

@@ -5,7 +5,7 @@ it has many local minima. A filter stays near the data for any parameters, so it
 nearly linear in them (L. Ljung, System Identification, 2nd ed., 1999, chapter 10). Its estimates
 are the initial values of a fit by simulation.
 
-Derivatives are differences of the innovations of whole filters. Responses about the measured
+Derivatives follow from differences of the model's own steps. Responses about the measured
 accelerations contain the noise of the innovations that they should explain, which biases a step.
 """
 
@@ -191,32 +191,33 @@ def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) ->
 
 
 def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
-    """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters."""
-    target = followed.filtered.whitened
-    columns = [_compute_innovation_derivative(followed, target, i, b) for i, b in bounds.items()]
-    return np.stack(columns, axis=-1).reshape(-1, len(bounds))
+    """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters.
 
-
-def _compute_innovation_derivative(
-    followed: FollowedRuns, target: Array, index: int, bounds: Bounds
-) -> Array:
-    """Return minus the derivative (R, T, C) of the whitened innovations by one parameter.
-
-    It is a one-sided difference that stays within the bounds. `target` has the innovations at the
-    present parameters, and `index` is the index of the parameter in theta.
+    They are one-sided differences that stay within the bounds. A parameter without a range has no
+    derivative.
 
     Raises:
         SearchStoppedError: the search has to end.
     """
-    followed.evaluator.search_control.check_not_stopped()
+    sizes = np.array(
+        [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
+    )
+    moved = np.flatnonzero(sizes)
+    places = np.array(list(bounds), dtype=np.intp)[moved]
+    responses = followed.compute_parameter_responses(places.tolist(), sizes[moved])
+    derivatives = np.zeros((*responses.shape[:3], len(bounds)))
+    derivatives[..., moved] = responses
+    return derivatives.reshape(-1, len(bounds))
+
+
+def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> float:
+    """Return the finite difference of a parameter, which stays within the bounds.
+
+    It is zero if the parameter has no range.
+    """
     low, high = bounds
     plausible_low, plausible_high = followed.evaluator.parameters[index].bounds
-    step = DIFFERENCE_SHARE * min(plausible_high - plausible_low, high - low)
-    # A parameter without a range has no derivative.
-    if not step > 0:
-        return np.zeros_like(target)
-    displaced_theta = followed.theta.copy()
-    displaced_theta[index] += step if displaced_theta[index] + step <= high else -step
-    change = target - followed.compute_whitened_innovations(displaced_theta)
-    derivative: Array = np.nan_to_num(change / (displaced_theta[index] - followed.theta[index]))
-    return derivative
+    size = DIFFERENCE_SHARE * min(plausible_high - plausible_low, high - low)
+    if not size > 0:
+        return 0.0
+    return size if followed.theta[index] + size <= high else -size

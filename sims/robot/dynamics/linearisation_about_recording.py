@@ -116,6 +116,8 @@ class MeasuredLinear(RunLinearisation):
             samples, by joint number; all other joints follow the simulation.
         nearby: linear model of a similar motion, whose commands and readings are reused.
         reuses_jacobians: whether its Jacobians are reused as well.
+        reuses_loads: whether the loads of its transmissions are reused as well, unless an active
+            effect depends on them.
     """
 
     def __init__(
@@ -128,6 +130,7 @@ class MeasuredLinear(RunLinearisation):
         measured: Mapping[int, Array] | None = None,
         nearby: MeasuredLinear | None = None,
         reuses_jacobians: bool = True,
+        reuses_loads: bool = False,
     ) -> None:
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
@@ -136,6 +139,7 @@ class MeasuredLinear(RunLinearisation):
         numbers of the steps at the samples.
         """
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
+        self._reuses_loads = reuses_loads
         if nearby is not None and reuses_jacobians:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
@@ -221,8 +225,16 @@ class MeasuredLinear(RunLinearisation):
         return Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
 
     def _add_transmission_loads(self, motion: RobotMotion) -> RobotMotion:
-        """Return the motion with the loads of the transmissions, if any effect depends on them."""
-        effects = [m for effect in self._simulator.effects for m in members_of(effect)]
+        """Return the motion with the loads of the transmissions, if any effect depends on them.
+
+        Only active effects count if the loads of another motion are reused.
+        """
+        available = (
+            [effect for effect, _ in self._work.acting]
+            if self._reuses_loads
+            else self._simulator.effects
+        )
+        effects = [m for effect in available for m in members_of(effect)]
         if not any((e.of or e.name) in LOAD_DEPENDENT_EFFECTS for e in effects):
             return motion
         simulator = self._simulator
@@ -295,6 +307,26 @@ class MeasuredLinear(RunLinearisation):
             step_errors,
             self._compute_limit_jumps(),
         )
+
+    def compute_changes(self, similar: MeasuredLinear) -> tuple[Array, Array]:
+        """Compute how defects and readings differ from those of a model with other parameters.
+
+        Both models have the same motion and Jacobians.
+
+        Args:
+            similar: the other model.
+
+        Returns:
+            Changes of d in (3), (T - 1, Z), and of h(x̄) in (4), (T, C).
+        """
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            changes = self._tangent.defects - similar._tangent.defects
+        defects = np.zeros((self.knots.size - 1, self._tangent.state_size))
+        points, states = self._tangent.point_of_step, self._tangent.quotients.states
+        for steps, active in self._list_active_intervals():
+            ahead = np.einsum("izy,iy->iz", states[points[steps]], defects[active])
+            defects[active] = ahead + changes[steps]
+        return defects, self.observed - similar.observed
 
     def _compute_limit_jumps(self) -> Array:
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""

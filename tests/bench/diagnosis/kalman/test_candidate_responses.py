@@ -7,7 +7,8 @@ import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns, _linearise_run
+from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
 from bench.logs.joined_recordings import load_joined
 
 LOG = Path(__file__).parents[4] / "examples/robot/log.csv"
@@ -49,3 +50,28 @@ def test_jacobians_are_computed_again_only_if_an_effect_changes_them(
     renewed = followed.with_parameters(theta)
     assert reused.log_likelihood == pytest.approx(renewed.log_likelihood, abs=0.5)
     assert abs(reused.log_likelihood - followed.log_likelihood) > 5.0
+
+
+def test_parameter_responses_are_differences_of_whole_filters(followed):
+    """The filter keeps its gains, because its Jacobians and its noise stay the same."""
+    slices = followed.evaluator.coefficient_slices
+    names = ("drag.linear@elbow", "mass.scale@forearm", "sensor.gain@q.elbow")
+    places = [slices[name].start for name in names]
+    sizes = np.array([1e-3, -1e-3, 1e-3])
+    responses = followed.compute_parameter_responses(places, sizes)
+    for column, (place, size) in enumerate(zip(places, sizes, strict=True)):
+        theta = followed.theta.copy()
+        theta[place] += size
+        linear = [
+            _linearise_run(
+                followed.evaluator, theta, followed.noise, run, one.trajectory, one
+            ).interval_maps()
+            for run, one in enumerate(followed.linear)
+        ]
+        runs = LinearRuns.stacked(linear, followed.evaluator.observed, followed.runs.prior)
+        coloured, white = add_noise_states(runs, followed.noise)
+        whitened = filter_runs(coloured, followed.force, white).whitened
+        expected = (followed.filtered.whitened - whitened) / size
+        error = np.linalg.norm(responses[..., column] - expected) / np.linalg.norm(expected)
+        # A gain also scales the predicted deviations, which are small.
+        assert error < (0.02 if names[column].startswith("sensor") else 2e-3), names[column]

@@ -63,13 +63,13 @@ def answer(tmp_path_factory):
 
 
 def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypatch):
-    filters, follow = [], FollowedRuns.compute_whitened_innovations
+    filters, respond = [], FollowedRuns.compute_parameter_responses
 
-    def counted(self, theta):
-        filters.append(theta)
-        return follow(self, theta)
+    def counted(self, places, sizes):
+        filters.append(places)
+        return respond(self, places, sizes)
 
-    monkeypatch.setattr(FollowedRuns, "compute_whitened_innovations", counted)
+    monkeypatch.setattr(FollowedRuns, "compute_parameter_responses", counted)
     stopped = explain(write_log(tmp_path), force=True, stop=lambda: bool(filters)).answer
     assert len(filters) == 1
     assert stopped.cut.reason == "interrupt"
