@@ -1,6 +1,6 @@
 """Tests of compiling, caching and loading machine code, and of the checks on its arrays."""
 
-import importlib
+import inspect
 import signal
 import subprocess
 import sys
@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.diagnosis.kalman.compiled_recursions import recursion_entry
 from sims.core.simulator import InputError
 from sims.engines.compiled import (
     data_layout,
     interpreter,
     kernel,
     kernel_build,
+    kernel_entry,
     machine_code,
+    mujoco_callback,
     traced_array,
 )
 
@@ -26,15 +29,19 @@ def fail_if_called():
     raise AssertionError("another process was waited for or the content was made")
 
 
-def test_the_cache_name_depends_on_every_compiled_source_file():
-    sources = {str(path) for path in kernel.list_source_files()}
+@pytest.mark.parametrize(
+    "entry", [kernel_entry.kernel_entry, mujoco_callback.add_effect_forces, recursion_entry]
+)
+def test_the_cache_name_depends_on_every_compiled_source_file(entry):
+    sources = {str(path) for path in kernel.list_source_files(entry.__module__)}
     assert all(Path(path).is_file() for path in sources)
-    for module in (*kernel_build.KERNEL_MODULES, kernel_build):
-        assert module.__file__ in sources
-        for thing in vars(module).values():
-            of = getattr(thing, "__module__", None) or getattr(thing, "__name__", "")
-            if str(of).startswith("sims."):
-                assert importlib.import_module(of).__file__ in sources, (module, of)
+    called = kernel_build.list_called_functions(entry)
+    assert called
+    for function in (entry, *called):
+        for thing in (function, *function.__globals__.values()):
+            module = inspect.getmodule(thing)
+            if module is not None and module.__name__.startswith("sims.engines"):
+                assert module.__file__ in sources, (function, module)
 
 
 def test_a_damaged_cache_file_is_made_again(tmp_path):
@@ -105,17 +112,17 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
-    path = machine_code.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
+    path = machine_code.get_cache_folder() / kernel.make_cache_name(kernel_entry.__name__, {})
     code = machine_code.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
-    monkeypatch.setattr(kernel_build, "build_kernel", lambda *_: code)
+    monkeypatch.setattr(kernel_build, "build_module", lambda *_: code)
     assert load_kernel() is not None
     assert "set SIMGAP_COMPILED to a folder that can be written" in capsys.readouterr().err
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
-    path = machine_code.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
+    path = machine_code.get_cache_folder() / kernel.make_cache_name(kernel_entry.__name__, {})
     code = machine_code.MachineCode.unpack(machine_code.read_cached(path))
     assert machine_code.MachineCode.unpack(code.pack()) == code
     with pytest.raises(machine_code.CodeNotLoadableError, match="frobnicate"):
@@ -142,10 +149,10 @@ def make_small_arrays():
     work = data_layout.BatchArrays(
         order=np.array([1, 0]), parameters=np.ones((2, 1)), mass=np.ones(2), x=np.ones((2, 1)),
         v=np.ones((2, 1)), steps=np.ones((1, 4)), inputs=np.zeros((0, 1, 4)), max_steps=np.ones(2),
-        planned_counts=np.ones(2), ground=np.zeros((4, 2)), steps_per_record=2, patience=np.inf,
-        records=np.zeros((2, 3, 3)),
+        planned_counts=np.ones(2), divisions=np.ones(2), ground=np.zeros((4, 2)),
+        limits=np.array([np.inf, 0.07]), records=np.zeros((2, 3, 3)), steps_per_record=2,
     )  # fmt: skip
-    return program, work, data_layout.allocate_block(7), 8, np.ones(2), np.ones(2)
+    return program, work, data_layout.allocate_block(7), 8
 
 
 @pytest.mark.parametrize(
@@ -161,20 +168,20 @@ def make_small_arrays():
         ("mass", np.ones(2, dtype=np.float32)),
         ("x", np.ones((4, 1))[::2]),
         ("v", np.ones((2, 2))),
+        ("divisions", np.ones(3)),
+        ("limits", np.ones(1)),
     ],
 )
 def test_arrays_of_wrong_shape_are_refused(name, value):
-    program, work, block, w, spans, parts = make_small_arrays()
-    data_layout.check_array_layout(program, work, block, w, spans, parts)
+    program, work, block, w = make_small_arrays()
+    data_layout.check_array_layout(program, work, block, w)
     with pytest.raises(ValueError, match=r"expected \(|does not match the arrays"):
-        data_layout.check_array_layout(
-            program, work._replace(**{name: value}), block, w, spans, parts
-        )
+        data_layout.check_array_layout(program, work._replace(**{name: value}), block, w)
     with pytest.raises(ValueError, match="does not match the arrays"):
-        data_layout.check_array_layout(program, work, block, 0, spans, parts)
+        data_layout.check_array_layout(program, work, block, 0)
     far = program._replace(code=np.array([[interpreter.ADD, 7, 0, 0, 0]]))
     with pytest.raises(ValueError, match="does not match the arrays"):
-        data_layout.check_array_layout(far, work, block, w, spans, parts)
+        data_layout.check_array_layout(far, work, block, w)
 
 
 def test_instructions_are_checked_and_run_on_any_number_of_slots():

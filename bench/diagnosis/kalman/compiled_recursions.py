@@ -11,23 +11,13 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.engines.compiled.intrinsics import carray, to_real_pointer
 from sims.engines.compiled.kernel import get_address, load_compiled_module
-
-if TYPE_CHECKING:
-    # These functions exist in compiled code only, see `sims.engines.compiled.kernel_build`.
-
-    def carray(pointer: Any, shape: Any) -> Any:
-        """Return the array at a pointer; the compiler's own function."""
-
-    def to_real_pointer(address: int) -> Any:
-        """Return an address as a pointer to floating-point numbers."""
-
 
 FILTER, SMOOTHER = range(2)
 """Recursions, by the first argument of `recursion_entry`."""
@@ -119,7 +109,7 @@ def _load_compiled_recursions() -> Callable[[int], None] | None:
     """
     if importlib.util.find_spec("llvmlite") is None:
         return None
-    return load_compiled_module(__name__, "recursion_entry", Path(__file__), "the Kalman filter")
+    return load_compiled_module(__name__, "recursion_entry", "the Kalman filter")
 
 
 def recursion_entry(arguments_at: Any) -> None:

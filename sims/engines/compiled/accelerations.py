@@ -24,10 +24,9 @@ from sims.engines.compiled.data_layout import (
     EXCESS_AFTER,
     EXCESS_BEFORE,
     F1,
-    FORCES_BEGIN,
+    FORCES,
     FRICTION_COORDINATE_COUNT,
     HAS_FRICTION,
-    IMPACT_BEGIN,
     IN_T,
     IN_V,
     IN_X,
@@ -36,8 +35,7 @@ from sims.engines.compiled.data_layout import (
     K1,
     MASS,
     OUT_LIMIT,
-    BlockBuffers,
-    ProgramArrays,
+    Block,
     T,
     V,
     X,
@@ -46,52 +44,56 @@ from sims.engines.compiled.events import compute_norm
 from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
 
-def evaluate_forces(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def run_part(block: Block, part: int) -> None:
+    """Run one part of the force program on all slots in use.
+
+    Args:
+        block: force program, batch elements, and buffers of the slots.
+        part: `CONSTANTS`, `FORCES` or `IMPACTS`.
+    """
+    run_instructions(block.code, block.ends[part], block.ends[part + 1], block.r, block.w)
+
+
+def evaluate_forces(block: Block) -> None:
     """Copy every element's state to the registers and evaluate the forces.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
-    d = program.flags[DIMENSIONS]
-    rows = program.rows
+    d = block.flags[DIMENSIONS]
+    rows = block.rows
     r = block.r
     a = block.a
-    for i in range(w):
+    for i in range(block.w):
         r[rows[IN_T], i] = a[T, i]
     for k in range(d):
-        for i in range(w):
+        for i in range(block.w):
             r[rows[IN_X] + k, i] = a[X + k, i]
             r[rows[IN_V] + k, i] = a[V + k, i]
-    run_instructions(program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], r, w)
+    run_part(block, FORCES)
 
 
-def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def begin_step(block: Block) -> None:
     """Compute the accelerations at the beginning of a step, in rows K1.
 
     This also determines which elements stick, and the direction of motion of the others.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
-    if program.flags[HAS_FRICTION] == 0:
-        compute_frictionless_acceleration(program, block, w, K1)
+    if block.flags[HAS_FRICTION] == 0:
+        compute_frictionless_acceleration(block, K1)
         return
-    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
-    if friction_coordinate_count == 1 and program.flags[BOUNCES] == 0:
-        begin_step_1d(program, block, w)
+    friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
+    if friction_coordinate_count == 1 and block.flags[BOUNCES] == 0:
+        begin_step_1d(block)
         return
     a = block.a
     r = block.r
-    limits = program.rows[OUT_LIMIT]
-    for i in range(w):
+    limits = block.rows[OUT_LIMIT]
+    for i in range(block.w):
         limit = r[limits, i]
-        compute_force_without_friction(program, block, i, K1)
+        compute_force_without_friction(block, i, K1)
         force_size = compute_norm(a, K1, friction_coordinate_count, i)
         speed = compute_norm(a, V, friction_coordinate_count, i)
         a[EXCESS_BEFORE, i] = force_size - limit
@@ -110,25 +112,22 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
             a[DIRECTION + k, i] = direction
             a[F1 + k, i] = friction
             a[K1 + k, i] = 0.0 if is_sticking else (force - friction) / a[MASS, i]
-        compute_acceleration_without_friction(program, block, i, K1, F1)
+        compute_acceleration_without_friction(block, i, K1, F1)
 
 
-def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def begin_step_1d(block: Block) -> None:
     """Compute `begin_step` for dry friction on one coordinate, the first; no ground.
 
     The numbers are the same; there are no branches, so that the loops over slots are vectorised.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     r = block.r
-    limits = program.rows[OUT_LIMIT]
-    force_row = program.out[0]
-    for i in range(w):
+    limits = block.rows[OUT_LIMIT]
+    force_row = block.out[0]
+    for i in range(block.w):
         force = r[force_row, i]
         limit = r[limits, i]
         v = a[V, i]
@@ -147,56 +146,44 @@ def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         a[F1, i] = friction
         a[K1, i] = 0.0 if is_held else slip_acceleration
         block.n[IS_STICKING, i] = 1 if is_held else 0
-    compute_further_coordinates(program, block, w, K1, F1)
+    compute_further_coordinates(block, K1, F1)
 
 
-def compute_acceleration(
-    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
-) -> None:
+def compute_acceleration(block: Block, row_of_result: int, friction_row: int) -> None:
     """Compute the accelerations of all slots within the present step, with dry friction.
 
     A slot is a column of the buffers that holds one batch element. The force program runs for
     all slots together; friction is then computed by the number of coordinates.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
-    run_instructions(
-        program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
-    )
-    if program.flags[HAS_FRICTION] == 0:
-        compute_frictionless_acceleration(program, block, w, row_of_result)
+    run_part(block, FORCES)
+    if block.flags[HAS_FRICTION] == 0:
+        compute_frictionless_acceleration(block, row_of_result)
         return
-    if program.flags[FRICTION_COORDINATE_COUNT] == 1 and program.flags[BOUNCES] == 0:
-        compute_acceleration_1d(program, block, w, row_of_result, friction_row)
+    if block.flags[FRICTION_COORDINATE_COUNT] == 1 and block.flags[BOUNCES] == 0:
+        compute_acceleration_1d(block, row_of_result, friction_row)
         return
-    for i in range(w):
-        compute_acceleration_nd(program, block, i, row_of_result, friction_row)
+    for i in range(block.w):
+        compute_acceleration_nd(block, i, row_of_result, friction_row)
 
 
-def compute_acceleration_1d(
-    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
-) -> None:
+def compute_acceleration_1d(block: Block, row_of_result: int, friction_row: int) -> None:
     """Compute `compute_acceleration` for dry friction on one coordinate, the first; no ground.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
     a = block.a
     r = block.r
-    limits = program.rows[OUT_LIMIT]
-    force_row = program.out[0]
-    for i in range(w):
+    limits = block.rows[OUT_LIMIT]
+    force_row = block.out[0]
+    for i in range(block.w):
         force = r[force_row, i]
         limit = r[limits, i]
         friction = limit * a[DIRECTION, i]
@@ -204,49 +191,40 @@ def compute_acceleration_1d(
         a[EXCESS_AFTER, i] = abs(force) - limit
         a[friction_row, i] = friction
         a[row_of_result, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slip_acceleration
-    compute_further_coordinates(program, block, w, row_of_result, friction_row)
+    compute_further_coordinates(block, row_of_result, friction_row)
 
 
-def compute_further_coordinates(
-    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
-) -> None:
+def compute_further_coordinates(block: Block, row_of_result: int, friction_row: int) -> None:
     """Compute the accelerations of the coordinates after the first, which have no dry friction.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
     a = block.a
-    for k in range(1, program.flags[DIMENSIONS]):
-        force_row = program.out[k]
-        for i in range(w):
+    for k in range(1, block.flags[DIMENSIONS]):
+        force_row = block.out[k]
+        for i in range(block.w):
             a[DIRECTION + k, i] = 0.0
             a[friction_row + k, i] = 0.0
             a[row_of_result + k, i] = block.r[force_row, i] / a[MASS, i]
 
 
-def compute_acceleration_nd(
-    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int, friction_row: int
-) -> None:
+def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_row: int) -> None:
     """Compute `compute_acceleration` for an element of several coordinates.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
     a = block.a
-    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
-    velocity = program.rows[IN_V]
-    limit = block.r[program.rows[OUT_LIMIT], i]
-    compute_force_without_friction(program, block, i, row_of_result)
+    friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
+    velocity = block.rows[IN_V]
+    limit = block.r[block.rows[OUT_LIMIT], i]
+    compute_force_without_friction(block, i, row_of_result)
     a[EXCESS_AFTER, i] = compute_norm(a, row_of_result, friction_coordinate_count, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
@@ -266,71 +244,60 @@ def compute_acceleration_nd(
         a[friction_row + k, i] = friction
         slip_acceleration = (a[row_of_result + k, i] - friction) / a[MASS, i]
         a[row_of_result + k, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slip_acceleration
-    compute_acceleration_without_friction(program, block, i, row_of_result, friction_row)
+    compute_acceleration_without_friction(block, i, row_of_result, friction_row)
 
 
 def compute_acceleration_without_friction(
-    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int, friction_row: int
+    block: Block, i: int, row_of_result: int, friction_row: int
 ) -> None:
     """Convert forces to accelerations for the coordinates without dry friction.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations, which contains the forces before.
         friction_row: first row of dry friction.
     """
     a = block.a
-    for k in range(program.flags[FRICTION_COORDINATE_COUNT], program.flags[DIMENSIONS]):
+    for k in range(block.flags[FRICTION_COORDINATE_COUNT], block.flags[DIMENSIONS]):
         a[DIRECTION + k, i] = 0.0
         a[friction_row + k, i] = 0.0
         a[row_of_result + k, i] = a[row_of_result + k, i] / a[MASS, i]
 
 
-def compute_force_without_friction(
-    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int
-) -> None:
+def compute_force_without_friction(block: Block, i: int, row_of_result: int) -> None:
     """Compute all forces except dry friction, without the part that the ground supports.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the forces.
     """
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     for k in range(d):
-        block.a[row_of_result + k, i] = block.r[program.out[k], i]
+        block.a[row_of_result + k, i] = block.r[block.out[k], i]
     if block.n[IS_RESTING, i] != 0:
         # The ground pushes but does not pull: an upward force remains.
         last_row = row_of_result + d - 1
         block.a[last_row, i] = nan_maximum(block.a[last_row, i], 0.0)
 
 
-def compute_frictionless_acceleration(
-    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int
-) -> None:
+def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
     """Compute accelerations without dry friction, in rows `row_of_result`.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         row_of_result: first row of the accelerations.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     for k in range(d):
-        force_row = program.out[k]
+        force_row = block.out[k]
         row = row_of_result + k
-        for i in range(w):
+        for i in range(block.w):
             a[row, i] = block.r[force_row, i] / a[MASS, i]
-    if program.flags[BOUNCES] != 0:
+    if block.flags[BOUNCES] != 0:
         last_row = row_of_result + d - 1
-        for i in range(w):
+        for i in range(block.w):
             if block.n[IS_RESTING, i] != 0:
-                a[last_row, i] = nan_maximum(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]
+                a[last_row, i] = nan_maximum(block.r[block.out[d - 1], i], 0.0) / a[MASS, i]

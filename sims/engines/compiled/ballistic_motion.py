@@ -18,18 +18,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.accelerations import compute_frictionless_acceleration, evaluate_forces
+from sims.engines.compiled.accelerations import (
+    compute_frictionless_acceleration,
+    evaluate_forces,
+    run_part,
+)
 from sims.engines.compiled.data_layout import (
     BOUNCES,
-    CONSTANTS_BEGIN,
+    CONSTANTS,
     DIMENSIONS,
     ELEMENT,
     FLOOR_LEVEL,
-    FORCES_BEGIN,
     K1,
-    BatchArrays,
-    BlockBuffers,
-    ProgramArrays,
+    Block,
     T,
     V,
     X,
@@ -37,99 +38,83 @@ from sims.engines.compiled.data_layout import (
 from sims.engines.compiled.element_clock import load_element
 from sims.engines.compiled.element_stepping import resolve_initial_ground_contact
 from sims.engines.compiled.events import compute_rebound_velocity
-from sims.engines.compiled.interpreter import run_instructions
 
 
-def fly_elements(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
+def fly_elements(block: Block) -> None:
     """Integrate elements on which only a constant force acts, in closed form.
 
     Between impacts with the ground they move on parabolas, so that no steps are needed. Each
     element is loaded into slot 0 of the buffers.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
     """
-    for order_index in range(arrays.order.size):
-        load_element(program, arrays, block, 0, order_index)
-        run_instructions(
-            program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, 1
-        )
-        if program.flags[BOUNCES] != 0:
-            resolve_initial_ground_contact(program, arrays, block, 1)
-        evaluate_forces(program, block, 1)
-        compute_frictionless_acceleration(program, block, 1, K1)
-        record_flight(program, arrays, block)
+    for order_index in range(block.order.size):
+        load_element(block, 0, order_index)
+        run_part(block, CONSTANTS)
+        if block.flags[BOUNCES] != 0:
+            resolve_initial_ground_contact(block)
+        evaluate_forces(block)
+        compute_frictionless_acceleration(block, K1)
+        record_flight(block)
 
 
-def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
+def record_flight(block: Block) -> None:
     """Record the states of the element at all sample times.
 
     The element in slot 0 moves on a parabola up to its next impact with the ground, and bounces
     there.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
     """
     element = block.n[ELEMENT, 0]
-    row = element if arrays.steps.shape[0] > 1 else 0
+    row = element if block.steps.shape[0] > 1 else 0
     time = 0.0
-    impact = compute_impact_time(program, block)
-    for step in range(arrays.steps.shape[1] + 1):
-        if step % arrays.steps_per_record == 0:
+    impact = compute_impact_time(block)
+    for step in range(block.steps.shape[1] + 1):
+        if step % block.steps_per_record == 0:
             while impact <= time:
-                bounce(program, arrays, block, impact)
-                impact = compute_impact_time(program, block)
-            record_arc(program, arrays, block, step // arrays.steps_per_record, time)
-        if step < arrays.steps.shape[1]:
-            time += arrays.steps[row, step]
+                bounce(block, impact)
+                impact = compute_impact_time(block)
+            record_arc(block, step // block.steps_per_record, time)
+        if step < block.steps.shape[1]:
+            time += block.steps[row, step]
 
 
-def record_arc(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, record: int, time: float
-) -> None:
+def record_arc(block: Block, record: int, time: float) -> None:
     """Record the state of slot 0 on its present parabola at a time, by (1) and (2).
 
     The position is x + v s + a s^2 / 2 and the velocity v + a s, with the time s since the
     beginning of the parabola. The record is position, velocity and acceleration, D numbers each.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         record: index of the record.
         time: seconds since the start of the run.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     element = block.n[ELEMENT, 0]
     s = time - a[T, 0]
     for k in range(d):
         v = a[V + k, 0]
         acceleration = a[K1 + k, 0]
-        arrays.records[element, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
-        arrays.records[element, record, d + k] = v + s * acceleration  # (2)
-        arrays.records[element, record, 2 * d + k] = acceleration
+        block.records[element, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
+        block.records[element, record, d + k] = v + s * acceleration  # (2)
+        block.records[element, record, 2 * d + k] = acceleration
 
 
-def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
+def compute_impact_time(block: Block) -> float:
     """Return the time of the next impact in seconds since the start; infinite if there is none.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
     """
-    if program.flags[BOUNCES] == 0:
+    if block.flags[BOUNCES] == 0:
         return np.inf
     a = block.a
-    last = program.flags[DIMENSIONS] - 1
+    last = block.flags[DIMENSIONS] - 1
     height = a[X + last, 0] - a[FLOOR_LEVEL, 0]
     upward_velocity = a[V + last, 0]
     down = -a[K1 + last, 0]
@@ -143,18 +128,15 @@ def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
     return float(np.inf if seconds != seconds else a[T, 0] + seconds)
 
 
-def bounce(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, impact: float) -> None:
+def bounce(block: Block, impact: float) -> None:
     """Move the element to its impact and begin the parabola after it.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         impact: time of the impact in seconds since the start of the run.
     """
     a = block.a
-    last = program.flags[DIMENSIONS] - 1
+    last = block.flags[DIMENSIONS] - 1
     s = impact - a[T, 0]
     for k in range(last + 1):
         acceleration = a[K1 + k, 0]
@@ -162,5 +144,5 @@ def bounce(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, imp
         a[V + k, 0] += s * acceleration  # (2)
     a[T, 0] = impact
     a[X + last, 0] = a[FLOOR_LEVEL, 0]  # removes the rounding of (1) and (3)
-    compute_rebound_velocity(program, arrays, block, 0, a[K1 + last, 0])
-    compute_frictionless_acceleration(program, block, 1, K1)
+    compute_rebound_velocity(block, 0, a[K1 + last, 0])
+    compute_frictionless_acceleration(block, K1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,10 +9,10 @@ import numpy as np
 from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
-from sims.engines.compiled.data_layout import FRICTION_COORDINATE_COUNT, HAS_FRICTION, BatchArrays
+from sims.engines.compiled.data_layout import BatchArrays
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_BLOCK, STEP_IN_LOCKSTEP
+from sims.engines.compiled.kernel_entry import CHOOSE_STEP_DIVISIONS, FLY_ELEMENTS, STEP_BLOCK
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
 
@@ -28,160 +27,112 @@ def integrate_batch(
 ) -> Trajectories:
     """Integrate a batch on the compiled kernel.
 
+    Elements of uniform systems without forces or friction by effects fly in closed form; others
+    are stepped.
+
     Args:
         batch: batch to integrate.
-        max_phase: maximum phase of an oscillation per step in radians.
+        max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
         jobs: number of threads.
 
     Returns:
         The trajectories.
     """
-    runner = _BatchRunner(batch, max_phase, patience, jobs)
+    get_kernel()  # an error of the compiler is not an error of the system
+    whole = _make_arrays(batch, max_phase, patience)
     for elements, effects in _group_by_effects(batch):
-        runner.integrate(elements, effects)
-    return Trajectories(*np.split(runner.records, 3, axis=2))
-
-
-class _BatchRunner:
-    """Arrays of a batch that the compiled kernel integrates.
-
-    Attributes:
-        records: (L, R, 3 D) recorded positions, velocities and accelerations.
-
-    Args:
-        batch: whole batch.
-        max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
-        patience: maximum number of steps; see `sims.engines.batch.BatchEngine`.
-        jobs: number of threads.
-    """
-
-    def __init__(
-        self, batch: IntegrationBatch, max_phase: float, patience: float, jobs: int
-    ) -> None:
-        """Convert the batch to the contiguous arrays that the kernel reads.
-
-        If all elements have the same steps, one row of steps is stored for all of them.
-        `_spans` (L,) is the longest step of each element in seconds, `_planned_counts` (L,)
-        its number of steps that are not zero.
-        """
-        self._kernel = get_kernel()
-        self._jobs = jobs
-        self._batch = batch
-        self._max_phase = max_phase
-        self._patience = patience
-        count, dimensions = batch.x.shape
-        shared = batch.steps.strides[0] == 0
-        steps = batch.steps[:1] if shared else batch.steps
-        self._steps = np.ascontiguousarray(steps, dtype=np.float64)
-        ones = np.ones(count)
-        self._spans = self._steps.max(axis=1, initial=0.0) * ones
-        self._planned_counts = np.count_nonzero(self._steps, axis=1) * ones
-        self._inputs = _stack_inputs(list(batch.inputs.values()), self._steps.shape[1])
-        self._mass = _to_column(batch.system.mass(batch.theta, batch.constants), count)
-        self._ground = _get_ground_parameters(batch)
-        record_count = self._steps.shape[1] // batch.steps_per_sample + 1
-        self.records = np.empty((count, record_count, 3 * dimensions))
-        self._max_steps = self._spans.copy()
-        self._x = np.ascontiguousarray(batch.x, dtype=np.float64)
-        self._v = np.ascontiguousarray(batch.v, dtype=np.float64)
-
-    def integrate(self, elements: Indices, effects: Sequence[tuple[Effect, Array]]) -> None:
-        """Integrate elements that have the same active effects, and write their records.
-
-        Elements of uniform systems without forces or friction by effects fly in closed
-        form; others are stepped.
-
-        Args:
-            elements: (n,) indices of the elements.
-            effects: effects that act on them, with their coefficients (K, L, 1).
-        """
-        batch = self._batch
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
         columns = [batch.theta[elements], *(c[elements] for c in batch.constants.values())]
         columns += [c[:, elements, 0].T for _, c in effects]
-        parameters = np.concatenate(columns, axis=1)
-        arrays = BatchArrays(
-            order=elements.astype(np.int64),
-            parameters=np.ascontiguousarray(parameters, dtype=np.float64),
-            mass=self._mass,
-            x=self._x,
-            v=self._v,
-            steps=self._steps,
-            inputs=self._inputs,
-            max_steps=self._max_steps,
-            planned_counts=self._planned_counts,
-            ground=self._ground,
-            steps_per_record=batch.steps_per_sample,
-            patience=self._patience,
-            records=self.records,
-        )
+        parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
+        arrays = whole._replace(order=elements.astype(np.int64), parameters=parameters)
         if batch.system.uniform and not any(isinstance(e, (Force, Friction)) for e, _ in effects):
-            self._run_kernel_function(FLY_ELEMENTS, program, arrays)
+            _run_kernel_function(FLY_ELEMENTS, program, arrays, jobs)
         else:
-            self._integrate_steps(program, arrays)
+            _integrate_steps(program, arrays, batch.system.bends, jobs)
+    return Trajectories(*np.split(whole.records, 3, axis=2))
 
-    def _integrate_steps(
-        self, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays
-    ) -> None:
-        """Integrate elements in steps, after dividing the steps where an element moves fast.
 
-        `parts` (n,) is the number of parts of each step. Elements without events whose
-        steps are not divided run in lockstep, which is faster; the others run in slots that
-        take the next element when one is finished.
-        """
-        elements = arrays.order
-        all_parts = np.ceil(self._batch.system.fastest * self._spans / self._max_phase)
-        all_parts = np.clip(all_parts, 1.0, MAX_STEP_DIVISIONS)
-        width = _count_slots(program, arrays)
+def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> BatchArrays:
+    """Convert a batch to the contiguous arrays that the kernel reads, without selected elements.
+
+    If all elements have the same steps, one row of steps is stored for all of them. `spans` (L,) is
+    the longest step of each element in seconds.
+    """
+    count, dimensions = batch.x.shape
+    shared = batch.steps.strides[0] == 0
+    steps = np.ascontiguousarray(batch.steps[:1] if shared else batch.steps, dtype=np.float64)
+    ones = np.ones(count)
+    spans = steps.max(axis=1, initial=0.0) * ones
+    divisions = np.ceil(batch.system.fastest * spans / max_phase)
+    record_count = steps.shape[1] // batch.steps_per_sample + 1
+    return BatchArrays(
+        order=np.zeros(0, dtype=np.int64),
+        parameters=np.zeros((0, 0)),
+        mass=_to_column(batch.system.mass(batch.theta, batch.constants), count),
+        x=np.ascontiguousarray(batch.x, dtype=np.float64),
+        v=np.ascontiguousarray(batch.v, dtype=np.float64),
+        steps=steps,
+        inputs=_stack_inputs(list(batch.inputs.values()), steps.shape[1]),
+        max_steps=spans,
+        planned_counts=np.count_nonzero(steps, axis=1) * ones,
+        divisions=np.clip(divisions, 1.0, MAX_STEP_DIVISIONS),
+        ground=_get_ground_parameters(batch),
+        limits=np.array([patience, max_phase]),
+        records=np.empty((count, record_count, 3 * dimensions)),
+        steps_per_record=batch.steps_per_sample,
+    )
+
+
+def _integrate_steps(
+    program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, is_fine: bool, jobs: int
+) -> None:
+    """Integrate elements in steps, after dividing the steps where an element moves fast.
+
+    `is_fine` is whether the system has hidden states, which need fine steps.
+    """
+    elements = arrays.order
+    _run_kernel_function(CHOOSE_STEP_DIVISIONS, program, arrays)
+    parts = arrays.divisions[elements]
+    spans = arrays.max_steps[elements]
+    if is_fine:
+        # The parts count as planned steps.
+        arrays.planned_counts[elements] *= parts
+    # Slightly longer than the part, so that rounding does not leave a tiny step after the last one.
+    arrays.max_steps[elements] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
+    # Elements with many steps begin first; the others fill the remaining slots meanwhile.
+    order = np.argsort(-parts, kind="stable")
+    _run_kernel_function(STEP_BLOCK, program, _select_elements(arrays, order), jobs)
+
+
+def _run_kernel_function(
+    function: int,
+    program: ForceProgram | NumpyForceProgram,
+    arrays: BatchArrays,
+    jobs: int = 1,
+) -> None:
+    """Run a function of the kernel, on several threads if there are enough elements."""
+    count = len(arrays.order)
+    threads = min(jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
+
+    def run(part: BatchArrays) -> None:
+        """Run one thread's part of the elements, in separate program buffers."""
+        padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
+        # Elements in closed form are integrated one after the other.
+        width = 1 if function == FLY_ELEMENTS else min(program.block_width, padded_count)
         prepared = program.prepare(width)
-        self._kernel.choose_step_divisions(
-            prepared.arrays, arrays, prepared.block, width, self._spans, self._max_phase, all_parts
-        )
+        get_kernel().run(function, prepared.arrays, part, prepared.block, width)
         prepared.raise_error()
-        parts = all_parts[elements]
-        spans = self._spans[elements]
-        if self._batch.system.bends:
-            # The fine steps that hidden states need count as planned steps.
-            self._planned_counts[elements] *= parts
-        # Slightly longer than the part, so that rounding does not leave a tiny step after the last
-        # one.
-        self._max_steps[elements] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
-        # Elements with many steps begin first; the others fill the remaining slots meanwhile.
-        order = np.argsort(-parts, kind="stable")
-        separate_count = len(order)
-        has_events = program.arrays.flags[HAS_FRICTION:FRICTION_COORDINATE_COUNT].any()
-        if not has_events and len(self._steps) == 1 and self._patience >= 1.0:
-            separate_count = int(np.count_nonzero(parts > 1))
-        self._run_kernel_function(
-            STEP_BLOCK, program, _select_elements(arrays, order[:separate_count])
-        )
-        self._run_kernel_function(
-            STEP_IN_LOCKSTEP, program, _select_elements(arrays, order[separate_count:])
-        )
 
-    def _run_kernel_function(
-        self, function: int, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays
-    ) -> None:
-        """Run a function of the kernel, on several threads if there are enough elements."""
-        count = len(arrays.order)
-        threads = min(self._jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
-
-        def run(part: BatchArrays) -> None:
-            """Run one thread's part of the elements, in separate program buffers."""
-            width = _count_slots(program, part)
-            prepared = program.prepare(width)
-            self._kernel.integrate(function, prepared.arrays, part, prepared.block, width)
-            prepared.raise_error()
-
-        # Every thread gets some elements with many steps and its own buffers. No two threads write
-        # the same element, and the result of an element does not depend on any other.
-        parts = [_select_elements(arrays, np.arange(k, count, threads)) for k in range(threads)]
-        if threads > 1:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(run, parts))
-        elif count:
-            run(arrays)
+    # Every thread gets some elements with many steps and its own buffers. No two threads write the
+    # same element, and the result of an element does not depend on any other.
+    parts = [_select_elements(arrays, np.arange(k, count, threads)) for k in range(threads)]
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, parts))
+    else:
+        run(arrays)
 
 
 def _select_elements(arrays: BatchArrays, places: Indices) -> BatchArrays:
@@ -189,12 +140,6 @@ def _select_elements(arrays: BatchArrays, places: Indices) -> BatchArrays:
     if len(places) == len(arrays.order) and (places == np.arange(len(places))).all():
         return arrays
     return arrays._replace(order=arrays.order[places], parameters=arrays.parameters[places])
-
-
-def _count_slots(program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> int:
-    """Return the number of slots in use."""
-    padded_count = -(-len(arrays.order) // _SIMD_WIDTH) * _SIMD_WIDTH
-    return min(program.block_width, padded_count)
 
 
 def _to_column(values: Array, count: int) -> Array:

@@ -59,10 +59,12 @@ class BatchArrays(NamedTuple):
         inputs: (U, L or 1, S) inputs.
         max_steps: (L,) longest step in seconds.
         planned_counts: (L,) number of planned steps.
+        divisions: (L,) numbers of parts into which steps are divided.
         ground: (4, L) floor, restitution, friction, minimum remaining fraction of tangential speed.
-        steps_per_record: number of steps between recorded states.
-        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        limits: (2,) maximum number of steps of an element, as a multiple of the planned ones, and
+            maximum phase of an oscillation per step in radians.
         records: (L, R, 3 D) recorded states, to be filled in.
+        steps_per_record: number of steps between recorded states.
     """
 
     order: IntTable
@@ -74,10 +76,11 @@ class BatchArrays(NamedTuple):
     inputs: FloatArray
     max_steps: FloatArray
     planned_counts: FloatArray
+    divisions: FloatArray
     ground: FloatArray
-    steps_per_record: int
-    patience: float
+    limits: FloatArray
     records: FloatArray
+    steps_per_record: int
 
 
 class BlockBuffers(NamedTuple):
@@ -94,14 +97,50 @@ class BlockBuffers(NamedTuple):
     n: IntTable
 
 
-# Entries of `ProgramArrays.ends`: where the instructions of constants, forces and impacts begin.
-CONSTANTS_BEGIN, FORCES_BEGIN, IMPACT_BEGIN, PROGRAM_END = range(4)
+class Block(NamedTuple):
+    """Argument of the compiled functions: `ProgramArrays`, `BatchArrays` and `BlockBuffers`.
+
+    A slot is a column of the buffers that holds one batch element.
+
+    Attributes:
+        w: number of slots in use.
+    """
+
+    code: IntTable
+    ends: IntTable
+    rows: IntTable
+    out: IntTable
+    flags: IntTable
+    order: IntTable
+    parameters: FloatArray
+    mass: FloatArray
+    x: FloatArray
+    v: FloatArray
+    steps: FloatArray
+    inputs: FloatArray
+    max_steps: FloatArray
+    planned_counts: FloatArray
+    divisions: FloatArray
+    ground: FloatArray
+    limits: FloatArray
+    records: FloatArray
+    r: FloatArray
+    a: FloatArray
+    n: IntTable
+    steps_per_record: int
+    w: int
+
+
+CONSTANTS, FORCES, IMPACTS = range(3)
+"""Parts of a force program; part k begins at entry k of `ProgramArrays.ends`."""
 # Entries of `ProgramArrays.rows`.
 IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
 # Entries of `ProgramArrays.flags`.
 DIMENSIONS, HAS_FRICTION, HAS_FORCES, BOUNCES, FRICTION_COORDINATE_COUNT = range(5)
 # Rows of `BatchArrays.ground`.
 FLOOR, RESTITUTION, GROUND_FRICTION, MIN_REMAINING_SHARE = range(4)
+# Entries of `BatchArrays.limits`.
+PATIENCE, MAX_PHASE = range(2)
 # Rows of `BlockBuffers.a`: first the rows with one number per slot, then the first row of each
 # vector. MAX_ACCELERATION is the square of the largest acceleration so far. EXCESS_BEFORE and
 # EXCESS_AFTER are the force minus the limit of dry friction at the ends of a step, and H is the
@@ -195,8 +234,6 @@ def check_array_layout(
     arrays: BatchArrays,
     block: BlockBuffers,
     w: int,
-    spans: FloatArray,
-    divisions: FloatArray,
 ) -> None:
     """Check that all arrays have the specified shapes, because machine code does not check them.
 
@@ -206,8 +243,6 @@ def check_array_layout(
         block: registers r, numbers a and integers n of the slots; a slot is a column that holds
             one batch element.
         w: number of slots in use.
-        spans: (L,) step sizes in seconds.
-        divisions: (L,) numbers of parts.
 
     Raises:
         ValueError: an array is not as specified.
@@ -235,8 +270,8 @@ def check_array_layout(
         (arrays.mass, (element_count,)),
         (arrays.max_steps, (element_count,)),
         (arrays.planned_counts, (element_count,)),
-        (spans, (element_count,)),
-        (divisions, (element_count,)),
+        (arrays.divisions, (element_count,)),
+        (arrays.limits, (2,)),
         (arrays.ground, (4, element_count)),
         (arrays.steps, (step_rows, steps)),
         (arrays.inputs, (len(arrays.inputs), input_rows, steps)),

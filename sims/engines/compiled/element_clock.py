@@ -20,40 +20,34 @@ from sims.engines.compiled.data_layout import (
     MAX_STEP,
     NO_EVENT,
     ORDER_INDEX,
+    PATIENCE,
     PENDING_EVENT,
     REMAINING_TIME,
     STEP_COUNT,
     STEP_INDEX,
     STEP_LIMIT,
     STEP_START,
-    BatchArrays,
-    BlockBuffers,
-    ProgramArrays,
+    Block,
     T,
     V,
     X,
 )
 
 
-def load_element(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, order_index: int
-) -> None:
+def load_element(block: Block, i: int, order_index: int) -> None:
     """Load an element into a slot, at the beginning of its run.
 
     A slot is a column of the buffers. It takes the next element when its element has finished.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
-        order_index: index of the element in `arrays.order`.
+        order_index: index of the element in `block.order`.
     """
     a = block.a
     n = block.n
-    d = program.flags[DIMENSIONS]
-    element = arrays.order[order_index]
+    d = block.flags[DIMENSIONS]
+    element = block.order[order_index]
     for row in range(FIRST_VECTOR):
         a[row, i] = 0.0
     n[:, i] = 0
@@ -62,47 +56,39 @@ def load_element(
     n[PENDING_EVENT, i] = NO_EVENT
     n[IS_STEP_START, i] = 1
     for k in range(d):
-        a[X + k, i] = arrays.x[element, k]
-        a[V + k, i] = arrays.v[element, k]
-    a[MAX_STEP, i] = arrays.max_steps[element]
-    a[STEP_LIMIT, i] = arrays.max_steps[element]
+        a[X + k, i] = block.x[element, k]
+        a[V + k, i] = block.v[element, k]
+    a[MAX_STEP, i] = block.max_steps[element]
+    a[STEP_LIMIT, i] = block.max_steps[element]
     a[EVENT_DELAY, i] = np.inf
-    a[MASS, i] = arrays.mass[element]
-    a[FLOOR_LEVEL, i] = arrays.ground[FLOOR, element]
-    a[REMAINING_TIME, i] = arrays.steps[element if arrays.steps.shape[0] > 1 else 0, 0]
-    first = program.rows[IN_P]
-    for p in range(arrays.parameters.shape[1]):
-        block.r[first + p, i] = arrays.parameters[order_index, p]
-    set_inputs(program, arrays, block, i)
+    a[MASS, i] = block.mass[element]
+    a[FLOOR_LEVEL, i] = block.ground[FLOOR, element]
+    a[REMAINING_TIME, i] = block.steps[element if block.steps.shape[0] > 1 else 0, 0]
+    first = block.rows[IN_P]
+    for p in range(block.parameters.shape[1]):
+        block.r[first + p, i] = block.parameters[order_index, p]
+    set_inputs(block, i)
 
 
-def set_inputs(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
+def set_inputs(block: Block, i: int) -> None:
     """Set the inputs of the element's step; after the last step, those of the last step.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
-    first = program.rows[IN_U]
-    step = min(block.n[STEP_INDEX, i], arrays.steps.shape[1] - 1)
-    row = block.n[ELEMENT, i] if arrays.inputs.shape[1] > 1 else 0
-    for u in range(arrays.inputs.shape[0]):
-        block.r[first + u, i] = arrays.inputs[u, row, step]
+    first = block.rows[IN_U]
+    step = min(block.n[STEP_INDEX, i], block.steps.shape[1] - 1)
+    row = block.n[ELEMENT, i] if block.inputs.shape[1] > 1 else 0
+    for u in range(block.inputs.shape[0]):
+        block.r[first + u, i] = block.inputs[u, row, step]
 
 
-def record_and_check_remaining(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int
-) -> bool:
+def record_and_check_remaining(block: Block, i: int) -> bool:
     """Record the state of an element that begins a step at a sample time.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
 
     Returns:
@@ -113,61 +99,53 @@ def record_and_check_remaining(
     step = n[STEP_INDEX, i]
     if n[IS_STEP_START, i] != 0:
         n[IS_STEP_START, i] = 0
-        if step % arrays.steps_per_record == 0:
-            record_state(program, arrays, block, i, step // arrays.steps_per_record)
-        if step == arrays.steps.shape[1]:
+        if step % block.steps_per_record == 0:
+            record_state(block, i, step // block.steps_per_record)
+        if step == block.steps.shape[1]:
             return False
-    if arrays.patience < np.inf and a[REMAINING_TIME, i] > 0.0:
+    if block.limits[PATIENCE] < np.inf and a[REMAINING_TIME, i] > 0.0:
         a[STEP_COUNT, i] += 1.0
-        if a[STEP_COUNT, i] > arrays.patience * arrays.planned_counts[n[ELEMENT, i]]:
+        if a[STEP_COUNT, i] > block.limits[PATIENCE] * block.planned_counts[n[ELEMENT, i]]:
             # Failed elements are recognised by their last recorded state.
-            arrays.records[n[ELEMENT, i], arrays.records.shape[1] - 1, :] = np.nan
+            block.records[n[ELEMENT, i], block.records.shape[1] - 1, :] = np.nan
             return False
     return True
 
 
-def record_state(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, record: int
-) -> None:
+def record_state(block: Block, i: int, record: int) -> None:
     """Record position, velocity and acceleration of the element in slot i.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         record: index of the record.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     element = block.n[ELEMENT, i]
     for k in range(d):
-        arrays.records[element, record, k] = a[X + k, i]
-        arrays.records[element, record, d + k] = a[V + k, i]
-        arrays.records[element, record, 2 * d + k] = a[K1 + k, i]
+        block.records[element, record, k] = a[X + k, i]
+        block.records[element, record, d + k] = a[V + k, i]
+        block.records[element, record, 2 * d + k] = a[K1 + k, i]
 
 
-def next_step(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
+def next_step(block: Block, i: int) -> None:
     """Begin the next planned step of the element in slot i, with the inputs of that step.
 
     A planned step is one of the batch's steps; it may be divided at events such as impacts.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
     n = block.n
-    row = n[ELEMENT, i] if arrays.steps.shape[0] > 1 else 0
+    row = n[ELEMENT, i] if block.steps.shape[0] > 1 else 0
     step = n[STEP_INDEX, i] + 1
     n[STEP_INDEX, i] = step
     n[IS_STEP_START, i] = 1
     n[EVENT_COUNT, i] = 0
-    a[STEP_START, i] += arrays.steps[row, step - 1]
+    a[STEP_START, i] += block.steps[row, step - 1]
     a[T, i] = a[STEP_START, i]
-    a[REMAINING_TIME, i] = arrays.steps[row, step] if step < arrays.steps.shape[1] else 0.0
-    set_inputs(program, arrays, block, i)
+    a[REMAINING_TIME, i] = block.steps[row, step] if step < block.steps.shape[1] else 0.0
+    set_inputs(block, i)

@@ -28,10 +28,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.accelerations import begin_step, compute_acceleration, evaluate_forces
+from sims.engines.compiled.accelerations import (
+    begin_step,
+    compute_acceleration,
+    evaluate_forces,
+    run_part,
+)
 from sims.engines.compiled.data_layout import (
     BOUNCES,
-    CONSTANTS_BEGIN,
+    CONSTANTS,
     DIMENSIONS,
     DIRECTION,
     ELEMENT,
@@ -43,7 +48,6 @@ from sims.engines.compiled.data_layout import (
     F4,
     FLOOR,
     FLOOR_LEVEL,
-    FORCES_BEGIN,
     FRICTION_COORDINATE_COUNT,
     HAS_FORCES,
     HAS_FRICTION,
@@ -74,10 +78,8 @@ from sims.engines.compiled.data_layout import (
     SCRATCH,
     STEP_INDEX,
     STEP_LIMIT,
-    BatchArrays,
-    BlockBuffers,
+    Block,
     H,
-    ProgramArrays,
     T,
     V,
     X,
@@ -92,52 +94,46 @@ from sims.engines.compiled.events import (
     handle_impact,
     is_too_nonlinear,
 )
-from sims.engines.compiled.interpreter import nan_maximum, run_instructions
+from sims.engines.compiled.interpreter import nan_maximum
 
 
-def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
-    """Make all steps of all elements, in w slots that are refilled as elements finish.
+def step_block(block: Block) -> None:
+    """Make all steps of all elements, in slots that are refilled as elements finish.
 
     Each slot has its own time and step length, so that impacts and reversals of one element do
     not delay others.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     loaded_count = 0
     active_count = 0
-    for i in range(w):
+    for i in range(block.w):
         block.n[ORDER_INDEX, i] = -1
-        if loaded_count < arrays.order.size:
-            load_element(program, arrays, block, i, loaded_count)
+        if loaded_count < block.order.size:
+            load_element(block, i, loaded_count)
             loaded_count += 1
             active_count += 1
         else:
-            load_element(program, arrays, block, i, arrays.order.size - 1)  # its result is not used
+            load_element(block, i, block.order.size - 1)  # its result is not used
             block.n[ORDER_INDEX, i] = -1
     has_new_elements = True
     while active_count > 0:
         if has_new_elements:
-            run_instructions(
-                program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, w
-            )
-            if program.flags[BOUNCES] != 0:
-                resolve_initial_ground_contact(program, arrays, block, w)
+            run_part(block, CONSTANTS)
+            if block.flags[BOUNCES] != 0:
+                resolve_initial_ground_contact(block)
             has_new_elements = False
-        evaluate_forces(program, block, w)
-        begin_step(program, block, w)
-        for i in range(w):
+        evaluate_forces(block)
+        begin_step(block)
+        for i in range(block.w):
             block.n[IS_IDLE, i] = block.n[ORDER_INDEX, i] < 0
             is_used = block.n[ORDER_INDEX, i] >= 0
-            if is_used and not record_and_check_remaining(program, arrays, block, i):
+            if is_used and not record_and_check_remaining(block, i):
                 active_count -= 1
                 block.n[ORDER_INDEX, i] = -1
-                if loaded_count < arrays.order.size:
-                    load_element(program, arrays, block, i, loaded_count)
+                if loaded_count < block.order.size:
+                    load_element(block, i, loaded_count)
                     loaded_count += 1
                     active_count += 1
                     has_new_elements = True
@@ -146,60 +142,54 @@ def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
             a[H, i] = min(min(a[REMAINING_TIME, i], a[STEP_LIMIT, i]), a[EVENT_DELAY, i])
             if block.n[IS_IDLE, i] != 0:
                 a[H, i] = 0.0
-        try_step(program, block, w)
-        detect_possible_events(program, block, w)
-        accept_steps(program, arrays, block, w)
-        for i in range(w):
+        try_step(block)
+        detect_possible_events(block)
+        accept_steps(block)
+        for i in range(block.w):
             if block.n[MAY_HAVE_EVENT, i] != 0 and block.n[IS_IDLE, i] == 0:
-                accept_or_retry(program, arrays, block, i)
+                accept_or_retry(block, i)
 
 
-def resolve_initial_ground_contact(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int
-) -> None:
+def resolve_initial_ground_contact(block: Block) -> None:
     """Apply ground contact at the initial state of newly loaded elements.
 
     Elements that start inside the ground are moved to its surface; those that do not move up have
     an impact or rest.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     n = block.n
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     height_row = X + d - 1
     rate_row = V + d - 1
     any_on_ground = False
-    for i in range(w):
+    for i in range(block.w):
         if is_newly_loaded(block, i):
-            floor = arrays.ground[FLOOR, n[ELEMENT, i]]
+            floor = block.ground[FLOOR, n[ELEMENT, i]]
             a[height_row, i] = nan_maximum(a[height_row, i], floor)
             any_on_ground |= a[height_row, i] <= floor and a[rate_row, i] <= 0.0
     if not any_on_ground:
         return
-    evaluate_forces(program, block, w)
-    begin_step(program, block, w)
-    for i in range(w):
+    evaluate_forces(block)
+    begin_step(block)
+    for i in range(block.w):
         if is_newly_loaded(block, i):
-            floor = arrays.ground[FLOOR, n[ELEMENT, i]]
+            floor = block.ground[FLOOR, n[ELEMENT, i]]
             if a[height_row, i] <= floor and a[rate_row, i] < 0.0:
-                handle_impact(program, arrays, block, i, K1)
+                handle_impact(block, i, K1)
             elif a[height_row, i] <= floor and a[rate_row, i] == 0.0:
                 n[IS_RESTING, i] = 1
 
 
-def is_newly_loaded(block: BlockBuffers, i: int) -> bool:
+def is_newly_loaded(block: Block, i: int) -> bool:
     """Return whether an element has just been loaded into slot `i`."""
     n = block.n
     return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 
 
-def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def try_step(block: Block) -> None:
     """Try a step of H seconds of every element by the classical Runge-Kutta method, (2) to (6).
 
     The acceleration k1 at the beginning is in rows K1. Stages 1 and 2 evaluate k2 and k3 in the
@@ -207,40 +197,35 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     NEXT_V.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     r = block.r
-    d = program.flags[DIMENSIONS]
-    t = program.rows[IN_T]
+    d = block.flags[DIMENSIONS]
+    t = block.rows[IN_T]
     for stage in range(1, 4):
         share = 0.5 if stage < 3 else 1.0
         acceleration_row = K1 + (stage - 1) * MAX_COORDINATES
-        for i in range(w):
+        for i in range(block.w):
             r[t, i] = a[T, i] + share * a[H, i]
         for k in range(d):
-            x = program.rows[IN_X] + k
-            v = program.rows[IN_V] + k
+            x = block.rows[IN_X] + k
+            v = block.rows[IN_V] + k
             if stage == 1:
-                for i in range(w):
+                for i in range(block.w):
                     r[x, i] = a[X + k, i] + 0.5 * a[H, i] * a[V + k, i]  # (2)
             elif stage == 2:
-                for i in range(w):
+                for i in range(block.w):
                     half_step = 0.5 * a[H, i]
                     r[x, i] = r[x, i] + (half_step * half_step) * a[K1 + k, i]  # (3)
             else:
-                for i in range(w):
+                for i in range(block.w):
                     r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
-            for i in range(w):
+            for i in range(block.w):
                 r[v, i] = a[V + k, i] + share * a[H, i] * a[acceleration_row + k, i]
-        compute_acceleration(
-            program, block, w, K1 + stage * MAX_COORDINATES, F1 + stage * MAX_COORDINATES
-        )
+        compute_acceleration(block, K1 + stage * MAX_COORDINATES, F1 + stage * MAX_COORDINATES)
     for k in range(d):
-        for i in range(w):
+        for i in range(block.w):
             h = a[H, i]
             sixth = h / 6.0
             middle_sum = a[K2 + k, i] + a[K3 + k, i]
@@ -250,66 +235,60 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
             a[NEXT_V + k, i] = v + sixth * (outer + 2.0 * middle_sum)  # (6)
 
 
-def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def detect_possible_events(block: Block) -> None:
     """Set MAY_HAVE_EVENT for the elements that may have an event in the step just tried.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     n = block.n
-    d = program.flags[DIMENSIONS]
-    for i in range(w):
+    d = block.flags[DIMENSIONS]
+    for i in range(block.w):
         n[MAY_HAVE_EVENT, i] = 1 if n[IS_IDLE, i] != 0 or n[PENDING_EVENT, i] != NO_EVENT else 0
-    if program.flags[HAS_FORCES] != 0 or program.flags[HAS_FRICTION] != 0:
-        for i in range(w):
+    if block.flags[HAS_FORCES] != 0 or block.flags[HAS_FRICTION] != 0:
+        for i in range(block.w):
             a[NONLINEARITY, i] = 0.0
             a[SCRATCH, i] = 0.0
         for k in range(d):
-            for i in range(w):
+            for i in range(block.w):
                 bend = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
                 a[NONLINEARITY, i] += bend * bend
                 a[SCRATCH, i] += a[K1 + k, i] * a[K1 + k, i]
-        for i in range(w):
+        for i in range(block.w):
             a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], a[SCRATCH, i])
-    if program.flags[HAS_FORCES] != 0:
-        for i in range(w):
+    if block.flags[HAS_FORCES] != 0:
+        for i in range(block.w):
             largest = FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
             n[MAY_HAVE_EVENT, i] |= 1 if a[NONLINEARITY, i] > largest else 0
-    if program.flags[BOUNCES] != 0:
-        for i in range(w):
+    if block.flags[BOUNCES] != 0:
+        for i in range(block.w):
             low = a[NEXT_X + d - 1, i] < a[FLOOR_LEVEL, i]
             lifts = n[IS_RESTING, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
             n[MAY_HAVE_EVENT, i] |= 1 if low or lifts else 0
-    if program.flags[HAS_FRICTION] != 0:
-        detect_friction_events(program, block, w)
+    if block.flags[HAS_FRICTION] != 0:
+        detect_friction_events(block)
 
 
-def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+def detect_friction_events(block: Block) -> None:
     """Set MAY_HAVE_EVENT for the elements that may have a friction event in the step just tried.
 
     If friction acts on several coordinates, it is set for all elements.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     n = block.n
-    if program.flags[FRICTION_COORDINATE_COUNT] > 1:
-        for i in range(w):
+    if block.flags[FRICTION_COORDINATE_COUNT] > 1:
+        for i in range(block.w):
             n[MAY_HAVE_EVENT, i] = 1
         return
-    for i in range(w):
+    for i in range(block.w):
         friction = nan_maximum(abs(a[F1, i]), abs(a[F4, i]))
         a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], friction)
         a[SCRATCH, i] = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
-    for i in range(w):
+    for i in range(block.w):
         bend = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
         largest = nan_maximum(a[MAX_FRICTION, i], a[SCRATCH, i])
         is_nonlinear = bend > FRICTION_NONLINEARITY_TOLERANCE * largest
@@ -319,25 +298,21 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
         n[MAY_HAVE_EVENT, i] |= loosens if n[IS_STICKING, i] != 0 else slips
 
 
-def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
+def accept_steps(block: Block) -> None:
     """Accept the steps just tried of elements that have no event in them.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
     """
     a = block.a
     n = block.n
-    for k in range(program.flags[DIMENSIONS]):
-        for i in range(w):
+    for k in range(block.flags[DIMENSIONS]):
+        for i in range(block.w):
             x = a[NEXT_X + k, i]
             v = a[NEXT_V + k, i]
             a[X + k, i] = a[X + k, i] if n[MAY_HAVE_EVENT, i] != 0 else x
             a[V + k, i] = a[V + k, i] if n[MAY_HAVE_EVENT, i] != 0 else v
-    for i in range(w):
+    for i in range(block.w):
         h = 0.0 if n[MAY_HAVE_EVENT, i] != 0 else a[H, i]
         remaining = a[REMAINING_TIME, i] - h
         doubled = 2.0 * a[STEP_LIMIT, i]
@@ -350,32 +325,25 @@ def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
         # near.
         limit = a[STEP_LIMIT, i]
         a[STEP_LIMIT, i] = doubled if n[MAY_HAVE_EVENT, i] == 0 and h >= limit else limit
-    for i in range(w):
+    for i in range(block.w):
         if a[REMAINING_TIME, i] <= 0.0 and n[MAY_HAVE_EVENT, i] == 0:
-            next_step(program, arrays, block, i)
+            next_step(block, i)
 
 
-def accept_or_retry(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int
-) -> None:
+def accept_or_retry(block: Block, i: int) -> None:
     """Accept the step just tried if it contains no event, otherwise prepare to repeat it.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
     n = block.n
-    d = program.flags[DIMENSIONS]
-    bends = program.flags[HAS_FRICTION] != 0 or program.flags[HAS_FORCES] != 0
-    if bends and is_too_nonlinear(program, block, i):
+    d = block.flags[DIMENSIONS]
+    bends = block.flags[HAS_FRICTION] != 0 or block.flags[HAS_FORCES] != 0
+    if bends and is_too_nonlinear(block, i):
         return
-    if (program.flags[HAS_FRICTION] != 0 or program.flags[BOUNCES] != 0) and detect_event(
-        program, arrays, block, i
-    ):
+    if (block.flags[HAS_FRICTION] != 0 or block.flags[BOUNCES] != 0) and detect_event(block, i):
         return
     for k in range(d):
         a[X + k, i] = a[NEXT_X + k, i]
@@ -386,8 +354,8 @@ def accept_or_retry(
     # would run backwards.
     a[REMAINING_TIME, i] = nan_maximum(a[REMAINING_TIME, i] - h, 0.0)
     if n[PENDING_EVENT, i] != NO_EVENT:
-        handle_event(program, arrays, block, i)
+        handle_event(block, i)
     if n[IS_RESTING, i] != 0 and not a[V + d - 1, i] <= 0.0:
         n[IS_RESTING, i] = 0
     if a[REMAINING_TIME, i] <= 0.0:
-        next_step(program, arrays, block, i)
+        next_step(block, i)

@@ -47,7 +47,7 @@ from sims.engines.compiled.data_layout import (
     HAS_FORCES,
     HAS_FRICTION,
     IMPACT,
-    IMPACT_BEGIN,
+    IMPACTS,
     IN_E,
     IN_MU,
     IN_SPEED,
@@ -68,17 +68,14 @@ from sims.engines.compiled.data_layout import (
     OUT_E,
     OUT_MU,
     PENDING_EVENT,
-    PROGRAM_END,
     REMAINING_TIME,
     RESTITUTION,
     SHORT_FLIGHT_COUNT,
     STANDSTILL,
     STEP_LIMIT,
-    BatchArrays,
-    BlockBuffers,
+    Block,
     FloatArray,
     H,
-    ProgramArrays,
     T,
     V,
     X,
@@ -163,28 +160,26 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
     return float(seconds if abs(seconds) < np.inf else h)
 
 
-def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> bool:
+def is_too_nonlinear(block: Block, i: int) -> bool:
     """Return whether forces are too nonlinear in the step just tried; set the next step size.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     h = a[H, i]
     a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], dot(a, K1, K1, d, i))
     is_nonlinear = False
-    if program.flags[HAS_FORCES] != 0:
+    if block.flags[HAS_FORCES] != 0:
         squared_change = 0.0
         for k in range(d):
             outer_sum = a[K1 + k, i] + a[K4 + k, i]
             middle_sum = a[K2 + k, i] + a[K3 + k, i]
             squared_change += (outer_sum - middle_sum) * (outer_sum - middle_sum)
         is_nonlinear = squared_change > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
-    if program.flags[HAS_FRICTION] != 0:
+    if block.flags[HAS_FRICTION] != 0:
         largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
         a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], largest)
         negligible = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
@@ -210,36 +205,33 @@ def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> boo
     return is_nonlinear
 
 
-def has_no_pending_event(block: BlockBuffers, i: int) -> bool:
+def has_no_pending_event(block: Block, i: int) -> bool:
     """Return whether the element has no pending event and not too many events in its step."""
     n = block.n
     return bool(n[PENDING_EVENT, i] == NO_EVENT and n[EVENT_COUNT, i] < MAX_EVENTS_PER_STEP)
 
 
-def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> bool:
+def detect_event(block: Block, i: int) -> bool:
     """Return whether an event is within the step just tried; schedule the event.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     h = a[H, i]
     has_no_event = has_no_pending_event(block, i)
     has_event = False
-    if has_no_event and program.flags[BOUNCES] != 0:
-        floor = arrays.ground[FLOOR, block.n[ELEMENT, i]]
+    if has_no_event and block.flags[BOUNCES] != 0:
+        floor = block.ground[FLOOR, block.n[ELEMENT, i]]
         end_value = a[NEXT_X + d - 1, i]
         if end_value < floor:
             height = a[X + d - 1, i] - floor
             rate = a[V + d - 1, i]
             schedule_event(block, i, find_event_time(height, rate, end_value - floor, h), IMPACT)
             has_event = True
-    if program.flags[HAS_FRICTION] != 0:
+    if block.flags[HAS_FRICTION] != 0:
         is_sticking = block.n[IS_STICKING, i] != 0
         if has_no_event and not is_sticking:
             end_value = dot(a, NEXT_V, DIRECTION, d, i)
@@ -266,12 +258,11 @@ def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
     return has_event
 
 
-def schedule_event(block: BlockBuffers, i: int, seconds: float, event: int) -> None:
+def schedule_event(block: Block, i: int, seconds: float, event: int) -> None:
     """Schedule an event at the end of the next step; of two events the first counts.
 
     Args:
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         seconds: seconds to the event.
         event: kind of event.
@@ -282,38 +273,34 @@ def schedule_event(block: BlockBuffers, i: int, seconds: float, event: int) -> N
         block.n[EVENT_COUNT, i] += 1
 
 
-def handle_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
+def handle_event(block: Block, i: int) -> None:
     """Apply the event to which the step led.
 
     An event is an impact with the ground, a standstill of a body with dry friction, or its
     break-away. The step was shortened to end there.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     event = block.n[PENDING_EVENT, i]
     if event == IMPACT:
-        handle_impact(program, arrays, block, i, K4)
+        handle_impact(block, i, K4)
     elif event == STANDSTILL:
-        handle_standstill(program, block, i)
+        handle_standstill(block, i)
     # Break-away needs no action: the next step finds that the element slips.
     block.a[EVENT_DELAY, i] = np.inf
     block.n[PENDING_EVENT, i] = NO_EVENT
 
 
-def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
+def shift_time(block: Block, i: int, seconds: float) -> float:
     """Move the element's clock, at most by one step.
 
     An event is known only up to rounding when a step ends at it; the clock is corrected by the
     rest.
 
     Args:
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         seconds: time correction in seconds; NaN counts as zero.
 
@@ -329,25 +316,20 @@ def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
     return seconds
 
 
-def handle_impact(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, k: int
-) -> None:
+def handle_impact(block: Block, i: int, k: int) -> None:
     """Apply the impact to which a step led up to rounding.
 
     The remaining distance d to the ground is removed by the time correction (10), which is
     -d / r (1 + d a / (2 r^2)) with the rate r and acceleration a. Then the velocity changes.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         k: first row of the acceleration before the impact.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
-    floor = arrays.ground[FLOOR, block.n[ELEMENT, i]]
+    d = block.flags[DIMENSIONS]
+    floor = block.ground[FLOOR, block.n[ELEMENT, i]]
     height_row = X + d - 1
     rate_row = V + d - 1
     pull = a[k + d - 1, i]
@@ -365,7 +347,7 @@ def handle_impact(
     # impact.
     a[height_row, i] = floor
     a[rate_row, i] = clip_to_non_positive(a[rate_row, i])
-    compute_rebound_velocity(program, arrays, block, i, pull)
+    compute_rebound_velocity(block, i, pull)
 
 
 def clip_to_non_positive(rate: float) -> float:
@@ -373,33 +355,28 @@ def clip_to_non_positive(rate: float) -> float:
     return rate if rate <= 0.0 or rate != rate else 0.0
 
 
-def compute_rebound_velocity(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, pull: float
-) -> None:
+def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
     """Compute the velocity after an impact, from restitution and friction with effects.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         pull: upward acceleration before the impact.
     """
     a = block.a
     r = block.r
-    d = program.flags[DIMENSIONS]
-    rows = program.rows
+    d = block.flags[DIMENSIONS]
+    rows = block.rows
     element = block.n[ELEMENT, i]
     rate_row = V + d - 1
     speed = abs(a[rate_row, i])
     # The program runs on all slots up to this one; the results of the others are not used.
     width = i + 1
     for s in range(width):
-        r[rows[IN_E], s] = arrays.ground[RESTITUTION, element]
-        r[rows[IN_MU], s] = arrays.ground[GROUND_FRICTION, element]
+        r[rows[IN_E], s] = block.ground[RESTITUTION, element]
+        r[rows[IN_MU], s] = block.ground[GROUND_FRICTION, element]
         r[rows[IN_SPEED], s] = speed
-    run_instructions(program.code, program.ends[IMPACT_BEGIN], program.ends[PROGRAM_END], r, width)
+    run_instructions(block.code, block.ends[IMPACTS], block.ends[IMPACTS + 1], r, width)
     e = r[rows[OUT_E], i]
     mu = r[rows[OUT_MU], i]
     rebound_speed = e * speed
@@ -415,21 +392,20 @@ def compute_rebound_velocity(
             square += a[V + j, i] * a[V + j, i]
         tangential_speed = abs(a[V, i]) if d == 2 else np.sqrt(square)
         share = 1.0 - lost_speed / (tangential_speed if tangential_speed > 0.0 else 1.0)
-        remaining_share = nan_maximum(share, arrays.ground[MIN_REMAINING_SHARE, element])
+        remaining_share = nan_maximum(share, block.ground[MIN_REMAINING_SHARE, element])
         for j in range(d - 1):
             a[V + j, i] *= remaining_share
     a[rate_row, i] = rebound_speed
 
 
-def is_bouncing_over(block: BlockBuffers, i: int, rebound_speed: float, down: float) -> bool:
+def is_bouncing_over(block: Block, i: int, rebound_speed: float, down: float) -> bool:
     """Return whether bouncing is finished after an impact.
 
     Without this, a ball would bounce infinitely often in finite time. Bouncing ends at a flight
     shorter than `MIN_FLIGHT_SECONDS`, or after `MAX_SHORT_FLIGHTS` short ones.
 
     Args:
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
         rebound_speed: rebound speed.
         down: downward acceleration.
@@ -443,17 +419,15 @@ def is_bouncing_over(block: BlockBuffers, i: int, rebound_speed: float, down: fl
     return bool(flight < MIN_FLIGHT_SECONDS or count > MAX_SHORT_FLIGHTS)
 
 
-def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> None:
+def handle_standstill(block: Block, i: int) -> None:
     """Stop the element, which has lost its speed along its direction up to rounding.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
+    d = block.flags[DIMENSIONS]
     deceleration = dot(a, K4, DIRECTION, d, i)
     correction = -dot(a, V, DIRECTION, d, i) / deceleration if deceleration < 0.0 else 0.0
     correction = shift_time(block, i, correction)
@@ -464,7 +438,7 @@ def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> No
     for k in range(d):
         a[V + k, i] -= a[DIRECTION + k, i] * directed_velocity
     # The speed becomes exactly zero, because only an element with zero speed can stick.
-    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
+    friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
     if (
         compute_norm(a, V, friction_coordinate_count, i)
         <= REST_SPEED_SHARE * compute_norm(a, K4, friction_coordinate_count, i) * a[MAX_STEP, i]

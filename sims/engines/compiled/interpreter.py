@@ -13,18 +13,11 @@ x = k ln 2 + r with |r| <= ln 2 / 2,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from sims.engines.compiled.data_layout import FloatArray, IntTable
+from sims.engines.compiled.intrinsics import call_external
 from sims.engines.compiled.traced_array import EXTERNAL, OPERATION_CODES
-
-if TYPE_CHECKING:
-
-    def call_external(address: int, part: int, w: int) -> None:
-        """Call the C function at an address with two integers; the compiler inserts the call."""
-
 
 ROUNDING_OFFSET = 6755399441055744.0
 """Number whose addition and subtraction rounds to the nearest integer: 1.5 * 2^52."""

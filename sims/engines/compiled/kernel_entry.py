@@ -2,101 +2,99 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sims.engines.compiled.ballistic_motion import fly_elements
-from sims.engines.compiled.data_layout import (
-    NUMBER_ROW_COUNT,
-    STATE_ROW_COUNT,
-    BatchArrays,
-    BlockBuffers,
-    ProgramArrays,
-)
+from sims.engines.compiled.data_layout import Block
 from sims.engines.compiled.element_stepping import step_block
 from sims.engines.compiled.interpreter import run_instructions
-from sims.engines.compiled.lockstep_stepping import step_in_lockstep
+from sims.engines.compiled.intrinsics import carray, to_int_pointer, to_real_pointer
 from sims.engines.compiled.step_size import choose_step_divisions
 
-if TYPE_CHECKING:
-
-    def carray(pointer: Any, shape: Any) -> Any:
-        """Return the array at a pointer; the compiler's own function."""
-
-    def to_real_pointer(address: int) -> Any:
-        """Return an address as a pointer to floating-point numbers; an intrinsic function."""
-
-    def to_int_pointer(address: int) -> Any:
-        """Return an address as a pointer to integers; an intrinsic function."""
-
-
-CHOOSE_STEP_DIVISIONS, STEP_BLOCK, STEP_IN_LOCKSTEP, FLY_ELEMENTS, RUN_INSTRUCTIONS = range(5)
+CHOOSE_STEP_DIVISIONS, STEP_BLOCK, FLY_ELEMENTS, RUN_INSTRUCTIONS = range(4)
 """Functions of the kernel, by the first argument of `kernel_entry`."""
-SIZE_COUNT = 14
-"""Number of integers before the addresses in the argument of `kernel_entry`."""
-INT_ARRAY_COUNT = 7
-"""Number of arrays of integers, which are the first."""
-REAL_ARRAY_COUNT = 15
-"""Number of arrays of floating-point numbers."""
-ARGUMENT_COUNT = SIZE_COUNT + INT_ARRAY_COUNT + REAL_ARRAY_COUNT
+HEADER_WORDS = 4
+"""Number of integers before the arrays.
+
+They are the function, the number of slots in use, and the steps between recorded states; or the
+first instruction and the index after the last one.
+"""
+ARRAY_WORDS = 4
+"""Number of integers for each array: its address, and its sizes."""
+ARRAY_COUNT = 21
+"""Number of arrays of a `Block`."""
+ARGUMENT_COUNT = HEADER_WORDS + ARRAY_WORDS * ARRAY_COUNT
 """Number of integers in the argument of `kernel_entry`."""
+
+
+def get_ints(words: Any, k: int) -> Any:
+    """Return array k of the argument, integers with one dimension."""
+    at = HEADER_WORDS + ARRAY_WORDS * k
+    return carray(to_int_pointer(words[at]), (words[at + 1],))
+
+
+def get_int_table(words: Any, k: int) -> Any:
+    """Return array k of the argument, integers with two dimensions."""
+    at = HEADER_WORDS + ARRAY_WORDS * k
+    return carray(to_int_pointer(words[at]), (words[at + 1], words[at + 2]))
+
+
+def get_numbers(words: Any, k: int) -> Any:
+    """Return array k of the argument, floating-point numbers with one dimension."""
+    at = HEADER_WORDS + ARRAY_WORDS * k
+    return carray(to_real_pointer(words[at]), (words[at + 1],))
+
+
+def get_table(words: Any, k: int) -> Any:
+    """Return array k of the argument, floating-point numbers with two dimensions."""
+    at = HEADER_WORDS + ARRAY_WORDS * k
+    return carray(to_real_pointer(words[at]), (words[at + 1], words[at + 2]))
+
+
+def get_box(words: Any, k: int) -> Any:
+    """Return array k of the argument, floating-point numbers with three dimensions."""
+    at = HEADER_WORDS + ARRAY_WORDS * k
+    return carray(to_real_pointer(words[at]), (words[at + 1], words[at + 2], words[at + 3]))
 
 
 def kernel_entry(arguments_at: Any) -> None:
     """Run a function of the kernel.
 
-    The argument is the address of `ARGUMENT_COUNT` integers: the function, sizes, and the addresses
-    of all arrays, in the order in which `sims.engines.compiled.kernel` writes them.
+    The argument is the address of `ARGUMENT_COUNT` integers, in the order in which
+    `sims.engines.compiled.kernel` writes them.
     """
-    sizes = carray(arguments_at, (ARGUMENT_COUNT,))
-    ints = sizes[SIZE_COUNT:]
-    reals = sizes[SIZE_COUNT + INT_ARRAY_COUNT :]
-    code = carray(to_int_pointer(ints[0]), (sizes[4], 5))
-    width = sizes[13]
-    w = sizes[12]
-    r = carray(to_real_pointer(reals[0]), (sizes[11], width))
-    if sizes[0] == RUN_INSTRUCTIONS:
-        run_instructions(code, sizes[1], sizes[2], r, w)
+    words = carray(arguments_at, (ARGUMENT_COUNT,))
+    if words[0] == RUN_INSTRUCTIONS:
+        run_instructions(get_int_table(words, 0), words[2], words[3], get_table(words, 1), words[1])
         return
-    element_count = sizes[1]
-    selected_count = sizes[2]
-    d = sizes[3]
-    steps = sizes[7]
-    steps_per_sample = sizes[10]
-    limits = carray(to_real_pointer(reals[14]), (2,))
-    program = ProgramArrays(
-        code,
-        carray(to_int_pointer(ints[1]), (4,)),
-        carray(to_int_pointer(ints[2]), (11,)),
-        carray(to_int_pointer(ints[3]), (d,)),
-        carray(to_int_pointer(ints[4]), (5,)),
+    block = Block(
+        get_int_table(words, 0),
+        get_ints(words, 1),
+        get_ints(words, 2),
+        get_ints(words, 3),
+        get_ints(words, 4),
+        get_ints(words, 5),
+        get_table(words, 6),
+        get_numbers(words, 7),
+        get_table(words, 8),
+        get_table(words, 9),
+        get_table(words, 10),
+        get_box(words, 11),
+        get_numbers(words, 12),
+        get_numbers(words, 13),
+        get_numbers(words, 14),
+        get_table(words, 15),
+        get_numbers(words, 16),
+        get_box(words, 17),
+        get_table(words, 18),
+        get_table(words, 19),
+        get_int_table(words, 20),
+        words[2],
+        words[1],
     )
-    arrays = BatchArrays(
-        carray(to_int_pointer(ints[5]), (selected_count,)),
-        carray(to_real_pointer(reals[2]), (selected_count, sizes[5])),
-        carray(to_real_pointer(reals[3]), (element_count,)),
-        carray(to_real_pointer(reals[4]), (element_count, d)),
-        carray(to_real_pointer(reals[5]), (element_count, d)),
-        carray(to_real_pointer(reals[6]), (sizes[6], steps)),
-        carray(to_real_pointer(reals[7]), (sizes[8], sizes[9], steps)),
-        carray(to_real_pointer(reals[8]), (element_count,)),
-        carray(to_real_pointer(reals[9]), (element_count,)),
-        carray(to_real_pointer(reals[10]), (4, element_count)),
-        steps_per_sample,
-        limits[0],
-        carray(to_real_pointer(reals[11]), (element_count, steps // steps_per_sample + 1, 3 * d)),
-    )
-    block = BlockBuffers(
-        r,
-        carray(to_real_pointer(reals[1]), (NUMBER_ROW_COUNT, width)),
-        carray(to_int_pointer(ints[6]), (STATE_ROW_COUNT, width)),
-    )
-    if sizes[0] == CHOOSE_STEP_DIVISIONS:
-        spans = carray(to_real_pointer(reals[12]), (element_count,))
-        divisions = carray(to_real_pointer(reals[13]), (element_count,))
-        choose_step_divisions(program, arrays, block, w, spans, limits[1], divisions)
-    elif sizes[0] == STEP_BLOCK:
-        step_block(program, arrays, block, w)
-    elif sizes[0] == STEP_IN_LOCKSTEP:
-        step_in_lockstep(program, arrays, block, w)
+    if words[0] == CHOOSE_STEP_DIVISIONS:
+        choose_step_divisions(block)
+    elif words[0] == STEP_BLOCK:
+        step_block(block)
     else:
-        fly_elements(program, arrays, block)
+        fly_elements(block)

@@ -14,27 +14,18 @@ simulation's context, zero for simulations without effects.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sims.engines.compiled.interpreter import run_instructions
-
-if TYPE_CHECKING:
-    # These functions exist in compiled code only, see `kernel_build`.
-
-    def carray(pointer: Any, shape: Any) -> Any:
-        """Return the array at a pointer; the compiler's own function."""
-
-    def to_real_pointer(address: Any) -> Any:
-        """Return a pointer to floating-point numbers."""
-
-    def to_int_pointer(address: Any) -> Any:
-        """Return a pointer to 64-bit integers."""
-
-    def to_short_pointer(address: Any) -> Any:
-        """Return a pointer to 32-bit integers."""
-
+from sims.engines.compiled.intrinsics import (
+    carray,
+    to_fixed_tuple,
+    to_int_pointer,
+    to_real_pointer,
+    to_short_pointer,
+)
 
 QPOS = QVEL = QACC = QFRC_APPLIED = USERDATA = 0
 EFC_TYPE = EFC_ID = EFC_FRICTIONLOSS = IEFC_FRICTIONLOSS = MAP_EFC2IEFC = 0
@@ -146,12 +137,7 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
     if context_address == 0.0:
         return
     words = carray(to_int_pointer(np.int64(context_address)), (CONTEXT_WORDS,))
-    context = CallbackContext(
-        *(words[0], words[1], words[2], words[3], words[4], words[5], words[6], words[7]),
-        *(words[8], words[9], words[10], words[11], words[12], words[13], words[14], words[15]),
-        *(words[16], words[17], words[18], words[19], words[20], words[21], words[22], words[23]),
-        *(words[24], words[25], words[26], words[27], words[28], words[29], words[30]),
-    )
+    context = CallbackContext(*to_fixed_tuple(words, CONTEXT_WORDS))
     k, stage = divmod(context.evaluation, context.evaluations_per_step)
     words[EVALUATION] += 1
     if k >= context.steps:

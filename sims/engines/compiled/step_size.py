@@ -1,4 +1,4 @@
-"""Step-size selection from stiffness and damping of the motion, for the elements of one program.
+"""Step-size selection from stiffness and damping of the motion, for the elements of one block.
 
 At the initial state, and at rest at zero, the change of the forces with a small change of position
 and of velocity is computed for some steps of the run. For x'' = -w^2 x - c x', the fourth-order
@@ -16,13 +16,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.accelerations import evaluate_forces
+from sims.engines.compiled.accelerations import evaluate_forces, run_part
 from sims.engines.compiled.data_layout import (
-    CONSTANTS_BEGIN,
+    CONSTANTS,
     DIMENSIONS,
     ELEMENT,
-    FORCES_BEGIN,
-    IMPACT_BEGIN,
+    FORCES,
     IN_U,
     IN_V,
     IN_X,
@@ -30,16 +29,14 @@ from sims.engines.compiled.data_layout import (
     MASS,
     MAX_ACCELERATION,
     MAX_FRICTION,
+    MAX_PHASE,
     SAMPLED_STEP,
-    BatchArrays,
-    BlockBuffers,
-    ProgramArrays,
-    Row,
+    Block,
     V,
     X,
 )
 from sims.engines.compiled.element_clock import load_element
-from sims.engines.compiled.interpreter import nan_maximum, run_instructions
+from sims.engines.compiled.interpreter import nan_maximum
 
 MAX_PHASE_PER_STEP = 0.07
 """Maximum phase of an oscillation per step, in radians: error (1) is then 2e-7 of the phase."""
@@ -54,77 +51,60 @@ FINITE_DIFFERENCE_STEP = 1e-5
 PHASE_TO_DECAY_RATIO = MAX_PHASE_PER_STEP / MAX_DECAY_PER_STEP
 
 
-def choose_step_divisions(
-    program: ProgramArrays,
-    arrays: BatchArrays,
-    block: BlockBuffers,
-    w: int,
-    spans: Row,
-    max_phase: float,
-    divisions: Row,
-) -> None:
-    """Raise `divisions` to the number of parts into which steps must be divided.
+def choose_step_divisions(block: Block) -> None:
+    """Raise `block.divisions` to the number of parts into which steps must be divided.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
-        spans: (L,) step sizes in seconds.
-        max_phase: maximum phase of an oscillation per step in radians.
-        divisions: (L,) numbers of parts, updated in place.
+        block: force program, batch elements, and buffers of the slots.
     """
-    instants = SAMPLED_INSTANTS if arrays.inputs.shape[0] > 0 else 1
-    for first in range(0, arrays.order.size, w):
-        for i in range(w):
-            load_element(program, arrays, block, i, min(first + i, arrays.order.size - 1))
+    spans = block.max_steps
+    divisions = block.divisions
+    instants = SAMPLED_INSTANTS if block.inputs.shape[0] > 0 else 1
+    for first in range(0, block.order.size, block.w):
+        for i in range(block.w):
+            load_element(block, i, min(first + i, block.order.size - 1))
             if instants > 1:
-                select_sampled_steps(arrays, block, i)
-        run_instructions(
-            program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, w
-        )
+                select_sampled_steps(block, i)
+        run_part(block, CONSTANTS)
         for instant in range(instants):
             if instants > 1:
-                set_inputs_at(program, arrays, block, w, instant)
+                set_inputs_at(block, instant)
             for at_rest in range(2):
-                compute_stiffness_and_damping(program, arrays, block, w, at_rest == 1)
-                for i in range(min(w, arrays.order.size - first)):
+                compute_stiffness_and_damping(block, at_rest == 1)
+                for i in range(min(block.w, block.order.size - first)):
                     element = block.n[ELEMENT, i]
                     phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * spans[element]
                     decay = block.a[MAX_FRICTION, i] * spans[element] * PHASE_TO_DECAY_RATIO
-                    needed_divisions = np.ceil(nan_maximum(phase, decay) / max_phase)
+                    needed_divisions = np.ceil(nan_maximum(phase, decay) / block.limits[MAX_PHASE])
                     # NaN does not change the number of parts.
                     if needed_divisions > divisions[element]:
                         divisions[element] = min(needed_divisions, MAX_STEP_DIVISIONS)
 
 
-def select_sampled_steps(arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
+def select_sampled_steps(block: Block, i: int) -> None:
     """Select the steps of an element at which the forces are evaluated.
 
     Steps of zero length do not count.
 
     Args:
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
+        block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
     """
     n = block.n
-    shared = arrays.steps.shape[0] == 1
+    shared = block.steps.shape[0] == 1
     if shared and i > 0:
         for k in range(SAMPLED_INSTANTS):
             n[SAMPLED_STEP + k, i] = n[SAMPLED_STEP + k, 0]
         return
     row = 0 if shared else n[ELEMENT, i]
-    steps = arrays.steps.shape[1]
+    steps = block.steps.shape[1]
     total = 0
     for s in range(steps):
-        total += arrays.steps[row, s] > 0.0
+        total += block.steps[row, s] > 0.0
     passed_count = 0
     k = 0
     for s in range(steps):
-        passed_count += arrays.steps[row, s] > 0.0
+        passed_count += block.steps[row, s] > 0.0
         while k < SAMPLED_INSTANTS and passed_count >= np.ceil(
             k * (1.0 / (SAMPLED_INSTANTS - 1)) * total
         ):
@@ -132,71 +112,54 @@ def select_sampled_steps(arrays: BatchArrays, block: BlockBuffers, i: int) -> No
             k += 1
 
 
-def set_inputs_at(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int, instant: int
-) -> None:
+def set_inputs_at(block: Block, instant: int) -> None:
     """Set the inputs of every element to those of one of its selected steps.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         instant: index of the selected step.
     """
-    first = program.rows[IN_U]
-    for i in range(w):
-        row = block.n[ELEMENT, i] if arrays.inputs.shape[1] > 1 else 0
-        for u in range(arrays.inputs.shape[0]):
-            block.r[first + u, i] = arrays.inputs[u, row, block.n[SAMPLED_STEP + instant, i]]
+    first = block.rows[IN_U]
+    for i in range(block.w):
+        row = block.n[ELEMENT, i] if block.inputs.shape[1] > 1 else 0
+        for u in range(block.inputs.shape[0]):
+            block.r[first + u, i] = block.inputs[u, row, block.n[SAMPLED_STEP + instant, i]]
 
 
-def compute_stiffness_and_damping(
-    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int, at_rest: bool
-) -> None:
+def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
     """Compute the largest slopes of the acceleration with position and with velocity.
 
     The slope with position (1/s^2) is stored in row MAX_ACCELERATION, that with velocity (1/s) in
     row MAX_FRICTION.
 
     Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
-    d = program.flags[DIMENSIONS]
-    for i in range(w):
+    d = block.flags[DIMENSIONS]
+    for i in range(block.w):
         a[MAX_ACCELERATION, i] = 0.0
         a[MAX_FRICTION, i] = 0.0
         for k in range(d):
-            x = arrays.x[block.n[ELEMENT, i], k]
-            v = arrays.v[block.n[ELEMENT, i], k]
+            x = block.x[block.n[ELEMENT, i], k]
+            v = block.v[block.n[ELEMENT, i], k]
             a[X + k, i] = 0.0 * x if at_rest else x
             a[V + k, i] = 0.0 * v if at_rest else v
-    evaluate_forces(program, block, w)
+    evaluate_forces(block)
     for k in range(d):
-        for i in range(w):
-            a[K1 + k, i] = block.r[program.out[k], i]
+        for i in range(block.w):
+            a[K1 + k, i] = block.r[block.out[k], i]
     for k in range(d):
-        update_max_slope(program, block, w, k, program.rows[IN_X], MAX_ACCELERATION)
-        update_max_slope(program, block, w, k, program.rows[IN_V], MAX_FRICTION)
+        update_max_slope(block, k, block.rows[IN_X], MAX_ACCELERATION)
+        update_max_slope(block, k, block.rows[IN_V], MAX_FRICTION)
 
 
-def update_max_slope(
-    program: ProgramArrays, block: BlockBuffers, w: int, k: int, register: int, row_of_result: int
-) -> None:
+def update_max_slope(block: Block, k: int, register: int, row_of_result: int) -> None:
     """Raise row `row_of_result` to the slope of the acceleration with one coordinate.
 
     Args:
-        program: program of the system and its effects.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+        block: force program, batch elements, and buffers of the slots.
         k: index of the coordinate.
         register: first register of the positions or velocities.
         row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities.
@@ -204,23 +167,19 @@ def update_max_slope(
     a = block.a
     if row_of_result == MAX_FRICTION:
         # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
-        for i in range(w):
+        for i in range(block.w):
             block.r[register + k, i] += FINITE_DIFFERENCE_STEP
-        run_instructions(
-            program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
-        )
-        for i in range(w):
-            a[K1 + k, i] = block.r[program.out[k], i]
-    for i in range(w):
+        run_part(block, FORCES)
+        for i in range(block.w):
+            a[K1 + k, i] = block.r[block.out[k], i]
+    for i in range(block.w):
         block.r[register + k, i] += FINITE_DIFFERENCE_STEP
-    run_instructions(
-        program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
-    )
-    for i in range(w):
-        change = block.r[program.out[k], i] - a[K1 + k, i]
+    run_part(block, FORCES)
+    for i in range(block.w):
+        change = block.r[block.out[k], i] - a[K1 + k, i]
         slope = abs(change / (FINITE_DIFFERENCE_STEP * a[MASS, i]))
         if slope > a[row_of_result, i]:
             a[row_of_result, i] = slope
     block_row = (X if row_of_result == MAX_ACCELERATION else V) + k
-    for i in range(w):
+    for i in range(block.w):
         block.r[register + k, i] = a[block_row, i]

@@ -1,0 +1,35 @@
+"""Functions that exist in compiled code only; `kernel_build` replaces these declarations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def carray(pointer: Any, shape: Any) -> Any:
+    """Return the array at a pointer."""
+    raise NotImplementedError
+
+
+def to_real_pointer(address: Any) -> Any:
+    """Return an address as a pointer to floating-point numbers."""
+    raise NotImplementedError
+
+
+def to_int_pointer(address: Any) -> Any:
+    """Return an address as a pointer to 64-bit integers."""
+    raise NotImplementedError
+
+
+def to_short_pointer(address: Any) -> Any:
+    """Return an address as a pointer to 32-bit integers."""
+    raise NotImplementedError
+
+
+def to_fixed_tuple(array: Any, size: int) -> Any:
+    """Return the first numbers of an array as a tuple."""
+    raise NotImplementedError
+
+
+def call_external(address: int, part: int, w: int) -> None:
+    """Call the C function at an address with two integers."""
+    raise NotImplementedError
