@@ -78,96 +78,6 @@ def compute_factor(c: Any) -> Any:
     return np.maximum(1.0 + c, MIN_FACTOR)
 
 
-def _add_dof(field: str) -> FieldWriter:
-    """Make a function that adds the coefficient to a field of a joint's degree of freedom."""
-
-    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        column = robot.joint(place).velocity
-        fields[field][:, column] = add_to_file_value(fields[field][:, column], c[0])
-
-    return write
-
-
-def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the quadratic damping of a joint, force = -c |v| v, by eq. (1)."""
-    # The first number of the polynomial multiplies |v| v.
-    column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
-    column[:, 0] = add_to_file_value(column[:, 0], c[0])
-
-
-def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the dry friction of a joint by eq. (1), in N m or N.
-
-    Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
-    with `friction_form` soft, the file's solver parameters remain.
-    """
-    column = robot.joint(place).velocity
-    loss = fields["dof_frictionloss"]
-    # A reduced friction keeps the solver parameters of the file.
-    has_added_friction = c[0] > 0
-    loss[:, column] = add_to_file_value(loss[:, column], c[0])
-    write_friction_form(fields, robot, has_added_friction, column)
-
-
-def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the linear stiffness of a joint by eq. (1), in N m/rad or N/m."""
-    column = fields["jnt_stiffness"]
-    number = robot.joint(place).id
-    column[:, number] = add_to_file_value(column[:, number], c[0])
-
-
-def _add_cubic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the cubic stiffness of a joint, in N m/rad^3 or N/m^3."""
-    # The second number of the polynomial multiplies x^3. It has no lower limit, since a spring may
-    # soften.
-    fields["jnt_stiffnesspoly"][:, robot.joint(place).id, 1] += c[0]
-
-
-def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed."""
-    number = robot.body(place).id
-    fields["body_mass"][:, number] *= compute_factor(c[0])
-    fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
-
-
-def _scale_inertia(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the inertia of a body by 1 + c, eq. (2), with the same mass."""
-    fields["body_inertia"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
-
-
-def _offset_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Move the centre of mass of a body by c (3 numbers, m) in the body frame, eq. (3)."""
-    fields["body_ipos"][:, robot.body(place).id] += c.T  # (3)
-
-
-def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the stiffness of a position servo by 1 + c, eq. (2).
-
-    MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
-    control u, the length l and its rate l'. The gain is scaled too where it is the same
-    stiffness.
-    """
-    number = robot.actuator(place).id
-    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
-    bias[:, 1] *= compute_factor(c[0])
-    if gain_pulls(robot, number, 1):
-        gain[:, 0] *= compute_factor(c[0])
-
-
-def _scale_damping(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the damping of a servo by 1 + c, eq. (2).
-
-    MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
-    control u, the length l and its rate l'. The gain is scaled too where it is the same
-    damping, as in a velocity servo.
-    """
-    number = robot.actuator(place).id
-    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
-    bias[:, 2] *= compute_factor(c[0])
-    if gain_pulls(robot, number, 2):
-        gain[:, 0] *= compute_factor(c[0])
-
-
 def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
     """Return whether an actuator's control is a set point of position (1) or velocity (2).
 
@@ -183,209 +93,6 @@ def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
     fixed = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     # With a position gain as well, the set point is multiplied by the position gain.
     return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
-
-
-def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity."""
-    gravity = fields["opt.gravity"]
-    # The tilt that another effect added is not scaled.
-    gravity += c[0][:, None] * robot.compiled.opt.gravity
-
-
-def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g."""
-    size = float(np.linalg.norm(robot.compiled.opt.gravity))
-    fields["opt.gravity"][:, :2] += size * c.T  # (4)
-
-
-def get_coupling_address(robot: RobotModel, place: str) -> int:
-    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
-
-    Args:
-        robot: robot with coupled drives.
-        place: joint of the drive.
-    """
-    model = robot.compiled
-    return int(model.tendon_adr[model.tendon(place + COUPLING_TENDON_SUFFIX).id]) + 1
-
-
-def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
-
-
-def _move_zero(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    fields["qpos0"][:, robot.joint(place).position] += c[0]
-
-
-def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Turn the axis of a joint by the rotation vector c in rad, eq. (6), where c is not zero.
-
-    `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
-    Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
-    """
-    number = robot.joint(place).id
-    tilted_elements = np.flatnonzero(c.any(axis=0))
-    axis = fields["jnt_axis"][tilted_elements, number]
-    vector = np.zeros(axis.shape)
-    # At a place, the effect has only the coefficients that the motion shows.
-    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[
-        :, tilted_elements
-    ].T
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    unit_vector = vector / angle
-    along = np.sum(unit_vector * axis, axis=1, keepdims=True)
-    rotated = (
-        np.cos(angle) * axis
-        + np.sin(angle) * np.cross(unit_vector, axis)
-        + (1.0 - np.cos(angle)) * along * unit_vector
-    )  # (6)
-    fields["jnt_axis"][tilted_elements, number] = rotated / np.linalg.norm(
-        rotated, axis=1, keepdims=True
-    )
-
-
-def _scale_length(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    fields["body_pos"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
-
-
-def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero."""
-    column = fields["body_gravcomp"]
-    number = robot.body(place).id
-    column[:, number] = np.where(
-        c[0], add_to_file_value(column[:, number], c[0]), column[:, number]
-    )
-
-
-def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add a point mass to a body by eq. (7), in the batch elements whose payload is not zero.
-
-    The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
-    the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
-    the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
-    """
-    number = robot.body(place).id
-    loaded = np.flatnonzero(c[0])
-    point = robot.compiled.body_ipos[number] + c[1:, loaded].T
-    mass, centre = fields["body_mass"][loaded, number], fields["body_ipos"][loaded, number]
-    total = mass + c[0, loaded]
-    middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
-    tensor = compute_inertia_tensors(
-        fields["body_iquat"][loaded, number], fields["body_inertia"][loaded, number]
-    )
-    tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
-    tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
-    moments, axes = np.linalg.eigh(tensor)
-    # A rotation has no reflection.
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    fields["body_mass"][loaded, number] = total
-    fields["body_ipos"][loaded, number] = middle
-    fields["body_inertia"][loaded, number] = moments
-    fields["body_iquat"][loaded, number] = compute_quaternions(axes)
-
-
-def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Restrict the force range of an actuator to [-c, c], eq. (5), in batch elements with c > 0.
-
-    `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
-    """
-    number = robot.actuator(place).id
-    is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
-    limits = c[0] > 0
-    free = limits & ~is_limited[:, number].astype(bool)
-    ranges[free, number] = (-np.inf, np.inf)
-    force_range = np.stack([-c[0], c[0]], axis=1)[limits]
-    low, high = ranges[limits, number].T
-    ranges[limits, number] = np.clip(force_range, low[:, None], high[:, None])  # (5)
-    is_limited[limits, number] = True
-
-
-def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the sliding friction coefficients of a pair of geoms by (1)."""
-    sliding = fields["pair_friction"][:, find_pair(robot, place), :2]
-    sliding[:] = add_to_file_value(sliding, c[0][:, None])
-
-
-def _soften(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the time constant of a pair of geoms by 1 + c (8)."""
-    solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
-    direct = solref[:, 0] <= 0
-    solref[:, 0] *= np.where(direct, factor**-2, factor)
-    solref[:, 1] *= np.where(direct, 1.0 / factor, 1.0)
-
-
-def _damp(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the damping ratio of a pair of geoms by 1 + c (8)."""
-    solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
-    direct = solref[:, 0] <= 0
-    solref[:, 0] *= np.where(direct, factor**-2, 1.0)
-    solref[:, 1] *= np.where(direct, 1.0, factor)
-
-
-COUPLING_FIELD = "wrap_prm"
-"""Model field of coupling coefficients, which a model without tendons lacks."""
-CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
-"""Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
-_SERVO_FIELDS = ("actuator_gainprm", "actuator_biasprm")
-
-MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
-    "drag.linear": ModelFieldEffect(("dof_damping",), _add_dof("dof_damping")),
-    "drag.quadratic": ModelFieldEffect(("dof_dampingpoly",), _add_quadratic),
-    "friction.coulomb": ModelFieldEffect(
-        ("dof_frictionloss", "dof_solref", "dof_solimp"), _add_friction
-    ),
-    "spring.linear": ModelFieldEffect(("jnt_stiffness",), _add_spring),
-    "spring.cubic": ModelFieldEffect(("jnt_stiffnesspoly",), _add_cubic),
-    "inertia.armature": ModelFieldEffect(
-        ("dof_armature",), _add_dof("dof_armature"), changes_derived_constants=True
-    ),
-    "mass.scale": ModelFieldEffect(
-        ("body_mass", "body_inertia"), _scale_mass, changes_derived_constants=True
-    ),
-    "mass.offset": ModelFieldEffect(("body_ipos",), _offset_mass, changes_derived_constants=True),
-    "inertia.scale": ModelFieldEffect(
-        ("body_inertia",), _scale_inertia, changes_derived_constants=True
-    ),
-    "actuator.stiffness": ModelFieldEffect(_SERVO_FIELDS, _scale_stiffness),
-    "actuator.damping": ModelFieldEffect(_SERVO_FIELDS, _scale_damping),
-    "joint.zero": ModelFieldEffect(("qpos0",), _move_zero),
-    "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
-    "link.length": ModelFieldEffect(("body_pos",), _scale_length, changes_derived_constants=True),
-    "gravity.compensation": ModelFieldEffect(
-        ("body_gravcomp",), _compensate_gravity, changes_derived_constants=True
-    ),
-    "payload": ModelFieldEffect(
-        ("body_mass", "body_ipos", "body_inertia", "body_iquat"),
-        _add_payload,
-        changes_derived_constants=True,
-    ),
-    "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
-    "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
-    "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
-    "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
-    "contact.softness": ModelFieldEffect(("pair_solref",), _soften),
-    "contact.damping": ModelFieldEffect(("pair_solref",), _damp),
-    "actuator.limit": ModelFieldEffect(
-        ("actuator_forcelimited", "actuator_forcerange"), _limit_force
-    ),
-}
-"""Model-field effects by name.
-
-Each acts at a place of its kind, and those of the world at any place, such as ``""``.
-"""
-
-
-def get_write_order(effect: str) -> int:
-    """Return the sort key of an effect in the order in which model fields are written.
-
-    A payload comes last, since errors of a body's own mass and inertia do not apply to it. In a
-    URDF, a joint's zero is a turn about the axis, so it comes after errors of the axis.
-    """
-    return int(effect in ("joint.zero", "payload"))
-
-
-Operation = Literal["abs", "add", "scale"]
-"""Operation that applies a random number to a field: replace, add to, or multiply its number."""
 
 
 @dataclass(frozen=True)
@@ -457,6 +164,270 @@ def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
 def _make_gravity_finder(*axes: int) -> Find:
     return lambda _robot, _place: [[ModelField("opt.gravity", (axis,))] for axis in axes]
 
+
+def _view_element(fields: Fields, element: ModelField) -> Any:
+    """Return an element of a field as a view (L, ...)."""
+    return fields[element.name][(slice(None), *element.address)]
+
+
+def _add(find: Find) -> FieldWriter:
+    """Make a function that adds each coefficient to its number by eq. (1)."""
+
+    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
+            view = _view_element(fields, element)
+            view[...] = add_to_file_value(view, coefficient)
+
+    return write
+
+
+def _scale(find: Find) -> FieldWriter:
+    """Make a function that scales all fields of a number by 1 + c, eq. (2)."""
+
+    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        for element in find(robot, place)[0]:
+            view = _view_element(fields, element)
+            view *= compute_factor(c[0]).reshape(-1, *[1] * (view.ndim - 1))
+
+    return write
+
+
+def _shift(find: Find) -> FieldWriter:
+    """Make a function that adds each coefficient to its number, without a lower limit."""
+
+    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
+            _view_element(fields, element)[...] += coefficient
+
+    return write
+
+
+def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the dry friction of a joint by eq. (1), in N m or N.
+
+    Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
+    with `friction_form` soft, the file's solver parameters remain.
+    """
+    column = robot.joint(place).velocity
+    loss = fields["dof_frictionloss"]
+    # A reduced friction keeps the solver parameters of the file.
+    has_added_friction = c[0] > 0
+    loss[:, column] = add_to_file_value(loss[:, column], c[0])
+    write_friction_form(fields, robot, has_added_friction, column)
+
+
+def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed."""
+    number = robot.body(place).id
+    fields["body_mass"][:, number] *= compute_factor(c[0])
+    fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
+
+
+def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity."""
+    gravity = fields["opt.gravity"]
+    # The tilt that another effect added is not scaled.
+    gravity += c[0][:, None] * robot.compiled.opt.gravity
+
+
+def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g."""
+    size = float(np.linalg.norm(robot.compiled.opt.gravity))
+    fields["opt.gravity"][:, :2] += size * c.T  # (4)
+
+
+def get_coupling_address(robot: RobotModel, place: str) -> int:
+    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
+
+    Args:
+        robot: robot with coupled drives.
+        place: joint of the drive.
+    """
+    model = robot.compiled
+    return int(model.tendon_adr[model.tendon(place + COUPLING_TENDON_SUFFIX).id]) + 1
+
+
+def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
+
+
+def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Turn the axis of a joint by the rotation vector c in rad, eq. (6), where c is not zero.
+
+    `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
+    Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
+    """
+    number = robot.joint(place).id
+    tilted_elements = np.flatnonzero(c.any(axis=0))
+    axis = fields["jnt_axis"][tilted_elements, number]
+    vector = np.zeros(axis.shape)
+    # At a place, the effect has only the coefficients that the motion shows.
+    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[
+        :, tilted_elements
+    ].T
+    angle = np.linalg.norm(vector, axis=1, keepdims=True)
+    unit_vector = vector / angle
+    along = np.sum(unit_vector * axis, axis=1, keepdims=True)
+    rotated = (
+        np.cos(angle) * axis
+        + np.sin(angle) * np.cross(unit_vector, axis)
+        + (1.0 - np.cos(angle)) * along * unit_vector
+    )  # (6)
+    fields["jnt_axis"][tilted_elements, number] = rotated / np.linalg.norm(
+        rotated, axis=1, keepdims=True
+    )
+
+
+def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero."""
+    column = fields["body_gravcomp"]
+    number = robot.body(place).id
+    column[:, number] = np.where(
+        c[0], add_to_file_value(column[:, number], c[0]), column[:, number]
+    )
+
+
+def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add a point mass to a body by eq. (7), in the batch elements whose payload is not zero.
+
+    The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
+    the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
+    the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
+    """
+    number = robot.body(place).id
+    loaded = np.flatnonzero(c[0])
+    point = robot.compiled.body_ipos[number] + c[1:, loaded].T
+    mass, centre = fields["body_mass"][loaded, number], fields["body_ipos"][loaded, number]
+    total = mass + c[0, loaded]
+    middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
+    tensor = compute_inertia_tensors(
+        fields["body_iquat"][loaded, number], fields["body_inertia"][loaded, number]
+    )
+    tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
+    tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
+    moments, axes = np.linalg.eigh(tensor)
+    # A rotation has no reflection.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    fields["body_mass"][loaded, number] = total
+    fields["body_ipos"][loaded, number] = middle
+    fields["body_inertia"][loaded, number] = moments
+    fields["body_iquat"][loaded, number] = compute_quaternions(axes)
+
+
+def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Restrict the force range of an actuator to [-c, c], eq. (5), in batch elements with c > 0.
+
+    `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
+    """
+    number = robot.actuator(place).id
+    is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+    limits = c[0] > 0
+    free = limits & ~is_limited[:, number].astype(bool)
+    ranges[free, number] = (-np.inf, np.inf)
+    force_range = np.stack([-c[0], c[0]], axis=1)[limits]
+    low, high = ranges[limits, number].T
+    ranges[limits, number] = np.clip(force_range, low[:, None], high[:, None])  # (5)
+    is_limited[limits, number] = True
+
+
+def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the sliding friction coefficients of a pair of geoms by (1)."""
+    sliding = fields["pair_friction"][:, find_pair(robot, place), :2]
+    sliding[:] = add_to_file_value(sliding, c[0][:, None])
+
+
+def _scale_solref(index: int) -> FieldWriter:
+    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (8)."""
+
+    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
+        direct = solref[:, 0] <= 0
+        solref[~direct, index] *= factor[~direct]
+        solref[direct, 0] *= factor[direct] ** -2
+        if index == 0:
+            solref[direct, 1] /= factor[direct]
+
+    return write
+
+
+COUPLING_FIELD = "wrap_prm"
+"""Model field of coupling coefficients, which a model without tendons lacks."""
+CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
+"""Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
+_SERVO_FIELDS = ("actuator_gainprm", "actuator_biasprm")
+
+MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
+    "drag.linear": ModelFieldEffect(("dof_damping",), _add(_make_dof_finder("dof_damping"))),
+    "drag.quadratic": ModelFieldEffect(
+        ("dof_dampingpoly",), _add(_make_dof_finder("dof_dampingpoly", 0))
+    ),
+    "friction.coulomb": ModelFieldEffect(
+        ("dof_frictionloss", "dof_solref", "dof_solimp"), _add_friction
+    ),
+    "spring.linear": ModelFieldEffect(
+        ("jnt_stiffness",), _add(_make_joint_finder("jnt_stiffness"))
+    ),
+    "spring.cubic": ModelFieldEffect(
+        # A spring may soften.
+        ("jnt_stiffnesspoly",),
+        _shift(_make_joint_finder("jnt_stiffnesspoly", 1)),
+    ),
+    "inertia.armature": ModelFieldEffect(
+        ("dof_armature",), _add(_make_dof_finder("dof_armature")), changes_derived_constants=True
+    ),
+    "mass.scale": ModelFieldEffect(
+        ("body_mass", "body_inertia"), _scale_mass, changes_derived_constants=True
+    ),
+    "mass.offset": ModelFieldEffect(
+        ("body_ipos",), _shift(_find_mass_centre_fields), changes_derived_constants=True
+    ),
+    "inertia.scale": ModelFieldEffect(
+        ("body_inertia",), _scale(_make_body_finder("body_inertia")), changes_derived_constants=True
+    ),
+    "actuator.stiffness": ModelFieldEffect(_SERVO_FIELDS, _scale(_make_servo_gain_finder(1))),
+    "actuator.damping": ModelFieldEffect(_SERVO_FIELDS, _scale(_make_servo_gain_finder(2))),
+    "joint.zero": ModelFieldEffect(
+        ("qpos0",), _shift(lambda r, place: [[ModelField("qpos0", (r.joint(place).position,))]])
+    ),
+    "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
+    "link.length": ModelFieldEffect(
+        ("body_pos",), _scale(_make_body_finder("body_pos")), changes_derived_constants=True
+    ),
+    "gravity.compensation": ModelFieldEffect(
+        ("body_gravcomp",), _compensate_gravity, changes_derived_constants=True
+    ),
+    "payload": ModelFieldEffect(
+        ("body_mass", "body_ipos", "body_inertia", "body_iquat"),
+        _add_payload,
+        changes_derived_constants=True,
+    ),
+    "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
+    "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
+    "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
+    "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
+    "contact.softness": ModelFieldEffect(("pair_solref",), _scale_solref(0)),
+    "contact.damping": ModelFieldEffect(("pair_solref",), _scale_solref(1)),
+    "actuator.limit": ModelFieldEffect(
+        ("actuator_forcelimited", "actuator_forcerange"), _limit_force
+    ),
+}
+"""Model-field effects by name.
+
+Each acts at a place of its kind, and those of the world at any place, such as ``""``.
+"""
+
+
+def get_write_order(effect: str) -> int:
+    """Return the sort key of an effect in the order in which model fields are written.
+
+    A payload comes last, since errors of a body's own mass and inertia do not apply to it. In a
+    URDF, a joint's zero is a turn about the axis, so it comes after errors of the axis.
+    """
+    return int(effect in ("joint.zero", "payload"))
+
+
+Operation = Literal["abs", "add", "scale"]
+"""Operation that applies a random number to a field: replace, add to, or multiply its number."""
 
 _FIELDS: Mapping[str, Find] = {
     "drag.linear": _make_dof_finder("dof_damping"),

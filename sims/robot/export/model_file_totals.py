@@ -10,7 +10,7 @@ import numpy as np
 from sims.core.effect import Effect
 from sims.robot.contact_pairs import add_contact_pairs, find_pair
 from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
-from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS, get_write_order
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS, get_write_order, model_fields
 from sims.robot.robot_model import RobotModel
 
 
@@ -33,18 +33,6 @@ Read = Callable[[Fields, RobotModel, str], Sequence[float]]
 
 It takes the model fields, the robot and the place.
 """
-
-
-def _make_dof_reader(field: str, *index: int) -> Read:
-    return lambda f, r, place: [f[field][(0, r.joint(place).velocity, *index)]]
-
-
-def _make_joint_reader(field: str, *index: int) -> Read:
-    return lambda f, r, place: [f[field][(0, r.joint(place).id, *index)]]
-
-
-def _make_servo_reader(term: int) -> Read:
-    return lambda f, r, place: [-f["actuator_biasprm"][0, r.actuator(place).id, term]]
 
 
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
@@ -76,51 +64,28 @@ def _make_solref_reader(index: int) -> Read:
     return read
 
 
-class Reading(NamedTuple):
-    """How a number is read from the model fields, and its unit.
-
-    Attributes:
-        read: function that reads the numbers.
-        hinge: unit at a hinge; the unit of the coefficient if empty.
-        slide: unit at a slide; the unit at a hinge if empty.
-    """
-
-    read: Read
-    hinge: str = ""
-    slide: str = ""
-
-
-_READING_BY_EFFECT: Mapping[str, Reading] = {
-    "drag.linear": Reading(_make_dof_reader("dof_damping")),
-    "drag.quadratic": Reading(_make_dof_reader("dof_dampingpoly", 0)),
-    "friction.coulomb": Reading(_make_dof_reader("dof_frictionloss")),
-    "inertia.armature": Reading(_make_dof_reader("dof_armature")),
-    "spring.linear": Reading(_make_joint_reader("jnt_stiffness")),
-    "spring.cubic": Reading(_make_joint_reader("jnt_stiffnesspoly", 1)),
-    "actuator.limit": Reading(_get_force_limit),
-    "actuator.stiffness": Reading(_make_servo_reader(1), "N*m/rad", "N/m"),
-    "actuator.damping": Reading(_make_servo_reader(2), "N*m*s/rad", "N*s/m"),
-    "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
-    "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
-    # The largest of the three principal moments represents the tensor.
-    "inertia.scale": Reading(
-        lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
-    ),
-    "contact.damping": Reading(_make_solref_reader(1)),
-    "contact.friction": Reading(
-        lambda f, r, place: [f["pair_friction"][0, find_pair(r, place), 0]]
-    ),
-    "contact.softness": Reading(_make_solref_reader(0), "s"),
-    "joint.zero": Reading(
-        lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
-    ),
-    "link.length": Reading(
-        lambda f, r, place: [float(np.linalg.norm(f["body_pos"][0, r.body(place).id]))], "m"
-    ),
-    "gravity.compensation": Reading(lambda f, r, place: [f["body_gravcomp"][0, r.body(place).id]]),
-    "gravity.scale": Reading(_get_gravity_strength, "m/s^2"),
-    "gravity.tilt": Reading(lambda f, *_: f["opt.gravity"][0, :2], "m/s^2"),
+_READERS: Mapping[str, Read] = {
+    "actuator.limit": _get_force_limit,
+    "contact.damping": _make_solref_reader(1),
+    "contact.friction": lambda f, r, place: [f["pair_friction"][0, find_pair(r, place), 0]],
+    "contact.softness": _make_solref_reader(0),
+    "gravity.compensation": lambda f, r, place: [f["body_gravcomp"][0, r.body(place).id]],
+    "gravity.scale": _get_gravity_strength,
+    "joint.zero": lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
+    "link.length": lambda f, r, place: [float(np.linalg.norm(f["body_pos"][0, r.body(place).id]))],
 }
+"""Readers of numbers that are more than one element of a field, or may be missing."""
+_UNITS: Mapping[str, tuple[str, str]] = {
+    "actuator.stiffness": ("N*m/rad", "N/m"),
+    "actuator.damping": ("N*m*s/rad", "N*s/m"),
+    "mass.scale": ("kg", ""),
+    "inertia.scale": ("kg*m^2", ""),
+    "contact.softness": ("s", ""),
+    "link.length": ("m", ""),
+    "gravity.scale": ("m/s^2", ""),
+    "gravity.tilt": ("m/s^2", ""),
+}
+"""Units at a hinge and at a slide, where they differ from that of the coefficient."""
 
 
 Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
@@ -148,7 +113,7 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
     for effect, values in sorted(
         fitted, key=lambda entry: get_write_order(_get_effect_name(entry[0]))
     ):
-        if _get_effect_name(effect) in _READING_BY_EFFECT:
+        if _read_numbers(file_fields, robot, effect):
             c = np.array(values, dtype=float)[:, None]
             MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(
                 changed_fields, robot, effect.place, c
@@ -161,6 +126,18 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
 
 def _get_effect_name(effect: type[Effect]) -> str:
     return effect.of or effect.name
+
+
+def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Sequence[float]:
+    """Return the numbers that an effect's coefficients change; empty if the file has none."""
+    name, place = _get_effect_name(effect), effect.place
+    if name in _READERS:
+        return _READERS[name](fields, robot, place)
+    # The largest of three principal moments represents a tensor.
+    return [
+        main.sign * np.max(fields[main.name][(0, *main.address)])
+        for main, *_ in model_fields(robot, name, place)
+    ]
 
 
 def _list_totals(
@@ -178,18 +155,16 @@ def _list_totals(
         file_fields: fields of the model file.
         changed_fields: fields with the effect.
     """
-    if _get_effect_name(effect) not in _READING_BY_EFFECT:
-        return [None] * count
-    reading = _READING_BY_EFFECT[_get_effect_name(effect)]
-    number_totals: list[Total | None] = []
-    pairs = (
-        np.array(reading.read(f, robot, effect.place), dtype=float)
+    pairs = [
+        np.array(_read_numbers(f, robot, effect), dtype=float)
         for f in (file_fields, changed_fields)
-    )
+    ]
+    if not pairs[0].size:
+        return [None] * count
+    hinge_unit, slide_unit = _UNITS.get(_get_effect_name(effect), ("", ""))
+    number_totals: list[Total | None] = []
     for c, before, total in zip(effect.coefficients, *pairs, strict=True):
-        unit = (
-            (reading.slide if _acts_on_slide(robot, effect) else "") or reading.hinge or c.units[0]
-        )
+        unit = (slide_unit if _acts_on_slide(robot, effect) else "") or hinge_unit or c.units[0]
         is_stated = np.isfinite([before, total]).all()
         number_totals.append(Total(float(before), float(total), unit or "1") if is_stated else None)
     return number_totals
