@@ -156,22 +156,9 @@ class FloatingJoints:
         Returns:
             The displaced poses (n, P).
         """
-        result = pose.copy()
-        for axes, quaternion_columns, first in self._joint_addresses:
-            # A free joint has its position before its quaternion.
-            rotation_index = number - first - len(axes)
-            if -len(axes) <= rotation_index < 0:
-                result[:, quaternion_columns.start + rotation_index] += displacement
-            elif 0 <= rotation_index < len(ANGULAR_VELOCITY_AXES):
-                quaternion = np.zeros(len(QUATERNION_ENTRIES))
-                quaternion[0], quaternion[1 + rotation_index] = (
-                    np.cos(0.5 * displacement),
-                    np.sin(0.5 * displacement),
-                )
-                result[:, quaternion_columns] = _multiply_quaternions(
-                    pose[:, quaternion_columns], quaternion[None]
-                )
-        return result
+        displacements = np.zeros((len(pose), self.velocities.size))
+        displacements[:, number] = displacement
+        return self.displaced(pose, displacements)
 
     def displaced(self, pose: Array, displacements: Array) -> Array:
         """Displace poses (n, P) by small displacements (n, F) by eq. (1), in m and rad.

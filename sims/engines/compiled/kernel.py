@@ -33,6 +33,13 @@ from sims.engines.compiled.data_layout import (
 
 _MAX_COMPILE_SECONDS = 20
 """Approximate compilation time of the batch engine in seconds, the longest one."""
+_PYTHON_MODULES = frozenset(
+    {
+        *("batch_runner.py", "code_cache.py", "compilability.py", "force_program.py"),
+        *("kernel.py", "numpy_forces.py", "traced_array.py"),
+    }
+)
+"""Source files of this package on which no compiled code depends."""
 _lock = Lock()
 
 
@@ -260,5 +267,6 @@ def make_cache_name(module: str, constants: Mapping[str, int]) -> str:
 def list_source_files(module: str) -> list[Path]:
     """Return the source files from which the code of a module is compiled, and those around it."""
     folder = Path(__file__).parent
-    files = {*folder.glob("*.py"), folder.parent / "ground_contact.py"}
-    return sorted({*files, Path(str(sys.modules[module].__file__))})
+    files = [path for path in folder.glob("*.py") if path.name not in _PYTHON_MODULES]
+    files += [folder.parent / "ground_contact.py", Path(str(sys.modules[module].__file__))]
+    return sorted(set(files))

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.effect import ActiveEffects, Input, Sensor, members_of
+from sims.core.effect import ActiveEffects, members_of
 from sims.core.simulator import Array, Scenario
 from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
 from sims.robot.dynamics.linearisation_about_simulation import (
@@ -150,12 +150,8 @@ class MeasuredLinear(RunLinearisation):
             with np.errstate(all="ignore"), capture_mujoco_warnings():
                 read = self._tangent.motion_readings
             self._readings = {name: read[:, i] for i, name in enumerate(self._sensor_channels)}
-        unchanged_states = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
-        unchanged_readings = np.zeros((1, self._motion.x.shape[0], len(self._sensor_channels)))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self.observed = self._compute_observations(unchanged_states, unchanged_readings, [()])[
-                0
-            ]
+            self.observed = self._observe_nominal_motion()
         knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
         self.knots: IndexArray = np.clip(knots, 0, self._steps)
 
@@ -398,19 +394,7 @@ class MeasuredLinear(RunLinearisation):
             (driven,) = compute_control_changes([self], effects)
         for begin in range(0, count, CANDIDATES_PER_BLOCK):
             block = range(begin, min(begin + CANDIDATES_PER_BLOCK, count))
-            changes: list[Perturbation] = []
-            sensors: list[ActiveEffects] = []
-            for owner, number in enumerate(block):
-                effect, c = effects[number]
-                parts = effect.parts(c[:, None, None])
-                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
-                for part, k in parts:
-                    is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(
-                        part
-                    )
-                    if not is_handled_otherwise and k.any():
-                        changes += self._list_perturbations(owner, part, k)
-                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+            changes, sensors = self._list_changes(effects, block, driven)
             columns = slice(begin, block.stop)
             with np.errstate(all="ignore"):
                 stepwise_inputs, direct_readings = self._tangent.sum_inputs_and_readings(

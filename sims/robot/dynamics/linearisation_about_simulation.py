@@ -94,13 +94,17 @@ class RunLinearisation:
             self._tangent = self._make_tangent_model()
             self._preparation_count = self._tangent.placed_element_count
         self._perturbation_cache: dict[tuple[str, bytes], Perturbation] = {}
-        unchanged_states = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
-        unchanged_readings = np.zeros((1, self._motion.x.shape[0], len(self._sensor_channels)))
-        self.observed: Array = self._compute_observations(
-            unchanged_states, unchanged_readings, [()]
-        )[0]
+        self.observed = self._observe_nominal_motion()
         # The joints of the file come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
+
+    def _observe_nominal_motion(self) -> Array:
+        """Return the observations (T, C) of the motion without perturbations."""
+        steps = len(self._motion.x)
+        states = np.zeros((1, steps, self._tangent.state_size))
+        readings = np.zeros((1, steps, len(self._sensor_channels)))
+        observed: Array = self._compute_observations(states, readings, [()])[0]
+        return observed
 
     def _simulate_nominal_motion(self) -> RobotMotion:
         """Simulate the motion of the run, plus one step that begins at the run's end."""
@@ -223,19 +227,7 @@ class RunLinearisation:
             )
         for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
             block = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
-            changes: list[Perturbation] = []
-            sensors: list[ActiveEffects] = []
-            for owner, number in enumerate(block):
-                effect, c = added[number]
-                parts = effect.parts(c[:, None, None])
-                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
-                for part, k in parts:
-                    if isinstance(part, Sensor) or not k.any():
-                        continue
-                    if isinstance(part, Input) or is_series_effect(part):
-                        continue
-                    changes += self._list_perturbations(owner, part, k)
-                changes += [c._replace(owner=owner) for c in control_changes.get(number, ())]
+            changes, sensors = self._list_changes(added, block, control_changes)
             # A change that overflows is one that a fit could not follow.
             with np.errstate(all="ignore"):
                 states, readings = self._tangent.propagate(changes, len(block))
@@ -244,6 +236,37 @@ class RunLinearisation:
             result[not_in_series] = (observations - self.observed)[not_in_series - block.start]
         placed_count = self._tangent.placed_element_count - before
         return result, 1 + len(in_series) + placed_count // len(self._motion.controls)
+
+    def _list_changes(
+        self,
+        added: Sequence[EffectWithCoefficients],
+        numbers: range,
+        control_changes: Mapping[int, Sequence[Perturbation]],
+    ) -> tuple[list[Perturbation], list[ActiveEffects]]:
+        """Return the perturbations and the sensor effects of some added effects.
+
+        Effects in series with joints have no perturbation.
+
+        Args:
+            added: effects with their coefficients.
+            numbers: numbers of the effects; the first owns the perturbations with owner 0.
+            control_changes: changes of the controls by effects on inputs, by number of the effect.
+
+        Returns:
+            Perturbations of the motion, and the sensor effects of each effect.
+        """
+        changes: list[Perturbation] = []
+        sensors: list[ActiveEffects] = []
+        for owner, number in enumerate(numbers):
+            effect, c = added[number]
+            parts = effect.parts(c[:, None, None])
+            sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
+            for part, k in parts:
+                is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(part)
+                if not is_handled_otherwise and k.any():
+                    changes += self._list_perturbations(owner, part, k)
+            changes += [c._replace(owner=owner) for c in control_changes.get(number, ())]
+        return changes, sensors
 
     def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
         """Simulate observations (K, T, C) of the run with each effect added.

@@ -294,7 +294,9 @@ class TangentModel:
 
     # -- propagation over time
 
-    def propagate(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
+    def propagate(
+        self, changes: Sequence[Perturbation], count: int, initial: Array | None = None
+    ) -> tuple[Array, Array]:
         """Propagate changes along the motion by (2), added up for each owner.
 
         A step multiplies a change of the state by A and adds B times the change of forces and C
@@ -304,6 +306,7 @@ class TangentModel:
         Args:
             changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
+            initial: (Z, n) changes of the initial state; none by default.
 
         Returns:
             Changes of states (n, S + 1, Z) and of readings (n, S, O).
@@ -315,6 +318,8 @@ class TangentModel:
         # States, forces and controls are stacked, so that a step is one matrix product.
         stacked = np.zeros((steps + 1, state_size + inputs.shape[1], count))
         stacked[:-1, state_size:] = inputs
+        if initial is not None:
+            stacked[0, :state_size] = initial
         step_matrices = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
         stacked_steps = list(stacked)
         for t, point in enumerate(self._at.point_of_step.tolist()):
@@ -466,21 +471,13 @@ class TangentModel:
     def propagate_initial_state(self) -> tuple[Array, Array]:
         """Compute the responses to each initial position and velocity.
 
-        The first D columns are unit changes of the positions, the others those of the
-        velocities. There are no forces, so that dz_{t+1} = A_t dz_t.
+        The first D changes are unit changes of the positions, the others those of the velocities.
 
         Returns:
             Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
         """
         count = 2 * self._motion.x.shape[1]
-        q = self.quotients
-        states = np.zeros((self._steps + 1, self.state_size, count))
-        readings = np.zeros((self._steps, self._at.output_count, count))
-        states[0, :count] = np.eye(count)
-        for t in range(self._steps):
-            readings[t] = q.read_states[self._at.point_of_step[t]] @ states[t]
-            states[t + 1] = q.states[self._at.point_of_step[t]] @ states[t]
-        return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
+        return self.propagate((), count, np.eye(self.state_size, count))
 
 
 def compute_runge_kutta_step(
