@@ -1,8 +1,7 @@
 """Compiled kernel of the batch engine: loaded from the user's cache, or compiled once.
 
-numba translates the functions (`kernel_build`), which takes 20 s. The machine code is stored
-(`machine_code`) and loaded with llvmlite alone (`machine_code`), in a few hundredths of a second and
-without numba.
+numba translates the functions (`kernel_build`), which takes 20 s. The machine code is stored and
+loaded with llvmlite alone (`machine_code`), in a few hundredths of a second and without numba.
 """
 
 from __future__ import annotations
@@ -33,12 +32,7 @@ from sims.engines.compiled.data_layout import (
 
 _MAX_COMPILE_SECONDS = 20
 """Approximate compilation time of the batch engine in seconds, the longest one."""
-_PYTHON_MODULES = frozenset(
-    {
-        *("batch_runner.py", "code_cache.py", "compilability.py", "force_program.py"),
-        *("kernel.py", "numpy_forces.py", "traced_array.py"),
-    }
-)
+_PYTHON_MODULES = ("batch_runner.py", "force_program.py", "kernel.py", "numpy_forces.py")
 """Source files of this package on which no compiled code depends."""
 _lock = Lock()
 
