@@ -162,7 +162,7 @@ class ContactCase(Case):
 
     @cached_property
     def motions(self):
-        """Motion of the true robot by run."""
+        """Motion of the true robot by run: (commands, states)."""
         rng = np.random.default_rng([self.seed, 0])
         return {
             run: record_motion(self.robot, self.numbers, self.true_model, form, rng)
@@ -173,8 +173,8 @@ class ContactCase(Case):
     def gap(self):
         """RMS error of the model file from the true initial states, in multiples of the noise."""
         errors = [
-            (replay(self.model, motion.states[0], motion.commands) - motion.states)
-            for motion in self.motions.values()
+            replay(self.model, states[0], commands) - states
+            for commands, states in self.motions.values()
         ]
         return compute_rms(np.concatenate(errors)[:, : self.model.nq]) / NOISE
 
@@ -187,8 +187,8 @@ class ContactCase(Case):
         deviation = NOISE * np.random.default_rng(0).standard_normal(2 * self.model.nq)
         deviation[self.model.nq :] = 0.0
         errors = [
-            replay(self.true_model, motion.states[0] + deviation, motion.commands) - motion.states
-            for motion in self.motions.values()
+            replay(self.true_model, states[0] + deviation, commands) - states
+            for commands, states in self.motions.values()
         ]
         later = np.array(errors)[:, RATE // 10 :, : self.model.nq] / NOISE
         return float(np.sqrt(np.square(later).mean(axis=1)).max())
@@ -205,10 +205,10 @@ class ContactCase(Case):
             f"q.{joint}": (position_unit(model.joint(joint)), NOISE) for joint in self.joints
         }
         tables = {}
-        for run, motion in self.motions.items():
-            readings = motion.states[:, : model.nq]
+        for run, (commands, states) in self.motions.items():
+            readings = states[:, : model.nq]
             readings = readings + NOISE * rng.standard_normal(readings.shape)
-            tables[run] = (run == HELD_OUT, np.arange(SAMPLES) / RATE, motion.commands, readings)
+            tables[run] = (run == HELD_OUT, np.arange(SAMPLES) / RATE, commands, readings)
         text = write_model(self.robot, self.numbers)
         return write_robot_recording(
             folder, "log", inputs, channels, tables, (f"{self.robot}.xml", text)

@@ -6,12 +6,9 @@ leaves the ground and lands again. Sizes, masses and the numbers of the contact 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import mujoco
 import numpy as np
 
-from tests.exams.planted.planted_motion import RATE, SAMPLES, SECONDS, reference
+from tests.exams.planted.planted_motion import RATE, SAMPLES, SECONDS, Run, Simulator, reference
 
 SETTLE_SAMPLES = 200  # Samples before a run, in which the robot comes to rest.
 PUSH_BANDWIDTH = 2 * np.pi * 2.0  # Bandwidth of the loop that moves the sled, rad/s.
@@ -102,32 +99,13 @@ def write_model(robot, numbers):
     return TEXTS[robot].format(**numbers)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A run: commands (SAMPLES, nu) and states (SAMPLES, nq + nv)."""
-
-    commands: np.ndarray
-    states: np.ndarray
-
-
-def _steps(data, command, model):
-    data.ctrl[:] = command
-    mujoco.mj_step(model, data, nstep=round(1 / RATE / model.opt.timestep))
-
-
 def replay(model, start, commands):
     """Return the states (SAMPLES, nq + nv) from a state under commands that are held."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = start[: model.nq], start[model.nq :]
-    states = np.empty((len(commands), start.size))
-    for sample, command in enumerate(commands):
-        states[sample] = np.concatenate([data.qpos, data.qvel])
-        _steps(data, command, model)
-    return states
+    return Simulator(model, []).simulate(Run(commands, start[: model.nq], start[model.nq :]))
 
 
 def record_motion(robot, numbers, model, form, rng):
-    """Drive a robot with the numbers of its contact for one run.
+    """Drive a robot with the numbers of its contact for one run: (commands, states).
 
     Args:
         robot: a key of `TEXTS`.
@@ -139,22 +117,21 @@ def record_motion(robot, numbers, model, form, rng):
     drive = {"arm": _drive_arm, "sled": _drive_sled, "hopper": _drive_hopper}[robot]
     waves = reference(form, 2, rng)
     begin, command = drive(numbers, waves, rng)
-    data = mujoco.MjData(model)
-    data.qpos[:] = begin
+    simulator = Simulator(model, [])
+    simulator.start(begin, np.zeros(model.nv))
     for _ in range(SETTLE_SAMPLES):
-        _steps(data, command(0, data), model)
-    start = np.concatenate([data.qpos, data.qvel])
+        simulator.advance(command(0, simulator.data))
     # The warm start of MuJoCo's solver is no part of the state that a log states.
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = start[: model.nq], start[model.nq :]
+    start = simulator.data.qpos.copy(), simulator.data.qvel.copy()
+    simulator.start(*start)
     commands = []
     for sample in range(SAMPLES):
-        given = command(sample, data)
         # Round as in the table.
+        given = command(sample, simulator.data)
         commands.append([float(f"{value:.9g}") for value in given])
-        _steps(data, commands[-1], model)
-    commands = np.array(commands)
-    return Motion(commands, replay(model, start, commands))
+        simulator.advance(commands[-1])
+    run = Run(np.array(commands), *start)
+    return run.commands, simulator.simulate(run)
 
 
 def _drive_arm(numbers, waves, rng):

@@ -175,7 +175,7 @@ class PlantedCase(Case):
         for index in range(model.nu):
             joint, name = model.joint(model.actuator_trnid[index, 0]), model.actuator(index).name
             inputs[f"u.{name}"] = signal_unit("u", position_unit(joint), robot.drive == "motor")
-            actuators[name] = robot.describe_actuator(joint.name, self.force_limits)
+            actuators[name] = robot.drive_of(joint.name, self.force_limits).description
         channels = [f"q.{joint}" for joint in experiment.joints]
         if self.with_velocities:
             channels += [f"qd.{joint}" for joint in experiment.joints]

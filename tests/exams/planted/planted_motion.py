@@ -152,12 +152,12 @@ class Simulator:
     def simulate(self, run):
         """Return positions and velocities (SAMPLES, nq + nv) of a run."""
         self.start(run.positions, run.velocities)
-        states = np.empty((SAMPLES, self.model.nq + self.model.nv))
-        for sample in range(SAMPLES):
-            states[sample] = np.concatenate([self.data.qpos, self.data.qvel])
-            if sample + 1 < SAMPLES:
-                self.advance(run.commands[sample])
-        return states
+        states = []
+        for command in run.commands:
+            states.append(np.concatenate([self.data.qpos, self.data.qvel]))
+            if len(states) < len(run.commands):
+                self.advance(command)
+        return np.array(states)
 
 
 class Operator:

@@ -16,6 +16,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from tests.exams.robots.exam_robots import Drive, compile_urdf, plain
+
 STIFF_SERVO = (2000.0, 100.0)
 """Gains kp (N m/rad) and kv (N m s/rad) of a stiff position servo."""
 
@@ -84,21 +86,13 @@ class Robot:
     @cached_property
     def text(self):
         """Text of the model file in the recording (without the servos of a URDF)."""
-        tree = ElementTree.fromstring(self.source().read_text())
-        (self._edit_urdf if self.is_urdf else self._edit_mjcf)(tree)
+        text = self.source().read_text()
+        if self.is_urdf:
+            return plain(text, self.locked)
+        tree = ElementTree.fromstring(text)
+        self._edit_mjcf(tree)
         ElementTree.indent(tree)
         return ElementTree.tostring(tree, encoding="unicode") + "\n"
-
-    def _edit_urdf(self, tree):
-        for element in list(tree):
-            if element.tag not in ("link", "joint"):
-                tree.remove(element)
-                continue
-            for tag in ("visual", "collision", "safety_controller", "calibration", "mimic"):
-                for found in element.findall(tag):
-                    element.remove(found)
-            if element.tag == "joint" and element.get("name") in self.locked:
-                element.set("type", "fixed")
 
     def _edit_mjcf(self, tree):
         for body in tree.iter("body"):
@@ -154,35 +148,21 @@ class Robot:
         """Compile the model with plain MuJoCo, including actuators of the description."""
         import mujoco
 
-        limits = force_limits or {}
-        spec = mujoco.MjSpec.from_string(self.model_text(limits))
-        if self.is_urdf:
-            timestep, integrator = self.engine
-            spec.option.timestep = timestep
-            spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-            for joint in spec.joints:
-                if self.driven and joint.name not in self.driven:
-                    continue
-                actuator = spec.add_actuator(name=f"s_{joint.name}", target=joint.name)
-                actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-                if self.drive == "servo":
-                    actuator.set_to_position(kp=self.gains[0], kv=self.gains[1])
-                    if joint.name in limits:
-                        actuator.forcelimited = True
-                        actuator.forcerange = [-limits[joint.name], limits[joint.name]]
-                else:
-                    actuator.set_to_motor()
-        return spec.compile()
+        if not self.is_urdf:
+            return mujoco.MjModel.from_xml_string(self.model_text(force_limits or {}))
+        drives = [self.drive_of(joint, force_limits or {}) for joint in self._driven_joints()]
+        return compile_urdf(self.text, drives, *self.engine)
 
-    def describe_actuator(self, joint, force_limits):
-        """Return the table of a recording's description for the actuator of a joint."""
-        if self.drive == "motor":
-            return {"joint": joint, "kind": "motor"}
-        kp, kv = self.gains
-        table = {"joint": joint, "kind": "position", "kp": kp, "kv": kv}
-        if joint in force_limits:
-            table["force_range"] = [-force_limits[joint], force_limits[joint]]
-        return table
+    def _driven_joints(self):
+        """Return the names of the driven joints of a URDF."""
+        joints = ElementTree.fromstring(self.text).findall("joint")
+        names = [joint.get("name") for joint in joints if joint.get("type") != "fixed"]
+        return [name for name in names if not self.driven or name in self.driven]
+
+    def drive_of(self, joint, force_limits):
+        """Return the actuator of a joint, with its force limit by joint, N m or N."""
+        kind, gains = ("motor", (0.0, 0.0)) if self.drive == "motor" else ("position", self.gains)
+        return Drive(joint, kind, *gains, force_limits.get(joint, np.inf), f"s_{joint}")
 
     def about(self, model):
         """Return the positions (nq,) around which the robot moves."""

@@ -17,7 +17,8 @@ class Drive:
         joint: name of the joint.
         kind: motor (the control is a force) or position (force kp (u - q) - kv v).
         kp, kv: gains of a position servo.
-        force: largest force, N m or N.
+        force: largest force, N m or N; infinite without a limit.
+        called: name of the actuator; m_JOINT if empty.
     """
 
     joint: str
@@ -25,10 +26,18 @@ class Drive:
     kp: float
     kv: float
     force: float
+    called: str = ""
 
     @property
     def name(self):
-        return f"m_{self.joint}"
+        return self.called or f"m_{self.joint}"
+
+    @property
+    def description(self):
+        """Table of the actuator in a recording's description."""
+        gains = {"kp": self.kp, "kv": self.kv} if self.kp else {}
+        limits = {"force_range": [-self.force, self.force]} if np.isfinite(self.force) else {}
+        return {"joint": self.joint, "kind": self.kind} | gains | limits
 
 
 @dataclass(frozen=True)
@@ -80,14 +89,8 @@ class Machine:
     @property
     def description(self):
         """Tables of a recording's description that say what the model file does not."""
-        actuators = {
-            d.name: {"joint": d.joint, "kind": d.kind}
-            | ({"kp": d.kp, "kv": d.kv} if d.kp else {})
-            | {"force_range": [-d.force, d.force]}
-            for d in self.drives
-        }
         engine = {"timestep": self.step, "integrator": self.integrator}
-        return {"engine": engine, "actuators": actuators}
+        return {"engine": engine, "actuators": {d.name: d.description for d in self.drives}}
 
     def stated_initial_state(self, run):
         """Return the initial state of a run that its description states: none."""
@@ -203,23 +206,29 @@ def _mounted(tree, mount):
     ElementTree.SubElement(fixed, "origin", {"xyz": "0 0 0", "rpy": angles})
 
 
-def compiled(machine, step=None, integrator=None):
-    """Compile a MuJoCo model of the machine with its actuators."""
+def compile_urdf(text, drives, step, integrator):
+    """Compile a MuJoCo model of a URDF with actuators.
+
+    Args:
+        text: text of the file.
+        drives: actuators.
+        step: time step, s.
+        integrator: name of the integrator.
+    """
     import mujoco
 
-    spec = mujoco.MjSpec.from_string(machine.urdf)
-    spec.option.timestep = step or machine.step
-    name = f"mjINT_{(integrator or machine.integrator).upper()}"
-    spec.option.integrator = getattr(mujoco.mjtIntegrator, name)
-    for drive in machine.drives:
+    spec = mujoco.MjSpec.from_string(text)
+    spec.option.timestep = step
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    for drive in drives:
         actuator = spec.add_actuator(name=drive.name, target=drive.joint)
         actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
         if drive.kind == "position":
             actuator.set_to_position(kp=drive.kp, kv=drive.kv)
         else:
             actuator.set_to_motor()
-        actuator.forcerange = [-drive.force, drive.force]
-        actuator.forcelimited = True
+        if np.isfinite(drive.force):
+            actuator.forcerange, actuator.forcelimited = [-drive.force, drive.force], True
     return spec.compile()
 
 
@@ -227,7 +236,9 @@ def moved(machine, run, step=None, integrator=None):
     """Return positions and velocities (T, N) at the run's time stamps, multiples of the step."""
     import mujoco
 
-    model = compiled(machine, step, integrator)
+    model = compile_urdf(
+        machine.urdf, machine.drives, step or machine.step, integrator or machine.integrator
+    )
     data = mujoco.MjData(model)
     places = [model.joint(name).qposadr[0] for name in machine.joints]
     rates = [model.joint(name).dofadr[0] for name in machine.joints]

@@ -61,23 +61,8 @@ class Case:
         return folder / self.file
 
 
-def motor(name, joint, force=1e4):
-    return (
-        Drive(joint, "motor", 0.0, 0.0, force)
-        if name == f"m_{joint}"
-        else _Named(joint, "motor", 0.0, 0.0, force, name)
-    )
-
-
-@dataclass(frozen=True)
-class _Named(Drive):
-    """An actuator whose name is given by the file."""
-
-    called: str = ""
-
-    @property
-    def name(self):
-        return self.called
+def motor(name, joint):
+    return Drive(joint, "motor", 0.0, 0.0, np.inf, name)
 
 
 class FromMjcf(Machine):
@@ -142,7 +127,7 @@ def write_case(case, folder, seed=0):
     channels = {f"q.{joint}": (machine.unit(joint), NOISE) for joint in machine.joints}
     actuators = machine.description["actuators"]
     for table in actuators.values():
-        del table["force_range"]
+        table.pop("force_range", None)
     more = {"actuators": actuators} if case.path.suffix == ".urdf" else {}
     more |= {"engine": case.engine} if case.engine else {}
     model = (case.path, None)

@@ -270,13 +270,7 @@ def differs(machine, name, c, moves, folder):
     run = driven(machine, moves, stamps=np.arange(101) / 100)
     bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))
     (folder / "robot.urdf").write_text(machine.urdf)
-    drives = {
-        d.name: {"joint": d.joint, "kind": d.kind, "force_range": [-d.force, d.force]}
-        | ({"kp": d.kp, "kv": d.kv} if d.kind == "position" else {})
-        for d in machine.drives
-    }
-    engine = {"timestep": machine.step, "integrator": machine.integrator}
-    kind = make_robot_simulator(read_robot(folder / "robot.urdf", actuators=drives, engine=engine))
+    kind = make_robot_simulator(read_robot(folder / "robot.urdf", **machine.description))
     simulator = kind(observe=[f"q.{joint}" for joint in machine.joints], effects=[name])
     initial = {f"q.{joint}": q for joint, q in zip(machine.joints, run.q, strict=True)}
     inputs = {f"u.{drive}": u for drive, u in run.commands.items()}
