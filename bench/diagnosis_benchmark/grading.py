@@ -224,13 +224,13 @@ def _count_covered_intervals(
     if not set(case.effects) <= leading_causes:
         return {}  # parameters fitted together with a wrong cause are not comparable
     return {
-        name: _contains_value(intervals[name], value)
+        name: contains_value(intervals[name], value)
         for name, value in truth.items()
         if intervals.get(name)
     }
 
 
-def _contains_value(estimate: Mapping[str, float | None], value: float) -> bool | None:
+def contains_value(estimate: Mapping[str, float | None], value: float) -> bool | None:
     """Return whether a 95 % interval contains a value; None if the interval is open.
 
     Args:

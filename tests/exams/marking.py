@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 
-from bench.diagnosis_benchmark.grading import grade_sets, list_named_sets
+from bench.diagnosis_benchmark.grading import contains_value, grade_sets, list_named_sets
 
 
 @dataclass(frozen=True)
@@ -190,9 +190,7 @@ def covered_intervals(effects, verdict):
             }
             pairs = [((k, cause["coefficients"][k]), v) for k, v in values.items() if v is not None]
         for (key, estimate), value in pairs:
-            low, high = estimate["low"], estimate["high"]
-            is_open = low is None or high is None
-            covered[f"{cause['effect']} {key}"] = None if is_open else bool(low <= value <= high)
+            covered[f"{cause['effect']} {key}"] = contains_value(estimate, value)
     return covered
 
 
@@ -203,6 +201,5 @@ def _is_number_right(hidden_cause, verdict):
     if not estimates:
         return None
     estimate = next(iter(estimates[0].values()))
-    low, high, value = estimate["low"], estimate["high"], coefficients[0]
-    is_inside = low is not None and high is not None and low <= value <= high
-    return bool(abs(estimate["value"] - value) <= 0.05 * abs(value) or is_inside)
+    is_near = abs(estimate["value"] - coefficients[0]) <= 0.05 * abs(coefficients[0])
+    return bool(is_near or contains_value(estimate, coefficients[0]))

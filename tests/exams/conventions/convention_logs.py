@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from tests.exams.planted.planted_motion import Change
 from tests.exams.robot_files import write_robot_recording
 
 BROKEN = (
@@ -31,6 +32,11 @@ BROKEN = (
 """Conventions to break, one in each log."""
 CAUSES = ("nothing", "friction", "damping", "delay", "offset", "mass", "stiffness")
 """Causes in correct logs; they are not broken conventions."""
+CHANGES = {
+    "friction": ("frictionloss", "j", (0.1, 0.8)), "damping": ("damping", "j", (0.5, 3.0)),
+    "mass": ("mass", "link", (0.2, 0.8)), "stiffness": ("kp", "m", (0.2, 0.6)),
+}  # fmt: skip
+"""Kind of the changed number, begin of the name of its place, and limits of its size, by cause."""
 RATE, SECONDS, RUNS, NOISE = 100.0, 3.0, 3, 5e-4
 TIMESTEP = 0.002
 
@@ -136,28 +142,14 @@ def _model(rng, axes, servo):
 
 def _hide(model, rng, cause, joint, servo):
     """Put a cause into the model and return its size."""
-    if cause == "friction":
-        size = float(rng.uniform(0.1, 0.8))
-        model.dof_frictionloss[joint] = size
-    elif cause == "damping":
-        size = float(rng.uniform(0.5, 3.0))
-        model.dof_damping[joint] += size
-    elif cause == "mass":
-        size = float(rng.uniform(0.2, 0.8))
-        model.body_mass[joint + 1] *= 1.0 + size
-        model.body_inertia[joint + 1] *= 1.0 + size
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    elif cause == "stiffness" and servo:
-        size = float(rng.uniform(0.2, 0.6))
-        model.actuator_gainprm[joint, 0] *= 1.0 + size
-        model.actuator_biasprm[joint, 1] *= 1.0 + size
-    elif cause == "offset":
-        size = float(rng.uniform(0.01, 0.05))
-    elif cause == "delay":
-        size = float(rng.integers(1, 4)) / RATE
-    else:
-        size = 0.0
-    return size
+    if cause in CHANGES and (servo or cause != "stiffness"):
+        kind, place, limits = CHANGES[cause]
+        size = float(rng.uniform(*limits))
+        Change(kind, f"{place}{joint}", size).apply(model)
+        return size
+    if cause == "offset":
+        return float(rng.uniform(0.01, 0.05))
+    return float(rng.integers(1, 4)) / RATE if cause == "delay" else 0.0
 
 
 def _run(model, rng, servo, cause, joint, size, travel):
@@ -202,14 +194,15 @@ def _break(rng, broken, joint, gravity_joints, q, qd, u, units, servo):
     """Break a convention in place; return the affected joints and the size."""
     joints = q.shape[-1]
     other = int(rng.choice([i for i in range(joints) if i != joint]))
-    if broken == "sign of position":
-        q[..., joint] *= -1.0
-        qd[..., joint] *= -1.0
-    elif broken == "sign of command":
-        u[..., joint] *= -1.0
-    elif broken == "sign of both":
-        for values in (q, qd, u):
+    concerned = [v for v, part in ((q, "position"), (qd, "position"), (u, "command"))
+                 if broken.endswith("both") or part in broken]  # fmt: skip
+    if broken.startswith("sign"):
+        for values in concerned:
             values[..., joint] *= -1.0
+    elif broken.startswith("exchanged"):
+        for values in concerned:
+            values[..., [joint, other]] = values[..., [other, joint]]
+        return (joint, other), 0.0
     elif broken in ("zero of position", "zero of both"):
         size = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.25, 2.8))
         q[..., joint] += size
@@ -224,19 +217,6 @@ def _break(rng, broken, joint, gravity_joints, q, qd, u, units, servo):
         if servo and rng.random() < 0.5:
             u *= factor
         return tuple(range(joints)), factor
-    elif broken == "exchanged positions":
-        q[..., [joint, other]], qd[..., [joint, other]] = (
-            q[..., [other, joint]],
-            qd[..., [other, joint]],
-        )
-        return (joint, other), 0.0
-    elif broken == "exchanged commands":
-        u[..., [joint, other]] = u[..., [other, joint]]
-        return (joint, other), 0.0
-    elif broken == "exchanged both":
-        for values in (q, qd, u):
-            values[..., [joint, other]] = values[..., [other, joint]]
-        return (joint, other), 0.0
     elif broken == "wrapped":
         q[..., joint] = (q[..., joint] + math.pi) % (2.0 * math.pi) - math.pi
     elif broken == "late commands":

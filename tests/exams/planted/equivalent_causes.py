@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms, fit_coefficients
-from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES, Change, Run
+from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, Change, Run
 
 STEPS = 12  # Maximum number of steps of a fit.
 
@@ -60,7 +60,7 @@ class _Comparison:
             "actuator": [model.actuator(i).name for i in range(model.nu)],
             "channel": [f"q.{joint}" for joint in self.experiment.joints],
             "world": [""],
-        }[PLACES[effect]]
+        }[_place_kind(effect)]
         return every if place == "*" else [p for p in every if p == place]
 
     def _residual(self, name, simulated):
@@ -138,30 +138,16 @@ class _Form:
                 commands[:, index] = self.command(c, commands[:, index])
         if self.edit is not None:
             mujoco.mj_setConst(model, mujoco.MjData(model))
-        if self.step is None:
-            states = simulator.simulate(Run(commands, run.positions, run.velocities))
-        else:
-            states = self._stepped(simulator, coefficients, commands, run)
+        if self.step is not None:
+            joints = [(_Joint(model, place), c) for place, c in coefficients.items()]
+            simulator.before_step = lambda: [self.step(model, simulator.data, *j) for j in joints]
+        states = simulator.simulate(Run(commands, run.positions, run.velocities))
         channels = experiment.channels(states).copy()
         if self.reading is not None:
             for place, c in coefficients.items():
                 column = experiment.joints.index(place.partition(".")[2])
                 channels[:, column] = self.reading(c, channels[:, column])
         return channels
-
-    def _stepped(self, simulator, coefficients, commands, run):
-        model, data = simulator.model, simulator.data
-        simulator.start(run.positions, run.velocities)
-        joints = {place: _Joint(model, place) for place in coefficients}
-        states = np.empty((SAMPLES, model.nq + model.nv))
-        for sample in range(SAMPLES):
-            states[sample] = np.concatenate([data.qpos, data.qvel])
-            data.ctrl[:] = commands[sample]
-            for _ in range(simulator.steps):
-                for place, c in coefficients.items():
-                    self.step(model, data, joints[place], c)
-                mujoco.mj_step(model, data)
-        return states
 
 
 class _Joint:
@@ -291,13 +277,9 @@ FORMS = {
 }
 """Forms of each cause that plain MuJoCo can express; the best one counts."""
 
-PLACES = {
-    "drag.linear": "joint", "friction.coulomb": "joint", "friction.stribeck": "joint",
-    "friction.direction": "joint", "inertia.armature": "joint", "mass.scale": "body",
-    "mass.offset": "body", "inertia.scale": "body", "actuator.stiffness": "actuator",
-    "actuator.damping": "actuator", "spring.linear": "joint", "spring.cubic": "joint",
-    "gravity.scale": "world", "gravity.tilt": "world", "drag.quadratic": "joint",
-    "force.bias": "joint", "input.gain": "actuator", "input.bias": "actuator",
-    "input.delay": "actuator", "input.lag": "actuator", "sensor.gain": "channel",
-    "sensor.bias": "channel", "sensor.delay": "channel", "sensor.lag": "channel",
-}  # fmt: skip
+
+def _place_kind(effect):
+    """Return the kind of place at which an effect acts."""
+    kinds = {"actuator": "actuator", "input": "actuator", "sensor": "channel", "gravity": "world"}
+    is_body = effect.startswith("mass.") or effect == "inertia.scale"
+    return "body" if is_body else kinds.get(effect.partition(".")[0], "joint")

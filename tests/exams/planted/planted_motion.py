@@ -132,6 +132,7 @@ class Simulator:
         self.joints = np.isin(model.jnt_bodyid, watched)
         self.steps = round(1 / RATE / model.opt.timestep)
         self.touches = False  # Whether a contact or a joint limit was active since `start`.
+        self.before_step = None  # Function that is called before each step, or None.
         if not np.isclose(self.steps * model.opt.timestep, 1 / RATE):
             raise ValueError(f"timestep {model.opt.timestep} s does not divide 1/{RATE} s")
 
@@ -143,7 +144,12 @@ class Simulator:
     def advance(self, command):
         """Advance by one sample with the controls held."""
         self.data.ctrl[:] = command
-        mujoco.mj_step(self.model, self.data, nstep=self.steps)
+        if self.before_step is None:
+            mujoco.mj_step(self.model, self.data, nstep=self.steps)
+        else:
+            for _ in range(self.steps):
+                self.before_step()
+                mujoco.mj_step(self.model, self.data)
         limited = self.data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT
         contacts = self.data.contact.geom[: self.data.ncon]
         self.touches |= bool(self.geoms[contacts].any())

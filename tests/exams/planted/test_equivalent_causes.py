@@ -6,7 +6,6 @@ import pytest
 from bench.diagnosis_benchmark.case_generation.cause_sizes import fit_coefficients
 from tests.exams.planted.equivalent_causes import (
     FORMS,
-    PLACES,
     held_out_ratios,
 )
 from tests.exams.planted.planted_cases import STANDARD
@@ -33,7 +32,6 @@ def test_an_equivalent_cause_fits_as_well_and_another_does_not():
 
 def test_every_planted_kind_can_be_refitted():
     assert set(EFFECTS.values()) <= FORMS.keys()
-    assert FORMS.keys() == PLACES.keys()
 
 
 @pytest.mark.slow

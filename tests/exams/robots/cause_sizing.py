@@ -51,14 +51,14 @@ class Gauge:
         ]
 
     def change(self, effects):
-        """Return the change that effects cause, one (N,) per run.
+        """Return the change (N,) that effects cause in all runs.
 
         The part that initial states can explain is projected out.
         """
         return self.beyond_states(self.seen(effects))
 
     def beyond_states(self, seen):
-        """Return the difference of observations from the base, one (N,) per run.
+        """Return the difference (N,) of observations from the base in all runs.
 
         The part that initial states can explain is projected out.
 
@@ -68,21 +68,18 @@ class Gauge:
         differences = [
             (after - before).ravel() for after, before in zip(seen, self.base, strict=True)
         ]
-        return [d - basis @ (basis.T @ d) for d, basis in zip(differences, self.free, strict=True)]
+        pairs = zip(differences, self.free, strict=True)
+        return np.concatenate([d - basis @ (basis.T @ d) for d, basis in pairs])
 
-    def gap(self, effects, beyond=()):
+    def gap(self, effects, beyond=0.0):
         """Return the RMS discrepancy over runs, samples and channels.
 
         Args:
             effects: coefficients by effect@place.
-            beyond: changes that are subtracted first, one (N,) per run.
+            beyond: change (N,) that is subtracted first.
         """
         try:
-            changes = self.change(effects)
-            others = beyond or [np.zeros_like(change) for change in changes]
-            return compute_rms(
-                np.concatenate([c - b for c, b in zip(changes, others, strict=True)])
-            )
+            return compute_rms(self.change(effects) - beyond)
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return np.inf  # The simulation diverged.
 
@@ -146,8 +143,8 @@ class CompetingCauses:
         values = [v / self.setting.sigma for v in recorded]
         self.fitted, self.held = Gauge(self.setting), Gauge(self.setting, held_out=True)
         count = len(setting.fitted)
-        self.wanted = np.concatenate(self.fitted.beyond_states(values[:count]))
-        self.unseen = np.concatenate(self.held.beyond_states(values[count:]))
+        self.wanted = self.fitted.beyond_states(values[:count])
+        self.unseen = self.held.beyond_states(values[count:])
 
     def true_cause_error(self):
         """Return the held-out error of the hidden effects with their true coefficients."""
@@ -205,10 +202,10 @@ class CompetingCauses:
         )
 
     def _change(self, effects):
-        return np.concatenate(self.fitted.change(effects))
+        return self.fitted.change(effects)
 
     def _error(self, effects):
-        return compute_rms(self.unseen - np.concatenate(self.held.change(effects)))
+        return compute_rms(self.unseen - self.held.change(effects))
 
 
 FREE = {

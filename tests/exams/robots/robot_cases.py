@@ -241,7 +241,7 @@ def simpler_changes(hidden, gauge):
         return []
     other = f"{planted_effects.SIMPLER[effect]}@{place}"
     sizes = [share * (c[0] + abs(c[1])) for share in (0.3, 0.6)]
-    return [np.concatenate(gauge.change({other: (size,)})) for size in sizes]
+    return [gauge.change({other: (size,)}) for size in sizes]
 
 
 def _drawn_effect(item, effect, rng):
@@ -259,7 +259,7 @@ def _sized(item, effect, setting, rng, taken=()):
         planted_effects.shape(effect, place, setting, rng),
         planted_effects.named(effect, place),
     )
-    gauge, beyond = gauge_of(item.name), ()
+    gauge, beyond = gauge_of(item.name), 0.0
     if effect in planted_effects.WITH_ROTOR:
         # The drive inertia is there even if the joint is nearly rigid, so its change is subtracted.
         beyond = gauge.change(reference_plant.stiff(setting.machine, place, of(0.0)[-1]))
@@ -275,7 +275,7 @@ def _single(item, setting, effect, rng):
     hidden, size = found
     gauge, beyond = gauge_of(item.name), None
     if simpler := simpler_changes(hidden, gauge):
-        beyond = cause_sizing.left(np.concatenate(gauge.change(hidden)), simpler)
+        beyond = cause_sizing.left(gauge.change(hidden), simpler)
         if beyond < TELLING:
             return None
     return replace(item, effects=hidden, size=size, beyond=beyond)
@@ -305,8 +305,8 @@ def _double(item, setting, effect, rng):
     gauge, both = gauge_of(item.name), first[0] | second[0]
     if not np.isfinite(gauge.gap(both)):
         return None
-    whole = np.concatenate(gauge.change(both))
-    alone = [np.concatenate(gauge.change(part[0])) for part in (first, second)]
+    whole = gauge.change(both)
+    alone = [gauge.change(part[0]) for part in (first, second)]
     beyond = min(cause_sizing.left(whole, [part]) for part in alone)
     size = min(first[1], second[1])
     return (
@@ -325,7 +325,7 @@ def _foreign(item, setting, effect, rng):
     if found is None:
         return None
     hidden = of(found[0])
-    change = np.concatenate(gauge.change(hidden))
+    change = gauge.change(hidden)
     others = _near(item.robot, setting, joint, gauge, rng)
     beyond = min(cause_sizing.left(change, [other]) for other in others)
     shown = replace(item, effects=hidden, size=found[1], beyond=beyond)
@@ -340,7 +340,7 @@ def _near(robot, setting, joint, gauge, rng):
     for effect in planted_effects.effects(robot):
         for place in sorted(at & set(planted_effects.places(machine, effect))):
             c = planted_effects.shape(effect, place, setting, rng)(0.05)
-            yield np.concatenate(gauge.change({planted_effects.named(effect, place): c}))
+            yield gauge.change({planted_effects.named(effect, place): c})
 
 
 DRAW = {"single": _single, "family": _family, "double": _double, "foreign": _foreign}

@@ -26,6 +26,13 @@ def roller(kind="motor"):
     return Machine("roller", ROLLER, (Drive("axle", kind, 30.0, 3.0, 50.0),), (0.0,))
 
 
+def roll(effects, command=0.0, speed=0.0, kind="motor"):
+    """Return the motion of the disc from rest or at a speed, with a command of the axle."""
+    commands = {"m_axle": np.broadcast_to(command, STAMPS.shape)}
+    run = Run(STAMPS, commands, np.zeros(1), np.array([speed]))
+    return World(roller(kind), effects).move(run, STAMPS)
+
+
 def driven(machine, amplitude, frequency=3.0, stamps=STAMPS):
     """Return a run with sinusoidal commands around the values that hold the pose."""
     pose = np.array(machine.pose)
@@ -49,9 +56,7 @@ def test_a_double_pendulum_without_friction_keeps_its_energy():
 
 
 def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
-    world = World(roller(), {"friction.coulomb@axle": (0.47,)})
-    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
-    motion = world.move(start, STAMPS)
+    motion = roll({"friction.coulomb@axle": (0.47,)}, speed=2.0)
     stop, distance = 2.0 * 0.4 / 0.47, 2.0**2 * 0.4 / (2 * 0.47)
     moving = stop - 1e-9 > STAMPS
     assert motion.q[-1, 0] == pytest.approx(distance, abs=1e-12)
@@ -63,9 +68,7 @@ def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
 
 def test_position_dependent_friction_dissipates_its_work():
     least, sine, cosine, period, inertia = 0.2, 0.2, -0.3, 1.3, 0.4
-    world = World(roller(), {"friction.position@axle": (least, sine, cosine, period)})
-    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.5]))
-    motion = world.move(start, STAMPS)
+    motion = roll({"friction.position@axle": (least, sine, cosine, period)}, speed=2.5)
     q, v = motion.q[:, 0], motion.v[:, 0]
     angle = 2 * np.pi * q / period
     wave = period / (2 * np.pi) * (sine * (1 - np.cos(angle)) + cosine * np.sin(angle))
@@ -98,20 +101,18 @@ def test_a_loaded_gear_lifts_beyond_its_drive_line(effect, lifts):
 
 def test_a_warming_joint_loses_its_friction():
     dry, viscous, time, inertia = 0.3, 0.2, 0.9, 0.4
-    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([3.0]))
     cold = -np.expm1(-STAMPS / time) * time / inertia
     for c, expected in (
         ((dry, 0.0, time), 3.0 - dry * cold),
         ((0.0, viscous, time), 3.0 * np.exp(-viscous * cold)),
     ):
-        motion = World(roller(), {"friction.warming@axle": c}).move(start, STAMPS)
+        motion = roll({"friction.warming@axle": c}, speed=3.0)
         np.testing.assert_allclose(motion.v[:, 0], expected, atol=1e-9)
 
 
 def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
     pull = np.where(STAMPS < 2.0, 0.4999, 0.75)
-    world = World(roller(), {"friction.coulomb@axle": (0.5,)})
-    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    motion = roll({"friction.coulomb@axle": (0.5,)}, pull)
     held_still = STAMPS <= 2.0
     assert np.all(motion.q[held_still, 0] == 0.0)
     expected = (0.75 - 0.5) / 0.4 * (STAMPS[-1] - 2.0) ** 2 / 2
@@ -120,11 +121,9 @@ def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
 
 def test_a_servo_breaks_loose_when_its_lagging_command_pulls_enough():
     """The joint breaks away when kp (1 - exp(-t / lag)) = friction."""
-    lag, friction, step = 0.5, 12.0, np.ones(STAMPS.size)
+    lag, friction = 0.5, 12.0
     effects = {"friction.coulomb@axle": (friction,), "input.lag@m_axle": (lag,)}
-    world = World(roller("position"), effects)
-    command = np.where(STAMPS > 0, step, 0.0)
-    motion = world.move(Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1)), STAMPS)
+    motion = roll(effects, np.where(STAMPS > 0, 1.0, 0.0), kind="position")
     loose = 0.01 - lag * np.log(1 - friction / 30.0)
     assert np.all(motion.q[loose > STAMPS, 0] == 0.0)
     assert np.all(motion.q[loose + 0.01 < STAMPS, 0] > 0.0)
@@ -180,16 +179,14 @@ def test_a_hidden_body_effect_changes_the_inertia_as_stated():
 
 
 def test_an_armature_slows_a_joint_by_its_inertia():
-    pull = Run(STAMPS, {"m_axle": np.ones(STAMPS.size)}, np.zeros(1), np.zeros(1))
-    motion = World(roller(), {"inertia.armature@axle": (0.1,)}).move(pull, STAMPS)
+    motion = roll({"inertia.armature@axle": (0.1,)}, 1.0)
     assert motion.q[-1, 0] == pytest.approx(16.0 / (2 * 0.5), rel=1e-12)
 
 
 def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
     """The frequency about the common motion is w^2 = k (1/J1 + 1/J2)."""
     kick = np.where(STAMPS < 0.02, 10.0, 0.0)
-    world = World(roller(), {"joint.flexibility@axle": (1 / 20.0, 0.0, 0.25)})
-    motion = world.move(Run(STAMPS, {"m_axle": kick}, np.zeros(1), np.zeros(1)), STAMPS)
+    motion = roll({"joint.flexibility@axle": (1 / 20.0, 0.0, 0.25)}, kick)
     late = STAMPS > 0.5
     line = np.polyfit(STAMPS[late], motion.q[late, 0], 1)
     swing = motion.q[late, 0] - np.polyval(line, STAMPS[late])
@@ -200,9 +197,8 @@ def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
 
 def test_backlash_decouples_the_link_within_its_gap():
     """The motor has a tenth of the roller's inertia and moves alone until it meets the flank."""
-    gap, pull = 0.02, np.full(STAMPS.size, 0.1)
-    world = World(roller(), {"joint.backlash@axle": (gap, 0.1)})
-    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    gap = 0.02
+    motion = roll({"joint.backlash@axle": (gap, 0.1)}, 0.1)
     meets = np.sqrt(2 * 0.04 * gap / 2 / 0.1)
     alone = meets > STAMPS
     np.testing.assert_allclose(motion.q[alone, 0], 0.5 * 0.1 / 0.04 * STAMPS[alone] ** 2, atol=1e-9)
@@ -213,9 +209,8 @@ def test_backlash_decouples_the_link_within_its_gap():
 
 def test_friction_with_memory_dissipates_over_its_distance():
     """Energy balance: J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
-    dry, way, pull = 0.3, 0.1, np.full(STAMPS.size, 0.4)
-    world = World(roller(), {"friction.hysteresis@axle": (dry, way)})
-    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    dry, way = 0.3, 0.1
+    motion = roll({"friction.hysteresis@axle": (dry, way)}, 0.4)
     q, v = motion.q[:, 0], motion.v[:, 0]
     work = 0.4 * q - dry * (q - way * (1 - np.exp(-q / way)))
     np.testing.assert_allclose(0.5 * 0.4 * v**2, work, atol=1e-9)
@@ -324,9 +319,7 @@ def test_friction_with_teeth_lags_by_half_a_tooth():
 
 
 def test_a_binding_range_has_friction_only_within_it():
-    world = World(roller(), {"binding": (0, 0.5, 3.0, 0.5)})
-    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
-    v = world.move(start, STAMPS).v[:, 0]
+    v = roll({"binding": (0, 0.5, 3.0, 0.5)}, speed=2.0).v[:, 0]
     np.testing.assert_allclose(v[STAMPS < 1.15], 2.0, rtol=1e-5)
     # The work of friction is that over the width of the range, with soft borders too.
     assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 1.0 / 0.4, rel=1e-4)
@@ -334,10 +327,9 @@ def test_a_binding_range_has_friction_only_within_it():
 
 def test_commands_are_delayed_and_filtered_as_stated():
     command = np.where(STAMPS >= 1.0, 1.0, 0.0)
-    run = Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1))
-    late = World(roller(), {"input.delay@m_axle": (0.105,)}).move(run, STAMPS)
+    late = roll({"input.delay@m_axle": (0.105,)}, command)
     assert late.q[-1, 0] == pytest.approx((3.0 - 0.105) ** 2 / (2 * 0.4), rel=1e-9)
-    dull = World(roller(), {"input.gain@m_axle": (0.5,), "input.deadband@m_axle": (0.3,)})
-    moved = dull.move(run, STAMPS)
+    dull = {"input.gain@m_axle": (0.5,), "input.deadband@m_axle": (0.3,)}
+    moved = roll(dull, command)
     assert moved.q[-1, 0] == pytest.approx(1.2 * 9.0 / (2 * 0.4), rel=1e-9)
     np.testing.assert_allclose(moved.force[STAMPS >= 1.0, 0], 1.2)
