@@ -62,6 +62,8 @@ MAX_RESIDUAL_SHARE = 0.2
 """Maximum residual that remains with a hypothesis, as a share of the standard deviation of a
 channel.
 """
+MIN_MOTION_SIGMAS = 3.0
+"""Minimum standard deviation of a channel that moves, in units of its noise."""
 MAX_EXPLAINED_RESIDUAL = 1.5
 """Maximum RMS residual, in units of the noise, at which a hypothesis explains the data, so that no
 nearby factor is tested.
@@ -81,6 +83,11 @@ and by the whole runs.
 SCREENED_HYPOTHESES = 12
 """Number of hypotheses that are simulated over whole runs: those that fit the beginning of the runs
 best.
+"""
+UNCONVERGED_COST_RATIO = 2.0
+"""Minimum ratio of the cost at the beginning of the runs to the largest accepted cost of whole runs
+at which a hypothesis is rejected without fitting them. It exceeds 1 as that fit may not have
+converged.
 """
 CHECKED_CHANNELS = 3
 """Number of channels of a robot with the largest misfit whose joints are checked."""
@@ -323,7 +330,7 @@ def find_wrong_units(
     accepted: list[tuple[Hypothesis, float]] = []
     alternative_texts: list[str] = []
     for hypothesis in _select_promising(subject, hypotheses):
-        after, residual_share = _fit_rescaled(subject, hypothesis.factors())
+        after, residual_share = _fit_rescaled(subject, hypothesis.factors(), 1.0 + excess)
         if after - 1.0 > excess or residual_share > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
@@ -461,7 +468,7 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
         # A failed simulation counts as an infinite residual.
         mean_square = float(np.mean(np.nan_to_num(residual[..., c][is_recorded], nan=np.inf) ** 2))
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
-        shares.append(excess / deviation if deviation > 3.0 * sigma else 0.0)
+        shares.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
     return np.array(shares)
 
 
@@ -600,20 +607,50 @@ def _build_rescaled_evaluator(
     return evaluator, NoiseModel(sigma, np.zeros(len(sigma)))
 
 
-def _fit_rescaled(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
+def _fit_rescaled(
+    subject: Subject, factors: Mapping[str, float], max_rms: float = np.inf
+) -> tuple[float, float]:
     """Fit the base model to the rescaled recording.
+
+    Args:
+        subject: Recording and simulator to check.
+        factors: Factor of each signal that is rescaled, by name.
+        max_rms: Maximum RMS residual that is of interest, in units of the noise. If the beginning
+            of the runs exceeds it, or `MAX_RESIDUAL_SHARE`, both results are infinite.
 
     Returns:
         RMS residual in units of the noise, and the largest share of a channel's deviation.
     """
     evaluator, noise = _build_rescaled_evaluator(subject, factors)
-    fit = fit_base_model(evaluator, noise).fit
     is_recorded = np.isfinite(evaluator.observed)
+    max_cost = np.inf
+    if np.isfinite(max_rms):
+        max_cost = UNCONVERGED_COST_RATIO * _compute_max_cost(evaluator, noise, max_rms)
+    fit = fit_base_model(evaluator, noise, max_cost=max_cost).fit
     residual = np.where(is_recorded, evaluator.observed - fit.simulated, 0.0)
     evaluator.close()
     return _compute_residual_rms(residual, is_recorded, noise), float(
         _compute_residual_shares(evaluator, residual, noise).max()
     )
+
+
+def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float) -> float:
+    """Return the largest cost of a fit that leaves at most these residuals.
+
+    Args:
+        evaluator: Run evaluator of the rescaled recording.
+        noise: White noise of each channel.
+        max_rms: Maximum RMS residual in units of the noise. In addition, the residual of each
+            channel is limited to `MAX_RESIDUAL_SHARE` of its standard deviation.
+    """
+    is_recorded = np.isfinite(evaluator.observed)
+    max_squares = 0.0
+    for c, sigma in enumerate(noise.sigma.tolist()):
+        values = evaluator.observed[..., c][is_recorded[..., c]]
+        deviation = float(np.std(values)) if values.size else 0.0
+        excess = MAX_RESIDUAL_SHARE * deviation if deviation > MIN_MOTION_SIGMAS * sigma else np.inf
+        max_squares += values.size * ((excess / sigma) ** 2 + 1.0) if values.size else 0.0
+    return min(max_rms**2 * float(is_recorded.sum()), max_squares)
 
 
 def _test_distinctness(

@@ -88,7 +88,10 @@ class BaseFit:
 
 
 def fit_base_model(
-    evaluator: RunEvaluator, noise: NoiseModel, initial_base: Array | None = None
+    evaluator: RunEvaluator,
+    noise: NoiseModel,
+    initial_base: Array | None = None,
+    max_cost: float = np.inf,
 ) -> BaseFit:
     """Fit base parameters and initial states.
 
@@ -97,9 +100,12 @@ def fit_base_model(
         noise: noise that weights the channels.
         initial_base: (b,) base parameters to start from, for example from a tuner; None for a
             multi-start over the bounds.
+        max_cost: cost above which the base model is of no interest. The cost of whole runs is at
+            least that of their beginnings, so a fit that exceeds it there is not continued.
 
     Returns:
-        The best fit, with insensitive parameters at their nominal values.
+        The best fit, with insensitive parameters at their nominal values. If it exceeds `max_cost`
+        at the beginning of the runs, it is simulated only there.
     """
     thetas = _list_starts(evaluator, initial_base)
     starts = [FitStart((), theta, evaluator.initial_state_guesses) for theta in thetas]
@@ -109,14 +115,15 @@ def fit_base_model(
         order = np.argsort(compute_start_costs(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
-    fits: list[TrajectoryFit] = []
     for horizon in FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS:
         evaluator.search_control.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
             starts, horizon.iterations
         )
         starts = [fit.make_start() for fit in fits]
-    best = min(fits, key=lambda fit: fit.cost)
+        best = min(fits, key=lambda fit: fit.cost)
+        if best.cost > max_cost and horizon.share < 1.0:
+            return BaseFit(best, frozenset())
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
         # Derivatives about the first start are replaced by those about the fitted model for all
         # later fits. The import is local, because only robots need it.

@@ -29,6 +29,20 @@ def test_any_inertia_in_the_bounds_is_found(inertia):
     assert not base.insensitive_parameters
 
 
+def test_a_fit_ends_where_the_beginning_of_the_runs_exceeds_its_maximum_cost():
+    sigma = [0.003, 0.02]
+    made = recorded(Pendulum(), [3.0e-3], [{"q": 0.9}], TIMES, sigma, seed=1)
+    there = evaluator(made, candidates=[])
+    beginning = int(there.get_sample_mask(0.2).sum())
+    whole = int(np.isfinite(there.observed).sum())
+    noise = white(there, sigma)
+    ended = fit_base_model(there, noise, max_cost=0.5 * beginning)
+    assert ended.fit.cost / beginning == pytest.approx(1.0, abs=0.3)
+    assert not np.isfinite(ended.fit.simulated[np.isfinite(there.observed)]).all()
+    complete = fit_base_model(there, noise, max_cost=2.0 * whole)
+    assert complete.fit.cost == fit_base_model(there, noise).fit.cost
+
+
 @pytest.mark.parametrize("restitution", [0.35, 0.93])
 def test_restitution_is_found_through_many_bounces(restitution):
     starts = [{"z": 2.5, "vx": 0.5}, {"z": 1.5, "vz": 1.0}]
