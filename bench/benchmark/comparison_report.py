@@ -320,6 +320,6 @@ def format_failure_reason(reason: str) -> str:
         return lines[-1].strip()
     # The error message is the first line without indentation after the last frame; it may be
     # followed by pages of text.
-    words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
+    message = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
     file, number, function = _TRACEBACK_FRAME.findall(lines[frames[-1]])[0]
-    return f"{words} ({Path(file).name}, line {number}, in {function})"
+    return f"{message} ({Path(file).name}, line {number}, in {function})"

@@ -70,7 +70,13 @@ def _select_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
 def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> TunerRanking:
     """Sort the tuners of one range by their verdict after `k` simulations.
 
-    `part` are the rows of the ranking for this range and this number of simulations.
+    One tuner has the verdict `BEST`, the lowest median error; others may be `EQUAL` to it. The
+    error in the sentence is that of the best one.
+
+    Args:
+        statistics: statistics of the comparison.
+        k: number of simulations.
+        part: rows of the ranking for this range and this number of simulations.
     """
 
     def select_verdicts(*verdicts: str) -> pd.DataFrame:

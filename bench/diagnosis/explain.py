@@ -617,7 +617,7 @@ class _ExplainRun:
         """Return wrong units and signs that the diagnosed causes imitate."""
         faults = [
             find_imitated_unit(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
-            for cause in self.assessor.causes(search, finding)
+            for cause in self.assessor.build_causes(search, finding)
         ]
         return tuple(fault for fault in faults if fault is not None)
 

@@ -114,6 +114,7 @@ def choose_friction_form(
 ) -> FittedModel | None:
     """Refit a model with the other form of dry friction, and return it if it is likelier.
 
+    The forms are stiff and soft: how hard the constraint of MuJoCo's `frictionloss` is solved.
     Effects with a state that contain dry friction, such as hysteresis, do not act through
     `frictionloss`. They are replaced by the dry friction that they contain, because they may only
     imitate the other form.

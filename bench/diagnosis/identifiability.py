@@ -50,6 +50,10 @@ for it to be detectable.
 """
 CONFOUNDING_CORRELATION = 0.95
 """Minimum correlation of two parameters that are reported as confounded."""
+MIN_EIGENVALUE = 1e-12
+"""Smallest eigenvalue of D'D with unit columns at which its direction is identifiable."""
+UNIDENTIFIED_VARIANCE = 1e12
+"""Variance along directions that are not identifiable, in units of those with unit columns."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
 
@@ -152,10 +156,13 @@ class _IdentifiabilityAssessment:
         return projected.reshape(runs * samples, count)
 
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
-        """Assess all free parameters from their joint covariance, eq. (1) of the module docstring.
+        """Assess all free parameters from their joint covariance (D'D)^-1, eq. (1).
 
-        Combinations of parameters that the data do not determine (eigenvalues of the correlations
-        below 1e-12) get a very large variance instead of that of the pseudoinverse, which is zero.
+        The columns of D, `self.parameters` (samples, parameters), are first scaled to unit length,
+        so that D'D is a matrix of correlations. Combinations of parameters that the data do not
+        determine (its eigenvalues below `MIN_EIGENVALUE`) get the variance `UNIDENTIFIED_VARIANCE`
+        instead of that of the pseudoinverse, which is zero. A parameter without any influence has
+        an infinite variance.
         """
         columns = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
@@ -166,8 +173,8 @@ class _IdentifiabilityAssessment:
             unit_columns.T @ unit_columns, rcond=1e-13, hermitian=True
         )
         values, vectors = np.linalg.eigh(unit_columns.T @ unit_columns)
-        unidentified = vectors[:, values < 1e-12]
-        correlation_inverse = correlation_inverse + 1e12 * unidentified @ unidentified.T
+        unidentified = vectors[:, values < MIN_EIGENVALUE]
+        correlation_inverse += UNIDENTIFIED_VARIANCE * unidentified @ unidentified.T
         sensitive_block = np.ix_(is_sensitive, is_sensitive)
         covariance[sensitive_block] = correlation_inverse / np.outer(
             scale[is_sensitive], scale[is_sensitive]

@@ -24,7 +24,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.randomization_ranges import RandomizationRange, RandomizationRanges, texts
+from bench.diagnosis.randomization_ranges import (
+    RandomizationRange,
+    RandomizationRanges,
+    describe_ranges,
+)
 from bench.pages.text_format import format_csv, sanitise
 from sims.extended_simulator import ExtendedSimulator
 
@@ -150,7 +154,7 @@ def render_isaac_lab_code(
         extended: Extended simulator with the numbers.
         robot: Robot with its compiled model.
     """
-    sentences = dict(texts(ranges))
+    sentences = dict(describe_ranges(ranges))
     terms, missing = _build_terms(ranges, sentences, robot)
     return render_code(
         "ranges_isaac_lab.py",
@@ -379,7 +383,7 @@ def render_mujoco_playground_code(
         extended: Extended simulator with the numbers.
         robot: Robot with its compiled model.
     """
-    sentences = dict(texts(ranges))
+    sentences = dict(describe_ranges(ranges))
     # Setting the mass also scales the inertia, and setting the size of gravity its components, so
     # inertia and components are set afterwards.
     with_fields = sorted((r for r in ranges.ranges if r.fields), key=_is_last)

@@ -269,11 +269,14 @@ def _convert_to_range(
     )
 
 
-def texts(ranges: RandomizationRanges) -> Iterator[tuple[RandomizationRange, str]]:
-    """Yield each range with a sentence that describes it."""
+def describe_ranges(
+    ranges: RandomizationRanges,
+) -> Iterator[tuple[RandomizationRange, str]]:
+    """Yield each range with a line of text: quantity, place, value, range, unit and cause."""
     for entry in ranges.ranges:
         place_text = f"{entry.kind} {entry.name}" if entry.name else "the world"
         quantity = entry.field or f"effect {entry.effect}"
+        # An effect with a single coefficient calls it "coefficient", which says nothing.
         quantity += "" if entry.coefficient == "coefficient" else f" ({entry.coefficient})"
         value_in_file = "" if entry.nominal is None else f"{entry.nominal:.4g} in the model file, "
         unit = "" if entry.unit == "1" else f" {entry.unit}"

@@ -94,7 +94,7 @@ class VerdictBuilder:
         """
         evaluator = self.fitting_evaluator
         numbers = self.collect_parameter_estimates(search, finding.model)
-        causes = self.causes(search, finding)
+        causes = self.build_causes(search, finding)
         parameters = {
             evaluator.parameters[i].name: numbers[i] for i in evaluator.base_indices.tolist()
         }
@@ -119,12 +119,15 @@ class VerdictBuilder:
             finding.early_stop,
         )
 
-    def causes(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Cause, ...]:
-        """Return the causes of a finding with their fitted numbers.
+    def build_causes(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Cause, ...]:
+        """Build the causes of the verdict: those found, with values and intervals of coefficients.
 
         Args:
             search: Search that produced the finding.
-            finding: Outcome of the search.
+            finding: Outcome of the search; its causes have names and evidence only.
+
+        Returns:
+            One `Cause` of the verdict for each cause found, in the same order.
         """
         numbers = self.collect_parameter_estimates(search, finding.model)
         return tuple(self._build_cause(cause, numbers) for cause in finding.causes)

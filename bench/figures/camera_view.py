@@ -94,10 +94,11 @@ def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
 
 
 def choose_projection(robot: RobotModel, data: Any) -> Projection:
-    """Choose the camera view of a robot.
+    """Choose the camera view of a robot, and the width and height of its picture.
 
     The camera looks along the common axis of a planar robot, else from the direction in which its
-    joints are furthest apart.
+    joints are furthest apart. The picture shows the bounding box, along the camera's axes, of all
+    moving parts and of the static parts close to them.
 
     Args:
         robot: The robot.
@@ -110,6 +111,7 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
         np.concatenate([data.xanchor, moving_points, _find_end_points(robot.compiled, data)])
         @ axes.T
     )
+    # Corners of the bounding box in m, along the camera's axes right, up and forward.
     low, high = points.min(axis=0), points.max(axis=0)
     if len(static_points):
         # A floor or a long rail would make the robot too small.
@@ -119,7 +121,8 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
         high = np.maximum(high, clipped.max(axis=0))
     width, height = np.maximum((high - low)[:2], MIN_VIEW_METRES) * (1 + 2 * MARGIN_SHARE)
     width, height = max(width, MIN_ASPECT_RATIO * height), max(height, MIN_ASPECT_RATIO * width)
-    return Projection(azimuth, elevation, (low + high) / 2 @ axes, float(width), float(height))
+    world_centre = (low + high) / 2 @ axes
+    return Projection(azimuth, elevation, world_centre, float(width), float(height))
 
 
 def _find_end_points(model: Any, data: Any) -> Array:

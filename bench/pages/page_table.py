@@ -242,7 +242,7 @@ def draw_intervals(
     Args:
         intervals: Class of the style sheet, estimate, lower and upper end of each.
         band: Lower and upper end of an interval behind the others, clipped to the drawing.
-        distance: Vertical distance between two intervals.
+        distance: Vertical distance between two intervals, in CSS pixels.
 
     Returns:
         The drawing; None if an end is not finite, or all of them are equal.
@@ -254,16 +254,21 @@ def draw_intervals(
         return None
     scale = SCALE_WIDTH / (high - low)
 
-    def place(value: float) -> float:
+    def to_pixels(value: float) -> float:
+        """Return the horizontal position of a value, within the drawing, in CSS pixels."""
         return round(min(max(_MARGIN + (value - low) * scale, 0.0), SCALE_WIDTH + 2 * _MARGIN), 1)
 
     rows = tuple(
         DrawnInterval(
-            kind, place(value), place(begin), place(end), distance // 2 + 1 + distance * i
+            kind,
+            to_pixels(value),
+            to_pixels(begin),
+            to_pixels(end),
+            distance // 2 + 1 + distance * i,
         )
         for i, (kind, value, begin, end) in enumerate(intervals)
     )
     band_extent = None
     if band is not None:
-        band_extent = place(band[0]), max(place(band[1]) - place(band[0]), 1.5)
+        band_extent = to_pixels(band[0]), max(to_pixels(band[1]) - to_pixels(band[0]), 1.5)
     return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

@@ -72,7 +72,7 @@ class Study(Protocol):
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Run what is missing.
+        """Run the runs of the plan that are not yet stored in the folder.
 
         Args:
             jobs: number of worker processes; 0 to run everything in this process.

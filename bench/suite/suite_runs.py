@@ -106,13 +106,13 @@ def list_comparison_folders(folder: Path) -> Iterator[tuple[Path, str]]:
 
     The condition is ``before`` or ``after`` the extension of a misspecified simulator, or empty.
     """
-    for part in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if (part / CONFIGURATION_FILE).is_file():
-            models = [label for label in MODEL_LABELS if (part / label).is_dir()]
+    for subfolder in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if (subfolder / CONFIGURATION_FILE).is_file():
+            models = [label for label in MODEL_LABELS if (subfolder / label).is_dir()]
             if models:
-                yield from ((part / m, "before" if m == PLAIN else "after") for m in models)
+                yield from ((subfolder / m, "before" if m == PLAIN else "after") for m in models)
             else:
-                yield part, ""
+                yield subfolder, ""
 
 
 def collect_suite_runs(folder: Path) -> SuiteRuns:

@@ -376,6 +376,7 @@ class SuiteTables:
         smallest, winners = medians.min(axis=1), medians.idxmin(axis=1)
         excess = medians[tuner] - smallest
         for cell in medians.index[excess > np.log(factor)]:
+            # exp(700) is close to the largest finite number.
             ratio = float(np.exp(min(float(excess[cell]), 700.0)))
             lines.append((str(cell), str(winners[cell]), ratio))
         frame = pd.DataFrame(lines, columns=["cell", "winner", "ratio"])

@@ -524,11 +524,17 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
 
 
 def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
-    """Fit the numbers a, b, c (3,) of (5), the linear form of the camera's line, robustly.
+    """Fit a, b and c of y = a + b x - c x y robustly; a camera maps heights x to pixel rows y so.
 
     The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong
-    samples do not spoil the fit. `design_matrix` (n, 3) has the regressors 1, x and -x y of n
-    samples, `values` (n,) the y.
+    samples do not spoil the fit.
+
+    Args:
+        design_matrix: (n, 3) regressors 1, x and -x y of n samples.
+        values: (n,) pixel rows y.
+
+    Returns:
+        (3,) numbers a, b and c, eq. (5) of the module.
     """
     weights: Array = np.ones(len(design_matrix))
     coefficients: Array = np.zeros(3)

@@ -106,27 +106,31 @@ class TrainedPairNetwork:
         return estimate_difference(self.weights, self.design, proposed, target)
 
     def make_estimator(self, task: Task) -> Callable[[Array], Array]:
-        """Return the network's estimate h as a function of one simulation (1, T, C).
+        """Return a function that estimates the parameter error of one simulation (1, T, C).
 
-        h(simulation, target) estimates the target's parameters less those of the simulation,
-        (dim,); it is NaN if the simulation failed. `proposed` makes the network's inputs of a
-        simulation and `features` those of the target; they differ only if the target has another
-        sensor.
+        The function returns the target's parameters less those of the simulation, (dim,), as
+        the network estimates them from both observations; NaN if the simulation
+        failed. `self.proposed` makes the row of network inputs of a simulation, `self.features`
+        that of the target. They are one function unless the target has another sensor, such as a
+        camera.
+
+        Args:
+            task: the target, with its observation, sample counts and scene.
         """
         is_shared = self.proposed is self.features
-        # Samples missing in the target are hidden in the simulation too, so that the true
-        # parameters give the target's own row.
+        # Samples missing in the target are hidden in the simulation too. A simulation at the true
+        # parameters then has the same row of inputs as the target.
         hidden = np.isnan(task.observed) if is_shared else None
         row = None
         if is_shared:
-            # The target's row is equal for all simulations, unless a simulation fills its gaps.
+            # The row of the target is then equal for all simulations, and computed once.
             row = self.features(task.observed[None], task.lengths, task.scene, hidden)[0]
 
         def difference(observations: Array) -> Array:
-            """Estimate target - simulation of the parameters (dim,) from one simulation (1, T, C).
+            """Estimate the parameters (dim,) of the target less those of a simulation (1, T, C).
 
-            If both sides do not have the same inputs, the missing samples of the target are filled
-            from the simulation first.
+            If the target has another sensor, its missing samples are first filled from the
+            simulation.
             """
             if not np.isfinite(observations).all():
                 return np.full(task.dim, np.nan)

@@ -139,9 +139,11 @@ class EntropySearch(Tuner):
     def _choose_candidates(
         self, process: GaussianProcess, best: Array, rng: np.random.Generator
     ) -> Array:
-        """Choose the best point, quasi-random points, and points around likely minimisers.
+        """Choose the candidates (N, dim) for the next simulation.
 
-        The latter have distances of all orders of magnitude.
+        They are the best point so far, `everywhere` quasi-random points in the cube, and `nearby`
+        points: half of these around the best point, half around the quasi-random point with the
+        lowest predicted loss, at distances of all orders of magnitude.
         """
         dim = len(best)
         spread_points = generate_quasi_random_points(self.everywhere, rng.uniform(size=dim))
@@ -152,9 +154,9 @@ class EntropySearch(Tuner):
         exponents = rng.uniform(np.log(min_scale), np.log(0.5), size=(self.nearby, 1))
         # The expected length is the same in any number of dimensions.
         scales = np.exp(exponents) / np.sqrt(dim)
-        expected = spread_points[process.predict(spread_points).argmin()]
+        expected_minimiser = spread_points[process.predict(spread_points).argmin()]
         is_even = np.arange(self.nearby)[:, None] % 2 == 0
-        centres = np.where(is_even, best, expected)
+        centres = np.where(is_even, best, expected_minimiser)
         near_points = centres + scales * rng.standard_normal((self.nearby, dim))
         return np.vstack([best, spread_points, np.clip(near_points, 0.0, 1.0)])
 

@@ -174,7 +174,7 @@ def build_time_grid(
     order = np.argsort(event_times, axis=1, kind="stable")
     event_times = np.take_along_axis(event_times, order, axis=1)
     steps, step_ends, steps_per_sample, rows = divide_intervals(event_times, largest_step)
-    # Rows in the original order of the marks, of which the first are samples.
+    # Rows in the original order of the event times, of which the first are samples.
     sample_rows = np.empty_like(rows)
     np.put_along_axis(sample_rows, order, rows, axis=1)
     return TimeGrid(steps, step_ends, steps_per_sample, sample_rows[:, :samples])

@@ -279,8 +279,9 @@ class RobotSimulator(SystemSimulator):
 
         Args:
             run_batches: batch elements of each run.
-            acting: effects active on all of them.
-            derived: whether effects change constants that MuJoCo derives.
+            acting: active effects with their coefficients for all batch elements, run after run.
+            derived: whether effects change numbers from which MuJoCo computes further constants of
+                the model (`mj_setConst`), such as masses.
             is_stepwise: whether forces are evaluated in every step.
             added: elements that effects add to the model.
         """

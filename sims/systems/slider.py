@@ -40,10 +40,13 @@ class SliderSystem(System):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """Return why the slider cannot have an effect; see `System`.
+        """Return why the slider, a mass on a level guide, cannot have an effect.
 
-        Without a load, the effects of `LOAD_DEPENDENT_EFFECTS` would be equivalent to
-        `friction.load`.
+        Gravity is not a load on a level guide. Without a load, the effects of
+        `LOAD_DEPENDENT_EFFECTS` would be equivalent to `friction.load`.
+
+        Returns:
+            The reason; empty if the slider can have the effect.
         """
         return (
             "it has no load that opposes its drive" if effect.name in LOAD_DEPENDENT_EFFECTS else ""

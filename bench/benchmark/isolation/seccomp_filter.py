@@ -23,8 +23,10 @@ from bench.benchmark.isolation.linux_syscalls import (
     set_no_new_privileges,
 )
 
-_PR_SET_SECCOMP = 22
-"""Option of prctl: install a filter of system calls."""
+_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 22, 2
+"""Option of prctl and its argument: install a filter of system calls."""
+_CAPABILITY_VERSION_3 = 0x20080522
+"""Number in linux/capability.h of the format in which capset reads sets of capabilities."""
 
 _SYSCALL_NUMBERS: Mapping[str, Mapping[str, int]] = {
     "x86_64": {
@@ -224,11 +226,16 @@ def install_syscall_filter(has_memory_limit: bool = False) -> None:
     machine = platform.machine()
     if not IS_LINUX or machine not in _ARCHITECTURES or sys.byteorder != "little":
         raise OSError(f"no filter for {machine}")
-    version_3 = struct.pack("<Ii", 0x20080522, 0)
-    call_system(_SYSCALL_NUMBERS[machine]["capset"], version_3, bytes(24))
+    # An empty set of capabilities (capset(2)) of this process, which has the number 0.
+    capability_header = struct.pack("<Ii", _CAPABILITY_VERSION_3, 0)
+    call_system(_SYSCALL_NUMBERS[machine]["capset"], capability_header, bytes(24))
     program = build_filter(machine, list_rules(os.getpid(), has_memory_limit))
-    packed = b"".join(struct.pack("<HBBI", i[0], i[2], i[3], i[1]) for i in program)
+    # Instructions are (code, operand, jump if true, jump if false), in C the operand is last.
+    packed = b"".join(
+        struct.pack("<HBBI", code, if_true, if_false, operand)
+        for code, operand, if_true, if_false in program
+    )
     buffer = ctypes.create_string_buffer(packed)
     header = struct.pack("<HxxxxxxQ", len(program), ctypes.addressof(buffer))
     set_no_new_privileges()
-    prctl(_PR_SET_SECCOMP, 2, ctypes.create_string_buffer(header))
+    prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.create_string_buffer(header))

@@ -266,9 +266,11 @@ class RunsTable(NamedTuple):
 
 
 def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
-    """Return the declared columns of an experiment's runs.
+    """Return the columns that the runs of an experiment must have, with their types and limits.
 
-    The parameters and channels are those in the file's columns and those of the experiment.
+    Some columns exist once for each parameter or channel: those that the names of the file's
+    columns contain and those of the experiment. If there are none, these columns keep the
+    placeholder PARAMETER or CHANNEL of `table_schemas` in their names.
 
     Args:
         names: Names of the file's columns.

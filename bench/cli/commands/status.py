@@ -144,7 +144,12 @@ def _count_endings(progress: StudyProgress) -> dict[str, dict[str, int]]:
 
 
 def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
-    """Format the counts as text, missing runs last."""
+    """Format the number of runs of each status as text, one line per group of runs.
+
+    Args:
+        groups: number of runs by status, such as ``ok`` or ``failed``, for each group, such as a
+            tuner. Missing runs come last in a line.
+    """
     from bench.benchmark.storage.run_status import MISSING_STATUS
 
     width = max(map(len, groups), default=0)

@@ -213,7 +213,7 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
 def _draw_effects_not_shown(
     figure: Figure, content: SheetContent, size: float, table_top: float = 0.0
 ) -> float:
-    """Draw the effects that are not shown in two columns.
+    """Draw a table, in two columns, of the effects that the data do not show.
 
     Args:
         figure: Page to draw on.

@@ -97,9 +97,12 @@ class DetectionLimit:
     def to_document(self) -> dict[str, Any]:
         """Return the keys of the limit in the row of a data sheet, as TOML data.
 
-        `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
-        exclude a backlash above, or a limit below, a size. The size is omitted if the data are
-        insensitive to the effect.
+        `resolved` is the smallest detectable size of an effect that is proportional to its
+        coefficient. `none_above` states that no backlash larger than a size exists, `none_below`
+        that no limit smaller than a size exists. The size is omitted if the data are insensitive to
+        the effect. `vague` states that this size is more than all plausible values. `leans_to` is
+        the estimate after one Gauss-Newton step from zero, if it is larger than the detectable
+        size. `mixed_with` names the parameters that the data cannot distinguish from the effect.
         """
         document: dict[str, Any] = {}
         if np.isfinite(self.size):
@@ -289,8 +292,8 @@ class _DetectionLimitCalculator:
         self.powers = np.maximum(
             raw_powers - np.einsum("kq,kq->k", projections, cross_products), 0.0
         )  # (1)
-        pull = self.products[self.q : -1, -1] - projections @ self.products[: self.q, -1]
-        self.newton_steps = pull / np.maximum(self.powers, 1e-300)  # (2)
+        gradients = self.products[self.q : -1, -1] - projections @ self.products[: self.q, -1]
+        self.newton_steps = gradients / np.maximum(self.powers, 1e-300)  # (2)
 
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, at the shape that is detected best."""

@@ -50,6 +50,11 @@ def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
     """Group the runs with equal constants, such as one load, in the order of the recording.
 
     An MJCF model has fixed numbers, so each group needs its own model.
+
+    Returns:
+        A group for each set of constants, with all numbers of its model by name. The later source
+        of a number takes precedence: defaults of the system, constants of the recording, constants
+        and fitted parameters of the extended simulator, constants of the runs.
     """
     by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
     for run in sheet.recording.runs:
@@ -60,7 +65,7 @@ def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
     numbers = {**defaults, **sheet.recording.constants, **sheet.extended.constants, **fitted_values}
     return [
         ConstantsGroup(
-            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
+            "_".join(f"{name}{value:g}" for name, value in constants),
             {**numbers, **dict(constants)},
             tuple(runs),
         )

@@ -185,11 +185,12 @@ class ForkedWorkerPool:
             self._fork_workers()
 
     def _fork_workers(self) -> None:
-        """Fork the workers, each with its own pipe to this process.
+        """Fork `jobs` workers, each with its own pipe to this process.
 
-        A forked worker inherits the registered run evaluators without a copy. `worker_arguments`
-        has the arguments of the worker's main function.
+        A forked worker inherits the run evaluators of `register` without a copy, so that tasks
+        can refer to them by number. Its main function is `_run_worker`.
         """
+        # One byte of memory that all workers share: not zero if they must stop their tasks.
         if self._stop_flag is None:
             self._stop_flag = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")

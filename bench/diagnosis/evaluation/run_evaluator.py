@@ -548,21 +548,22 @@ class RunEvaluator:
     def simulate_batch(
         self, is_fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
-        """Simulate batch elements of one group in one engine call.
+        """Simulate L batch elements in one engine call; all of them have the same time step.
 
         Args:
             is_fine: whether to use the fine time step that filters need.
-            theta: (L, P) parameters.
+            theta: (L, P) parameters: those of the system, constants of the recording that are
+                fitted, and coefficients of effects.
             runs: (L,) index of the run of each batch element.
             states: (L, s) initial states.
-            share: initial share of each run that is simulated.
+            share: each run is simulated from its start to this share of its duration, 0 to 1.
 
         Returns:
             Observations (L, T', C).
         """
         simulator = self._fine_step_simulator if is_fine else self.simulator
         scenarios = self._make_scenarios(theta, runs, share)
-        # The simulator does not treat freed constants as parameters.
+        # Fitted constants are in the scenarios; the simulator does not treat them as parameters.
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
         system_theta = np.delete(theta, freed_indices, axis=1)
         initial = dict(zip(self.state_names, states.T, strict=True))

@@ -141,7 +141,9 @@ def has_many_shapes(name: str) -> bool:
 
 
 def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
-    """Return the mean difference of a joint's readings from the command of its position servo.
+    """Return the mean difference in rad or m of a joint's readings from its servo's command.
+
+    The command acts on the actuator, so it is multiplied by the gear to get a joint position.
 
     Args:
         evaluator: the runs.
@@ -149,7 +151,8 @@ def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) 
         joint: index of the joint.
 
     Returns:
-        The difference; zero without a servo, or if the difference is small.
+        The difference; zero without a servo, or if it is within `OFFSET_THRESHOLD` standard
+        deviations of the noise, so that noise alone does not start an effect.
     """
     system, servo = evaluator.simulator.system, get_servo_input(evaluator, joint)
     channel = system.coordinates[joint]
@@ -157,9 +160,9 @@ def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) 
         return 0.0
     column = evaluator.channels.index(channel)
     differences = [
-        track.observed[:, column] - system.gear(joint) * track.scenario.inputs[servo]
-        for track in evaluator.prepared_runs
-        if servo in track.scenario.inputs
+        run.observed[:, column] - system.gear(joint) * run.scenario.inputs[servo]
+        for run in evaluator.prepared_runs
+        if servo in run.scenario.inputs
     ]
     offset = float(np.nanmean(np.concatenate(differences))) if differences else 0.0
     return offset if abs(offset) > OFFSET_THRESHOLD * noise.sigma[column] else 0.0

@@ -213,17 +213,18 @@ def _prune_set(
     """Remove the effects that gain too little, the least first, and maximise the likelihood again.
 
     The gain of an effect is its Wald statistic: the loss in twice the log-likelihood without it, to
-    second order. The likelihood is maximised again only if the removed effects together lose enough
-    to move the other coefficients.
+    second order. If the removed effects together lose more than twice the gain at which a
+    maximisation ends (`MIN_STEP_GAIN`), the other coefficients may have moved: the likelihood is
+    maximised again, and the remaining effects are tested again.
 
     Args:
         context: context of the search.
-        current: effects in the model, and the filter that has them.
+        current: names of the effects, and the runs followed by a filter with these effects.
 
     Returns:
         The remaining set, and the gain of each of its effects.
     """
-    followed, names, lost = current.followed, list(current.names), 0.0
+    followed, names, lost_gain = current.followed, list(current.names), 0.0
     bounds = _get_bounds(context, names)
     information = Information(list(bounds), compute_information(followed, bounds))
     min_gains = {name: _compute_min_gain(context, current, name) for name in names}
@@ -234,7 +235,7 @@ def _prune_set(
             break
         weakest = min(negligible, key=lambda name: gains[name] - min_gains[name])
         names.remove(weakest)
-        lost += gains[weakest]
+        lost_gain += gains[weakest]
     if len(names) == len(current.names):
         return current, gains
     theta = followed.theta.copy()
@@ -242,8 +243,7 @@ def _prune_set(
         theta[context.evaluator.coefficient_slices[name]] = 0.0
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
-    # Effects without influence leave the other coefficients as they are.
-    if lost > 2.0 * MIN_STEP_GAIN:
+    if lost_gain > 2.0 * MIN_STEP_GAIN:
         return _prune_set(context, _fit_set(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains
 

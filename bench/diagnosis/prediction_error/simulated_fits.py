@@ -215,11 +215,15 @@ def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedMod
 
 
 def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Replace single effects at all places by their family, one effect with the same coefficients.
+    """Replace the same effect at every place by one effect for all places, its family.
 
-    The family is kept if it fits about as well. It is one decision instead of one per place.
+    For example, ``drag.linear@shoulder`` and ``drag.linear@elbow``, of a robot with these joints,
+    become ``drag.linear@*``, which begins at their coefficients. The refitted family is kept if its
+    penalised log-likelihood is not lower by more than `INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO`: it
+    is one decision instead of one for each place.
     """
     evaluator = context.evaluator
+    # The names of families in the library end in "@*".
     for family in (name for name in evaluator.library if name.endswith("@*")):
         members = [member.name for member in members_of(evaluator.available_effects[family])]
         if len(members) < 2 or not set(members) <= set(model.effects):

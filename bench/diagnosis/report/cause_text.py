@@ -41,7 +41,9 @@ def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
     """Format a set of effects.
 
     For example ``Coulomb friction at any of the joints a, b or c``, or ``linear drag or Coulomb
-    friction at joint elbow``.
+    friction at joint elbow``. Effects that differ only by their place form one part. Of more than
+    `MAX_NAMED_MEMBERS` parts, the last ones are counted: ``one of 5 others``. If a part contains
+    the conjunction itself, a comma precedes each conjunction between parts.
 
     Args:
         names: Names of the effects.
@@ -55,7 +57,6 @@ def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
             *parts[: MAX_NAMED_MEMBERS - 1],
             f"one of {len(parts) - MAX_NAMED_MEMBERS + 1} others",
         ]
-    # Nested lists are separated by a comma before the last conjunction too.
     is_nested = len(parts) > 1 and any(f" {conjunction} " in part for part in parts)
     return f", {conjunction} ".join(parts) if is_nested else joined(parts, conjunction)
 

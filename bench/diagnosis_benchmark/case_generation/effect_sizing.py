@@ -221,9 +221,10 @@ def make_gap_function(
     last: list[tuple[float, ResidualFit]] = []
 
     def compute_size(strength: float) -> float:
-        """Return the size of the cause at a strength: the RMS residual in units of the noise.
+        """Return the RMS residual, in units of the noise, that a cause of a strength leaves.
 
-        The fit starts at the last fitted values, scaled to this strength, which saves iterations.
+        The recording with the cause is refitted by the model without it. The fit starts at the
+        values of the last strength, scaled to this strength, which saves iterations.
         """
         theta, starts = fit.theta, fit.starts
         if last:  # fitted parameters and states change about in proportion to the strength

@@ -155,6 +155,7 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
         r = carray(to_real_pointer(context.registers), (context.register_count, 1))
         r[context.t, 0] = k * step
         r[context.midpoint, 0] = (k + 0.5) * step
+        # Time since the last evaluation, over which hidden states advance.
         r[context.past, 0] = step if k > 0 else 0.5 * step
         for j in range(joints):
             r[context.x + j, 0] = qpos[positions[j]]
@@ -169,6 +170,8 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
             r[context.first_input + i, 0] = input_values[k, i]
         code = carray(to_int_pointer(context.code), (context.code_rows, 5))
         run_instructions(code, context.begin, context.end, r, 1)
+        # Registers of each joint's force and dry friction limit, and the model's own
+        # `frictionloss`.
         force = carray(to_int_pointer(context.forces), (joints,))
         limit = carray(to_int_pointer(context.limits), (joints,))
         losses = carray(to_real_pointer(context.losses), (joints,))

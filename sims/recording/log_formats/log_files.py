@@ -279,8 +279,15 @@ def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list
     Args:
         path: the file.
         columns: numbers (T,) or (T, k) by the name of their array.
-        texts: lists of texts in the file. One with as many texts as a matrix has columns, such as
-            joint names, gives these columns further names.
+        texts: lists of texts in the file, by their name. A list with as many texts as a matrix has
+            columns, such as joint names, names each of these columns.
+
+    Returns:
+        The log. Its messages call a row "entry" and count from 0. A matrix whose columns are named
+        so can still be read, but is left out of lists of columns.
+
+    Raises:
+        InputError: the file has no array of numbers.
     """
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")

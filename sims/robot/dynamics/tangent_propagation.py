@@ -453,9 +453,11 @@ class TangentModel:
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at linearisation points to all steps, (S, k).
 
-        A point lies at each change of a command and at regular distances after it. Between two
-        points with the same command, values are linear in time; after the last of them, they are
-        extrapolated.
+        A point lies at each change of a command and at regular distances after it. A command is
+        constant between its changes, so the motion is smooth there: values are linear in time
+        between two points of one command, and extrapolated after the last of them. Each step has
+        the value at its point plus `_share` times the difference of two neighbouring points of
+        the same command, `_earlier` and `_later`.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.point_of_step] + self._share[:, None] * slope

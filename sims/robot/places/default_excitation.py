@@ -81,7 +81,8 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
     commands = _make_commands(robot, joints)
     amplitude_shares = [0.5**k for k in range(MAX_AMPLITUDE_HALVINGS)]
     with capture_mujoco_warnings():
-        # If joints leave their ranges at any amplitude, their commands are not the cause.
+        # The largest amplitude at which all joints stay within their ranges. If they leave them
+        # at every amplitude, the commands are not the cause, and the full amplitude is used.
         share = next(
             (s for s in amplitude_shares if _stays_within_ranges(robot, joints, commands, s)), 1.0
         )
