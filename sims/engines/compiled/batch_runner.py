@@ -12,7 +12,7 @@ from sims.core.simulator import Array, Indices
 from sims.engines.compiled.data_layout import BatchArrays
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.kernel_entry import CHOOSE_STEP_DIVISIONS, FLY_ELEMENTS, STEP_BLOCK
+from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_ELEMENTS
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
 
@@ -47,10 +47,10 @@ def integrate_batch(
         columns += [c[:, elements, 0].T for _, c in effects]
         parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
         arrays = whole._replace(order=elements.astype(np.int64), parameters=parameters)
-        if batch.system.uniform and not any(isinstance(e, (Force, Friction)) for e, _ in effects):
-            _run_kernel_function(FLY_ELEMENTS, program, arrays, jobs)
-        else:
-            _integrate_steps(program, arrays, batch.system.bends, jobs)
+        is_uniform = batch.system.uniform and not any(
+            isinstance(e, (Force, Friction)) for e, _ in effects
+        )
+        _integrate_group(FLY_ELEMENTS if is_uniform else STEP_ELEMENTS, program, arrays, jobs)
     return Trajectories(*np.split(whole.records, 3, axis=2))
 
 
@@ -69,6 +69,7 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     record_count = steps.shape[1] // batch.steps_per_sample + 1
     return BatchArrays(
         order=np.zeros(0, dtype=np.int64),
+        queue=np.zeros(0, dtype=np.int64),
         parameters=np.zeros((0, 0)),
         mass=_to_column(batch.system.mass(batch.theta, batch.constants), count),
         x=np.ascontiguousarray(batch.x, dtype=np.float64),
@@ -85,34 +86,13 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     )
 
 
-def _integrate_steps(
-    program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, is_fine: bool, jobs: int
+def _integrate_group(
+    function: int, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, jobs: int
 ) -> None:
-    """Integrate elements in steps, after dividing the steps where an element moves fast.
+    """Integrate elements with equal effects, on several threads if there are enough of them.
 
-    `is_fine` is whether the system has hidden states, which need fine steps.
+    `function` is the function of the kernel.
     """
-    elements = arrays.order
-    _run_kernel_function(CHOOSE_STEP_DIVISIONS, program, arrays)
-    parts = arrays.divisions[elements]
-    spans = arrays.max_steps[elements]
-    if is_fine:
-        # The parts count as planned steps.
-        arrays.planned_counts[elements] *= parts
-    # Slightly longer than the part, so that rounding does not leave a tiny step after the last one.
-    arrays.max_steps[elements] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
-    # Elements with many steps begin first; the others fill the remaining slots meanwhile.
-    order = np.argsort(-parts, kind="stable")
-    _run_kernel_function(STEP_BLOCK, program, _select_elements(arrays, order), jobs)
-
-
-def _run_kernel_function(
-    function: int,
-    program: ForceProgram | NumpyForceProgram,
-    arrays: BatchArrays,
-    jobs: int = 1,
-) -> None:
-    """Run a function of the kernel, on several threads if there are enough elements."""
     count = len(arrays.order)
     threads = min(jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
 
@@ -122,11 +102,12 @@ def _run_kernel_function(
         # Elements in closed form are integrated one after the other.
         width = 1 if function == FLY_ELEMENTS else min(program.block_width, padded_count)
         prepared = program.prepare(width)
+        part = part._replace(queue=np.zeros_like(part.order))
         get_kernel().run(function, prepared.arrays, part, prepared.block, width)
         prepared.raise_error()
 
-    # Every thread gets some elements with many steps and its own buffers. No two threads write the
-    # same element, and the result of an element does not depend on any other.
+    # Every thread has its own buffers. No two threads write the same element, and the result of an
+    # element does not depend on any other.
     parts = [_select_elements(arrays, np.arange(k, count, threads)) for k in range(threads)]
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:

@@ -34,9 +34,9 @@ class ProgramArrays(NamedTuple):
             ground and speed; output registers of the limit of dry friction, restitution and
             friction of the ground.
         out: (D,) registers of the force.
-        flags: (5,) number of dimensions D; whether dry friction acts; whether forces of effects
+        flags: (6,) number of dimensions D; whether dry friction acts; whether forces of effects
             act; whether it bounces; number of coordinates, counted from the first, on which dry
-            friction acts.
+            friction acts; whether the system has hidden states.
     """
 
     code: IntTable
@@ -50,16 +50,18 @@ class BatchArrays(NamedTuple):
     """Batch elements of one program; N of them are selected out of L.
 
     Attributes:
-        order: (N,) selected elements in the order in which they begin.
-        parameters: (N, P) parameters of the program, in that order.
+        order: (N,) selected elements.
+        queue: (N,) places in this order as elements begin, to be filled in.
+        parameters: (N, P) parameters of the program, in the order of `order`.
         mass: (L,) generalised inertia.
         x: (L, D) initial position.
         v: (L, D) initial velocity.
         steps: (L or 1, S) step sizes in seconds.
         inputs: (U, L or 1, S) inputs.
-        max_steps: (L,) longest step in seconds.
+        max_steps: (L,) longest step in seconds; it is shortened where steps are divided.
         planned_counts: (L,) number of planned steps.
-        divisions: (L,) numbers of parts into which steps are divided.
+        divisions: (L,) minimum numbers of parts into which steps are divided, whole and at most
+            `step_size.MAX_STEP_DIVISIONS`; they are raised where an element moves fast.
         ground: (4, L) floor, restitution, friction, minimum remaining fraction of tangential speed.
         limits: (2,) maximum number of steps of an element, as a multiple of the planned ones, and
             maximum phase of an oscillation per step in radians.
@@ -68,6 +70,7 @@ class BatchArrays(NamedTuple):
     """
 
     order: IntTable
+    queue: IntTable
     parameters: FloatArray
     mass: FloatArray
     x: FloatArray
@@ -112,6 +115,7 @@ class Block(NamedTuple):
     out: IntTable
     flags: IntTable
     order: IntTable
+    queue: IntTable
     parameters: FloatArray
     mass: FloatArray
     x: FloatArray
@@ -136,7 +140,14 @@ CONSTANTS, FORCES, IMPACTS = range(3)
 # Entries of `ProgramArrays.rows`.
 IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
 # Entries of `ProgramArrays.flags`.
-DIMENSIONS, HAS_FRICTION, HAS_FORCES, BOUNCES, FRICTION_COORDINATE_COUNT = range(5)
+(
+    DIMENSIONS,
+    HAS_FRICTION,
+    HAS_FORCES,
+    BOUNCES,
+    FRICTION_COORDINATE_COUNT,
+    HAS_HIDDEN_STATES,
+) = range(6)
 # Rows of `BatchArrays.ground`.
 FLOOR, RESTITUTION, GROUND_FRICTION, MIN_REMAINING_SHARE = range(4)
 # Entries of `BatchArrays.limits`.
@@ -216,6 +227,7 @@ def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> 
         has_forces or system.bends,
         system.bounces,
         friction_coordinate_count,
+        system.bends,
     )
     return np.array(flags, dtype=np.int64)
 
@@ -259,8 +271,9 @@ def check_array_layout(
         (program.ends, (4,)),
         (rows, (11,)),
         (program.out, (d,)),
-        (program.flags, (5,)),
+        (program.flags, (6,)),
         (arrays.order, (selected_count,)),
+        (arrays.queue, (selected_count,)),
         (block.n, (STATE_ROW_COUNT, width)),
     ]
     real_arrays = [

@@ -95,23 +95,26 @@ from sims.engines.compiled.events import (
     is_too_nonlinear,
 )
 from sims.engines.compiled.interpreter import nan_maximum
+from sims.engines.compiled.step_size import choose_step_divisions, queue_by_divisions
 
 
-def step_block(block: Block) -> None:
+def step_elements(block: Block) -> None:
     """Make all steps of all elements, in slots that are refilled as elements finish.
 
-    Each slot has its own time and step length, so that impacts and reversals of one element do
-    not delay others.
+    Steps are divided where an element moves fast. Each slot has its own time and step length, so
+    that impacts and reversals of one element do not delay others.
 
     Args:
         block: force program, batch elements, and buffers of the slots.
     """
+    choose_step_divisions(block)
+    queue_by_divisions(block)
     loaded_count = 0
     active_count = 0
     for i in range(block.w):
         block.n[ORDER_INDEX, i] = -1
         if loaded_count < block.order.size:
-            load_element(block, i, loaded_count)
+            load_element(block, i, block.queue[loaded_count])
             loaded_count += 1
             active_count += 1
         else:
@@ -133,7 +136,7 @@ def step_block(block: Block) -> None:
                 active_count -= 1
                 block.n[ORDER_INDEX, i] = -1
                 if loaded_count < block.order.size:
-                    load_element(block, i, loaded_count)
+                    load_element(block, i, block.queue[loaded_count])
                     loaded_count += 1
                     active_count += 1
                     has_new_elements = True

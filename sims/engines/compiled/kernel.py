@@ -58,7 +58,7 @@ class CompiledKernel:
         """Run one of the functions of `kernel_entry` on all elements.
 
         Args:
-            function: `CHOOSE_STEP_DIVISIONS`, `STEP_BLOCK` or `FLY_ELEMENTS`.
+            function: `STEP_ELEMENTS` or `FLY_ELEMENTS`.
             program: program of the system and its effects.
             arrays: batch of elements.
             buffers: buffers of the slots, each of which holds one batch element at a time.

@@ -191,7 +191,7 @@ def _get_argument_types(numba: Any) -> dict[str, Any]:
         "FloatArray": table,
         "IntTable": int_table,
         "Block": Block(
-            code=int_table, ends=ints, rows=ints, out=ints, flags=ints, order=ints,
+            code=int_table, ends=ints, rows=ints, out=ints, flags=ints, order=ints, queue=ints,
             parameters=table, mass=row, x=table, v=table, steps=table, inputs=box, max_steps=row,
             planned_counts=row, divisions=row, ground=table, limits=row, records=box, r=table,
             a=table, n=int_table, steps_per_record=1, w=1,

@@ -6,12 +6,11 @@ from typing import Any
 
 from sims.engines.compiled.ballistic_motion import fly_elements
 from sims.engines.compiled.data_layout import Block
-from sims.engines.compiled.element_stepping import step_block
+from sims.engines.compiled.element_stepping import step_elements
 from sims.engines.compiled.interpreter import run_instructions
 from sims.engines.compiled.intrinsics import carray, to_int_pointer, to_real_pointer
-from sims.engines.compiled.step_size import choose_step_divisions
 
-CHOOSE_STEP_DIVISIONS, STEP_BLOCK, FLY_ELEMENTS, RUN_INSTRUCTIONS = range(4)
+STEP_ELEMENTS, FLY_ELEMENTS, RUN_INSTRUCTIONS = range(3)
 """Functions of the kernel, by the first argument of `kernel_entry`."""
 HEADER_WORDS = 4
 """Number of integers before the arrays.
@@ -21,7 +20,7 @@ first instruction and the index after the last one.
 """
 ARRAY_WORDS = 4
 """Number of integers for each array: its address, and its sizes."""
-ARRAY_COUNT = 21
+ARRAY_COUNT = 22
 """Number of arrays of a `Block`."""
 ARGUMENT_COUNT = HEADER_WORDS + ARRAY_WORDS * ARRAY_COUNT
 """Number of integers in the argument of `kernel_entry`."""
@@ -74,27 +73,26 @@ def kernel_entry(arguments_at: Any) -> None:
         get_ints(words, 3),
         get_ints(words, 4),
         get_ints(words, 5),
-        get_table(words, 6),
-        get_numbers(words, 7),
-        get_table(words, 8),
+        get_ints(words, 6),
+        get_table(words, 7),
+        get_numbers(words, 8),
         get_table(words, 9),
         get_table(words, 10),
-        get_box(words, 11),
-        get_numbers(words, 12),
+        get_table(words, 11),
+        get_box(words, 12),
         get_numbers(words, 13),
         get_numbers(words, 14),
-        get_table(words, 15),
-        get_numbers(words, 16),
-        get_box(words, 17),
-        get_table(words, 18),
+        get_numbers(words, 15),
+        get_table(words, 16),
+        get_numbers(words, 17),
+        get_box(words, 18),
         get_table(words, 19),
-        get_int_table(words, 20),
+        get_table(words, 20),
+        get_int_table(words, 21),
         words[2],
         words[1],
     )
-    if words[0] == CHOOSE_STEP_DIVISIONS:
-        choose_step_divisions(block)
-    elif words[0] == STEP_BLOCK:
-        step_block(block)
+    if words[0] == STEP_ELEMENTS:
+        step_elements(block)
     else:
         fly_elements(block)

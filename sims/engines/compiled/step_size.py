@@ -22,6 +22,7 @@ from sims.engines.compiled.data_layout import (
     DIMENSIONS,
     ELEMENT,
     FORCES,
+    HAS_HIDDEN_STATES,
     IN_U,
     IN_V,
     IN_X,
@@ -79,6 +80,32 @@ def choose_step_divisions(block: Block) -> None:
                     # NaN does not change the number of parts.
                     if needed_divisions > divisions[element]:
                         divisions[element] = min(needed_divisions, MAX_STEP_DIVISIONS)
+
+
+def queue_by_divisions(block: Block) -> None:
+    """Set the longest step of each element, and queue the elements.
+
+    Elements with many steps begin first; the others fill the remaining slots meanwhile.
+
+    Args:
+        block: force program, batch elements, and buffers of the slots.
+    """
+    queued_count = 0
+    parts = MAX_STEP_DIVISIONS
+    while parts >= 1.0:
+        for k in range(block.order.size):
+            element = block.order[k]
+            if block.divisions[element] == parts:
+                block.queue[queued_count] = k
+                queued_count += 1
+                if parts > 1.0:
+                    # Slightly longer than the part, so that rounding does not leave a tiny step
+                    # after the last one.
+                    block.max_steps[element] = block.max_steps[element] / parts * (1.0 + 1e-9)
+                if block.flags[HAS_HIDDEN_STATES] != 0:
+                    # The fine steps that hidden states need count as planned steps.
+                    block.planned_counts[element] *= parts
+        parts -= 1.0
 
 
 def select_sampled_steps(block: Block, i: int) -> None:
