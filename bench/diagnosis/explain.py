@@ -45,10 +45,15 @@ from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.numerics_cause import (
     CoarseStepFinding,
+    OptionFinding,
+    RatedOptions,
     Reusable,
-    add_numerics_cause,
+    RunEvaluators,
+    add_numerics_causes,
     is_finer_model_better,
     is_finer_step_better,
+    list_option_causes,
+    list_step_causes,
 )
 from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
 from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
@@ -92,6 +97,14 @@ MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
 """Maximum excess over the noise, as a share of that of the base model, with right units."""
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
+MIN_CLEAR_RESIDUAL = 3.0
+"""Minimum residual of the base model, in units of the noise, to change options in advance."""
+MAX_COMPETING_SQUARES_RATIO = 2.0
+"""Maximum sum of squares of an effect that competes with other options, relative to theirs."""
+MAX_OPTION_ROUNDS = 3
+"""Maximum number of options of the solver that are changed."""
+MAX_FITTED_OPTIONS = 3
+"""Maximum number of alternative options that are fitted in a round."""
 EXPLAINED_VERDICTS = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
 RecordingSource: TypeAlias = str | Path | Recording
@@ -181,14 +194,6 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
     return remove_inactive_drives(recording, kind)
 
 
-class _RunEvaluators(NamedTuple):
-    """Simulator with one time step, and its run evaluators for fitting and validation."""
-
-    kind: type[SystemSimulator]
-    fitting: RunEvaluator
-    validation: Validation | None
-
-
 class _SearchResult(NamedTuple):
     """Search result: base model, search, finding and random generator."""
 
@@ -260,10 +265,13 @@ class _ExplainRun:
             f"{effect} is not tested: {reason}" for effect, reason in kind.system.left_out.items()
         )
         self.coarse: CoarseStepFinding | None = None
+        # Options of the solver that replace those of the file, and those that may replace them.
+        self.changed_options: OptionFinding | None = None
+        self.possible_options: RatedOptions | None = None
         self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
         self.finer: Reusable[StepRefinement] | None = None
-        self.file = _RunEvaluators(self.kind, self.fitting, self.validation)
+        self.file = RunEvaluators(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.unit_errors: tuple[RecordingFault, ...] = ()
         self._check_recording()
@@ -416,14 +424,17 @@ class _ExplainRun:
             raise self._make_simulation_error()
         result = self._search_with_friction_forms(base)
         result = self._search_with_better_step(result.search, result.finding) or result
+        result = self._search_with_possible_options(result) or result
         base, search, finding, rng = result
         self.search_control.begin_stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
         verdict = replace(
             verdict, recording_faults=self.unit_errors, recording_notes=self.recording.notes
         )
-        if self.coarse is not None:
-            verdict = add_numerics_cause(verdict, self.coarse)
+        numerics_causes = [] if self.coarse is None else list_step_causes(self.coarse)
+        if self.changed_options is not None:
+            numerics_causes += list_option_causes(self.changed_options)
+        verdict = add_numerics_causes(verdict, numerics_causes)
         self.found = search, finding
         notes = (
             *describe_unusual_values(self.fitting, finding.model.fit.theta, self.wider),
@@ -449,7 +460,7 @@ class _ExplainRun:
         from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 
-        stiff_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        stiff_evaluators = RunEvaluators(self.kind, self.fitting, self.validation)
         try:
             result = _SearchResult(base, search, self._find_causes(search), rng)
             # The search itself compares the forms of friction that it selects, but not of friction
@@ -817,9 +828,147 @@ class _ExplainRun:
 
         Free numbers that the data cannot identify are frozen.
         """
-        if self._shows_step_errors(base):
+        base = self._choose_options(base)
+        if self.changed_options is None and self._shows_step_errors(base):
             base = self._choose_base_step(base)
         return self._finish_robot_base(base)
+
+    def _choose_options(self, base: BaseFit) -> BaseFit:
+        """Choose the options of MuJoCo's solver of a robot with contacts: the file's, or others.
+
+        Other options are used before the search if they alone close a large gap down to the noise,
+        and if no effect at a contact does so with the file's options. Other options that are better
+        than the file's are compared with the result of the search.
+        """
+        if (
+            not self._has_contacts
+            or self.tuner is not None
+            or self.search_control.is_over()
+            or not np.isfinite(base.fit.cost)
+        ):
+            return base
+        # This import is needed for robots only.
+        from bench.diagnosis.kalman.contact_proposals import find_lowest_scan
+
+        file_options = self._rate_options(base)
+        if file_options.is_noise_like:
+            return base
+        options = self._improve_options(file_options)
+        self._restore_evaluators(file_options.evaluators)
+        if options is file_options:
+            return base
+        if options.is_noise_like and file_options.residual > MIN_CLEAR_RESIDUAL:
+            limit = MAX_COMPETING_SQUARES_RATIO * options.base.fit.cost
+            search = self._create_search(base, self._make_rng())
+            if not find_lowest_scan(search) < limit:
+                self._use_options(options, file_options)
+                return options.base
+        self.possible_options = options
+        return base
+
+    def _rate_options(self, base: BaseFit) -> RatedOptions:
+        """Rate a base model that was fitted with the present options."""
+        search = self._create_search(base, self._make_rng())
+        model = search.base_model
+        held_out = 0.0
+        if self.validation is not None:
+            held_out = self.validation.validate([base.fit])[0].penalised_log_likelihood
+        return RatedOptions(
+            RunEvaluators(self.kind, self.fitting, self.validation),
+            base,
+            float(model.likelihood.value),
+            model.penalised_log_likelihood,
+            1.0 + search.compute_excess_residual(model),
+            held_out,
+            search.is_noise_like(model),
+        )
+
+    def _improve_options(self, rated: RatedOptions) -> RatedOptions:
+        """Return the best options, changed one after the other while the base model improves.
+
+        The run evaluators of any options may be in use afterwards.
+
+        Args:
+            rated: The options in use.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
+
+        for _ in range(MAX_OPTION_ROUNDS):
+            evaluator = rated.evaluators.fitting
+            tried = []
+            for alternative in rank_option_alternatives(
+                evaluator, self.noise, rated.base.fit.theta, evaluator.initial_state_guesses
+            )[:MAX_FITTED_OPTIONS]:
+                if self.search_control.is_over():
+                    break
+                robot: Any = self.kind
+                self._set_up(robot.with_integrator_settings(alternative.numerics))
+                if self.fitting.filtered_runs is None:
+                    self._filter_runs()
+                starts = self._get_nearby_starts(rated.base)
+                tried.append(self._rate_options(fit_base_model(self.fitting, self.noise, starts)))
+            best = max(tried, key=lambda one: one.log_likelihood, default=rated)
+            if best is rated or not best.is_better_than(rated):
+                break
+            rated = best
+        return rated
+
+    def _use_options(self, options: RatedOptions, file_options: RatedOptions) -> None:
+        """Use other options of the solver than the model file's.
+
+        Args:
+            options: The other options.
+            file_options: The options of the model file, with the base model fitted with them.
+        """
+        self._restore_evaluators(options.evaluators)
+        gain = options.log_likelihood - file_options.log_likelihood
+        robot: Any = self.kind
+        self.changed_options, self.possible_options = OptionFinding(robot, gain), None
+        self.say("simulated with other options of the solver than the model file's")
+        self.assessor = replace(
+            self.assessor,
+            before=self._predict_with_file_step(
+                file_options.base, file_options.evaluators.validation
+            ),
+        )
+
+    def _search_with_possible_options(self, result: _SearchResult) -> _SearchResult | None:
+        """Return the result with other options, if they explain the data better; otherwise None.
+
+        Args:
+            result: Result with the options of the model file.
+        """
+        options, finding = self.possible_options, result.finding
+        if options is None or self.coarse is not None or self.unit_errors:
+            return None
+        if finding.early_stop is not None or self.search_control.is_over():
+            return None
+        merits = (
+            finding.model.penalised_log_likelihood,
+            result.search.compute_excess_residual(finding.model),
+        )
+        is_better = is_finer_model_better(
+            merits, (options.penalised_log_likelihood, options.residual - 1.0)
+        )
+        if not is_better and self._is_explained(result):
+            return None
+        evaluators, before = (
+            RunEvaluators(self.kind, self.fitting, self.validation),
+            self.assessor.before,
+        )
+        file_options = self._rate_options(result.base)
+        self._use_options(options, file_options)
+        other = self._finish_base_and_search(options.base)
+        other_merits = (
+            other.finding.model.penalised_log_likelihood,
+            other.search.compute_excess_residual(other.finding.model),
+        )
+        if is_finer_model_better(merits, other_merits):
+            return other
+        self._restore_evaluators(evaluators, before)
+        self.changed_options = None
+        return None
 
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
@@ -893,7 +1042,7 @@ class _ExplainRun:
         from bench.diagnosis.evaluation.integrator_check import find_step_refinements
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
-        file_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        file_evaluators = RunEvaluators(self.kind, self.fitting, self.validation)
         file_log_likelihood, residual = self._rate_base(base)
         gap = residual - 1.0
         for refinement in self.finer:
@@ -926,7 +1075,7 @@ class _ExplainRun:
         refinement: StepRefinement,
         gain: float,
         base: BaseFit,
-        file_evaluators: _RunEvaluators,
+        file_evaluators: RunEvaluators,
     ) -> None:
         """Record that the file's own step is too coarse; the finer step is in use already.
 
@@ -973,7 +1122,7 @@ class _ExplainRun:
             finding.model.penalised_log_likelihood,
             search.compute_excess_residual(finding.model),
         )
-        present_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        present_evaluators = RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
             self._restore_evaluators(self.file)
@@ -1049,7 +1198,7 @@ class _ExplainRun:
             return None
         return validation.validate([base.fit])[0].simulated
 
-    def _restore_evaluators(self, evaluators: _RunEvaluators, before: Array | None = None) -> None:
+    def _restore_evaluators(self, evaluators: RunEvaluators, before: Array | None = None) -> None:
         """Return to run evaluators that were in use before."""
         self.kind, self.fitting, self.validation = evaluators
         self.assessor = replace(self._create_verdict_builder(), before=before)

@@ -133,21 +133,29 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
 
 
 def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
-    """Return the time step and integrator as causes, if they differ from those of the model file.
+    """Return the options of the model as causes, if they differ from those of the model file.
 
-    The step is in seconds; the integrator is its MuJoCo number. They have no intervals because they
-    are chosen, not fitted.
+    The step is in seconds; an option that is a word in the file has its MuJoCo number. They have no
+    intervals because they are chosen, not fitted.
     """
-    from sims.robot.integrator_settings import INTEGRATOR_IDS, read_integrator_settings
+    from sims.robot.integrator_settings import list_changed_options
 
-    file_settings, numerics = read_integrator_settings(kind.robot), kind.numerics
-    changed: dict[str, Mapping[str, FittedValue]] = {}
-    if numerics.timestep != file_settings.timestep:
-        changed["numerics.step"] = {"step": FittedValue(numerics.timestep, "s", None, None)}
-    if numerics.integrator != file_settings.integrator:
-        number = INTEGRATOR_IDS[numerics.integrator]
-        changed["numerics.integrator"] = {"integrator": FittedValue(number, "1", None, None)}
-    return changed
+    return {
+        effect: {effect.removeprefix("numerics."): make_option_value(effect, *numbers)}
+        for effect, numbers in list_changed_options(kind.robot, kind.numerics).items()
+    }
+
+
+def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
+    """Return the value of a changed option of the model file.
+
+    Args:
+        effect: Effect that names the option, such as ``numerics.impratio``.
+        stated: Number in the model file.
+        number: Number that replaces it.
+    """
+    unit = "s" if effect == "numerics.step" else "1"
+    return FittedValue(float(number), unit, None, None, stated=float(stated), total=float(number))
 
 
 MIN_UNCHANGED_SHARE = 0.5

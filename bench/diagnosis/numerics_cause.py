@@ -1,23 +1,31 @@
-"""Report a too coarse time step or integrator as the first cause of a verdict."""
+"""Report wrong numerical settings of a model file as the first causes of a verdict.
+
+They are a too coarse time step or integrator, and options of MuJoCo's solver.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.extended_robot_files import make_option_value
+from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.search.verdict_rules import (
     VerdictName,
     improves_held_out,
     is_indistinguishable,
 )
+from bench.diagnosis.validation.held_out_runs import Validation
 from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:
     from bench.diagnosis.evaluation.integrator_check import StepRefinement
+    from sims.robot.robot_simulator import RobotSimulator
 
 Item = TypeVar("Item")
 
@@ -30,11 +38,11 @@ MIN_CLOSED_SHARE = 0.5
 search. With a smaller share, another missing effect decides which step looks better.
 """
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
-_VERDICT_WITH_COARSE_STEP: dict[VerdictName, VerdictName] = {
+_VERDICT_WITH_NUMERICS: dict[VerdictName, VerdictName] = {
     "adequate": "named",
     "unknown": "partial",
 }
-"""Verdict on the whole if the step was too coarse, by the verdict on the remaining causes."""
+"""Verdict on the whole if numerical settings are wrong, by the verdict on the remaining causes."""
 
 
 class Reusable(Generic[Item]):
@@ -82,6 +90,14 @@ def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float])
     return not is_indistinguishable(merits[1] - merits[0]) and improves_held_out(merits, excesses)
 
 
+class RunEvaluators(NamedTuple):
+    """Simulator with one time step, and its run evaluators for fitting and validation."""
+
+    kind: Any
+    fitting: RunEvaluator
+    validation: Validation | None
+
+
 class CoarseStepFinding(NamedTuple):
     """Finding that the model file's own step is too coarse.
 
@@ -94,33 +110,110 @@ class CoarseStepFinding(NamedTuple):
     gain: float
 
 
-def add_numerics_cause(verdict: Verdict, coarse: CoarseStepFinding) -> Verdict:
-    """Add the step or integrator to a verdict as its first cause.
+class OptionFinding(NamedTuple):
+    """Finding that options of the model file's solver differ from those of the recording.
+
+    Attributes:
+        kind: Simulator with the options that explain the recording.
+        gain: Gain in twice the log-likelihood.
+    """
+
+    kind: type[RobotSimulator]
+    gain: float
+
+
+class RatedOptions(NamedTuple):
+    """Base model with some options of the solver, and how well it explains the recording.
+
+    Attributes:
+        evaluators: Simulator with the options, and its run evaluators.
+        base: The base model.
+        log_likelihood: Twice the log-likelihood.
+        penalised_log_likelihood: Penalised log-likelihood.
+        residual: RMS residual in units of the noise.
+        held_out: Penalised log-likelihood of the held-out runs; 0 without validation.
+        is_noise_like: Whether the residual may be noise.
+    """
+
+    evaluators: RunEvaluators
+    base: BaseFit
+    log_likelihood: float
+    penalised_log_likelihood: float
+    residual: float
+    held_out: float
+    is_noise_like: bool
+
+    def is_better_than(self, other: RatedOptions) -> bool:
+        """Return whether these options explain the recording better than others, on their own.
+
+        They must close half of the gap, and predict the held-out runs better. Only another value of
+        an option that has been changed already needs no part of the gap.
+        """
+        options, other_options = (
+            {name for name, _ in rated.evaluators.kind.numerics.solver_options}
+            for rated in (self, other)
+        )
+        gain = self.log_likelihood - other.log_likelihood
+        if options == other_options:
+            return not is_indistinguishable(gain)
+        return self.held_out >= other.held_out and is_finer_step_better(
+            gain, other.residual - 1.0, self.residual - 1.0
+        )
+
+
+def add_numerics_causes(verdict: Verdict, causes: Sequence[Cause]) -> Verdict:
+    """Add wrong numerical settings to a verdict as its first causes.
 
     Args:
         verdict: Verdict on the remaining causes.
-        coarse: Finding that the file's step is too coarse.
+        causes: The numerical settings; the verdict stays as it is without any.
     """
-    causes = (*_list_numerics_causes(coarse), *verdict.causes)
+    if not causes:
+        return verdict
     return replace(
         verdict,
-        verdict=_VERDICT_WITH_COARSE_STEP.get(verdict.verdict, verdict.verdict),
-        causes=causes,
+        verdict=_VERDICT_WITH_NUMERICS.get(verdict.verdict, verdict.verdict),
+        causes=(*causes, *verdict.causes),
     )
 
 
-def _list_numerics_causes(coarse: CoarseStepFinding) -> list[Cause]:
+def _compute_p_value(gain: float) -> float:
+    """Return the p-value of a gain in twice the log-likelihood by at most two chosen numbers.
+
+    It is exp(-gain / 2) by Wilks' theorem; the gain is limited to 1400 so that the p-value does not
+    become zero by underflow.
+    """
+    return float(np.exp(-0.5 * min(gain, 1400.0)))
+
+
+def list_option_causes(finding: OptionFinding) -> list[Cause]:
+    """Return the options of the solver that differ from the model file as causes."""
+    from sims.robot.integrator_settings import OPTION_EFFECTS, format_option, list_changed_options
+
+    kind, p_value = finding.kind, _compute_p_value(finding.gain)
+    causes = []
+    for effect, (stated, number) in list_changed_options(kind.robot, kind.numerics).items():
+        option = OPTION_EFFECTS[effect]
+        before, after = (
+            value if isinstance(value, str) else f"{value:g}"
+            for value in (format_option(option, stated), format_option(option, number))
+        )
+        description = f"{option} = {after} explains the recording, the model file has {before}"
+        coefficients = {"coefficient": make_option_value(effect, stated, number)}
+        causes.append(Cause(effect, (), description, coefficients, p_value))
+    return causes
+
+
+def list_step_causes(coarse: CoarseStepFinding) -> list[Cause]:
     """Return the integrator and the time step as causes if they differ from the model file.
 
-    Their p-value is that of the gain in twice the log-likelihood by Wilks' theorem, exp(-gain / 2)
-    for two parameters; the gain is limited to 1400 so that the p-value does not become zero by
-    underflow.
+    Args:
+        coarse: Finding that the file's step is too coarse.
     """
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 
     file_settings, numerics = coarse.refinement.file_settings, coarse.refinement.numerics
-    # At most two numbers are chosen, so Wilks' theorem gives this p-value of the gain.
-    p_value = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
+    p_value = _compute_p_value(coarse.gain)
     error = (
         f"the file's own misses its fine motion by {coarse.refinement.error:.2g} times the noise"
     )

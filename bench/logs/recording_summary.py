@@ -196,7 +196,7 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
         (len(robot.sensors), "sensor row"),
     )
     words = ", ".join(f"{n} {_pluralise(word, n)}" for n, word in counts if n)
-    step, integrator = simulator.numerics
+    step, integrator, *_ = simulator.numerics
     form = robot.format.upper()
     yield f"robot {robot.path} ({form}): {words}; {integrator} at {1e3 * step:g} ms"
     yield from (f"note: {note}" for note in robot.notes)

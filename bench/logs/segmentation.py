@@ -114,7 +114,7 @@ def segment_recording(
 def _compute_affordable_seconds(kind: type[Simulator]) -> float:
     """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`."""
     robot: Any = kind
-    step, integrator = robot.numerics
+    step, integrator, *_ = robot.numerics
     joints = sum(joint.has_one_coordinate for joint in robot.robot.joints)
     return float(
         MAX_RECORDING_COST * step / (joints + 3) / STEP_COST_BY_INTEGRATOR.get(integrator, 1.0)

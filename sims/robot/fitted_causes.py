@@ -11,6 +11,7 @@ import numpy as np
 from sims.core.plain_values import append_unit
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
+from sims.robot.integrator_settings import OPTION_EFFECTS, format_option
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
@@ -79,11 +80,20 @@ class FittedCause:
     def format(self, recording: str) -> str:
         """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``."""
         has_several = len(self.numbers) > 1
+        origin_text = f", fitted to {recording}" if recording else ""
+        if self.effect in OPTION_EFFECTS:
+            (number,) = self.numbers.values()
+            option = OPTION_EFFECTS[self.effect]
+            before, after = (
+                format_option(option, value if value is not None else number.value)
+                for value in (number.stated, number.total)
+            )
+            if isinstance(after, str):
+                return f"{self.name}: from {before} to {after}{origin_text}"
         numbers = [
             (f"{name} " if has_several else "") + _format_estimate(number)
             for name, number in self.numbers.items()
         ]
-        origin_text = f", fitted to {recording}" if recording else ""
         return f"{self.name}: {', '.join(numbers)}{origin_text}"
 
 

@@ -1,4 +1,4 @@
-"""Time step and integrator of a robot, and solver parameters of MuJoCo's friction constraint.
+"""Time step, integrator and solver options of a robot, and stiff friction constraints.
 
 MuJoCo models dry friction as a constraint with the parameters `solref` and `solimp`
 (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). Its defaults are
@@ -8,7 +8,7 @@ soft, so that a joint at rest creeps; effects add stiff friction.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -22,20 +22,111 @@ RK4_INTEGRATOR_ID = INTEGRATOR_IDS["RK4"]
 """MuJoCo's number of the Runge-Kutta 4 integrator."""
 
 
+CONE_IDS = {"pyramidal": 0, "elliptic": 1}
+"""Numbers of MuJoCo's friction cones (mjtCone), by their names in a model file."""
+SOLVER_IDS = {"PGS": 0, "CG": 1, "Newton": 2}
+"""Numbers of MuJoCo's constraint solvers (mjtSolver), by their names in a model file."""
+OPTION_WORDS: Mapping[str, Mapping[str, int]] = {
+    "integrator": INTEGRATOR_IDS,
+    "cone": CONE_IDS,
+    "solver": SOLVER_IDS,
+}
+"""Numbers of the words that an option of a model file may have, by option."""
+OPTION_EFFECTS: Mapping[str, str] = {
+    "numerics.step": "timestep",
+    "numerics.integrator": "integrator",
+    "numerics.cone": "cone",
+    "numerics.impratio": "impratio",
+    "numerics.noslip": "noslip_iterations",
+    "numerics.solver": "solver",
+    "numerics.iterations": "iterations",
+}
+"""Options of a model file by the effect that names them as a cause."""
+
+
 class IntegratorSettings(NamedTuple):
-    """Integrator settings of MuJoCo.
+    """Numerical settings of MuJoCo.
 
     Attributes:
         timestep: time step in seconds.
         integrator: name of the integrator, a key of `INTEGRATOR_IDS`.
+        solver_options: further options that differ from the model file, as pairs of name and
+            number, sorted by name. They are those of `OPTION_EFFECTS`.
     """
 
     timestep: float
     integrator: str
+    solver_options: tuple[tuple[str, float], ...] = ()
 
     def to_model_options(self) -> dict[str, float]:
         """Return the settings as fields of a model's options (`mujoco.MjOption`)."""
-        return {"timestep": self.timestep, "integrator": INTEGRATOR_IDS[self.integrator]}
+        return {
+            "timestep": self.timestep,
+            "integrator": INTEGRATOR_IDS[self.integrator],
+            **dict(self.solver_options),
+        }
+
+    def to_document(self) -> dict[str, float | str]:
+        """Return the settings as in a model file: words where the file has words."""
+        return {
+            name: format_option(name, number) for name, number in self.to_model_options().items()
+        }
+
+    def replace_options(self, options: Mapping[str, float]) -> IntegratorSettings:
+        """Return the settings with other options.
+
+        Args:
+            options: numbers by name of the option, as in `to_model_options`.
+        """
+        changed = {**self.to_model_options(), **options}
+        words = {number: word for word, number in INTEGRATOR_IDS.items()}
+        return IntegratorSettings(
+            changed.pop("timestep"),
+            words[int(changed.pop("integrator"))],
+            tuple(sorted(changed.items())),
+        )
+
+
+def format_option(name: str, number: float) -> float | str:
+    """Return the value of an option as in a model file: a word where the file has words.
+
+    Args:
+        name: name of the option.
+        number: its number in a compiled model.
+    """
+    words = {number: word for word, number in OPTION_WORDS.get(name, {}).items()}
+    return words.get(int(number), number) if words else number
+
+
+def parse_option(name: str, value: float | str) -> float:
+    """Return the number of an option in a compiled model; the reverse of `format_option`."""
+    return OPTION_WORDS[name][value] if isinstance(value, str) else value
+
+
+def read_option(robot: RobotModel, name: str) -> float:
+    """Return the number of an option in the robot's model file."""
+    return cast(float, getattr(robot.compiled.opt, name))
+
+
+def list_changed_options(
+    robot: RobotModel, settings: IntegratorSettings
+) -> dict[str, tuple[float, float]]:
+    """Return the options in which settings differ from the robot's model file.
+
+    Args:
+        robot: robot with the model file.
+        settings: settings in use.
+
+    Returns:
+        Number in the file and number in use, by the effect that names the option.
+    """
+    options = settings.to_model_options()
+    changes = {
+        effect: (read_option(robot, name), options[name])
+        for effect, name in OPTION_EFFECTS.items()
+        if name in options
+    }
+    return {effect: pair for effect, pair in changes.items() if pair[0] != pair[1]}
 
 
 DEFAULT_SETTINGS = IntegratorSettings(0.002, "Euler")

@@ -40,7 +40,7 @@ class RobotReference:
         free: numbers of the model file that are free parameters, such as ``damping@*``.
         actuators: actuators that a recording added, by name.
         engine: time step and integrator of the recording that replace those of the model file.
-        numerics: ``timestep`` and ``integrator`` that differ from those; found by explain.
+        numerics: options that differ from those, such as ``timestep``; found by explain.
         friction_form: form of the dry friction that effects add (`sims.robot.friction_form`).
     """
 
@@ -78,7 +78,7 @@ class RobotReference:
             InputError: the model file is missing, cannot be read or has changed.
         """
         # These modules are imported lazily, since most simulators do not need robots.
-        from sims.robot.integrator_settings import IntegratorSettings, read_integrator_settings
+        from sims.robot.integrator_settings import parse_option, read_integrator_settings
         from sims.robot.parsing.read_model_file import read_robot
         from sims.robot.robot_simulator import make_robot_simulator
 
@@ -86,8 +86,8 @@ class RobotReference:
         if self.digest is not None and robot.digest != self.digest:
             remedy = "restore that file, or explain the recording again"
             raise InputError(f"model file {self.path} is not the one that was fitted; {remedy}")
-        numerics = IntegratorSettings(
-            **{**read_integrator_settings(robot)._asdict(), **self.numerics}
+        numerics = read_integrator_settings(robot).replace_options(
+            {name: parse_option(name, value) for name, value in self.numerics.items()}
         )
         return make_robot_simulator(
             robot.with_friction_form(self.friction_form), self.free, numerics
@@ -97,7 +97,7 @@ class RobotReference:
 def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
     """Make the reference with which an extended simulator finds and checks its robot again.
 
-    Time step and integrator are stated only where they differ from the model file.
+    Numerical settings are stated only where they differ from the model file.
     """
     from sims.robot.integrator_settings import read_integrator_settings
 
@@ -109,7 +109,7 @@ def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
         kind.free,
         robot.actuator_tables,
         robot.engine_table,
-        kind.numerics._asdict() if differs else {},
+        kind.numerics.to_document() if differs else {},
         robot.friction_form,
     )
 
@@ -157,8 +157,8 @@ def _check_friction_form(source: Source, value: Any) -> FrictionForm:
 
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
-    """Check the table ``[numerics]``: a time step in seconds, and one of MuJoCo's integrators."""
-    from sims.robot.integrator_settings import INTEGRATOR_IDS
+    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver."""
+    from sims.robot.integrator_settings import OPTION_EFFECTS, OPTION_WORDS
 
     settings = check_table(source, "numerics", value)
     for key, entry in settings.items():
@@ -167,7 +167,16 @@ def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
             settings[key] = check_finite(source, entry_name, entry)
             if settings[key] <= 0:
                 raise make_error(source, entry_name, "more than 0 s", entry)
-        elif key != "integrator" or entry not in INTEGRATOR_IDS:
-            expectation = f"timestep, or integrator = {' | '.join(INTEGRATOR_IDS)}"
+        elif key in OPTION_WORDS:
+            if entry not in OPTION_WORDS[key]:
+                raise make_error(source, entry_name, " | ".join(OPTION_WORDS[key]), entry)
+        elif key in OPTION_EFFECTS.values():
+            settings[key] = check_finite(source, entry_name, entry)
+            if settings[key] < 0:
+                raise make_error(source, entry_name, "at least 0", entry)
+            if key != "impratio":
+                settings[key] = int(settings[key])
+        else:
+            expectation = f"one of {', '.join(OPTION_EFFECTS.values())}"
             raise make_error(source, entry_name, expectation, entry)
     return settings

@@ -79,6 +79,8 @@ from sims.robot.robot_model import RobotModel
 from sims.robot.robot_system import RobotSystem, make_robot_system
 from sims.system_simulator import SystemSimulator
 
+ENGINE_SETTINGS = ("timestep", "integrator")
+"""Settings of the engine that a recording or an experiment may specify."""
 LINEARISATION_BATCH_SIZE = 128
 """Batch size for linearisation: number of points of a motion that are evaluated together."""
 
@@ -88,7 +90,7 @@ class RobotSimulator(SystemSimulator):
 
     Attributes:
         robot: the robot.
-        numerics: time step and integrator, from the model file or changed.
+        numerics: time step, integrator and changed options of the solver.
         free: numbers of the model file that are parameters.
     """
 
@@ -127,10 +129,8 @@ class RobotSimulator(SystemSimulator):
         if name not in (None, "mujoco"):
             raise InputError(f"robot {self.name} steps in MuJoCo; it has no engine '{name}'")
         for setting in settings:
-            if setting not in IntegratorSettings._fields:
-                raise make_unknown_name_error(
-                    "setting of engine mujoco", setting, IntegratorSettings._fields
-                )
+            if setting not in ENGINE_SETTINGS:
+                raise make_unknown_name_error("setting of engine mujoco", setting, ENGINE_SETTINGS)
         numerics = self.numerics._replace(**settings)
         if numerics.integrator not in INTEGRATOR_IDS:
             raise make_unknown_name_error(

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 import simgap
+from tests.bench.diagnosis.block_recordings import write_block_recording
 
 MODEL_B = """<mujoco model="b">
   <compiler angle="radian" autolimits="true"/>
@@ -42,6 +43,11 @@ DIFFERENCES = {
     ),
 }
 """Text of the model file of B, and of that of A, by name of the difference."""
+BLOCK_DIFFERENCES = {
+    "cone": {"options": 'cone="elliptic"'},
+    "friction": {"change": ('friction="0.6"', 'friction="0.7"')},
+}
+"""Differences of the block on a plane, as arguments of `write_block_recording`."""
 RUNS, SAMPLES, RATE, NOISE = 4, 300, 100, 2e-4
 AMPLITUDES = np.array([0.4, 0.5])
 
@@ -89,11 +95,18 @@ def main() -> None:
     for name, (text_b, text_a) in DIFFERENCES.items():
         assert MODEL_B.count(text_b) == 1
         with tempfile.TemporaryDirectory() as folder:
-            path = write_recording(Path(folder), MODEL_B.replace(text_b, text_a))
-            verdict = simgap.explain(path).answer
-        for cause in verdict.causes:
-            values = [f"{number.value:.4g}" for number in cause.coefficients.values()]
-            print(name, verdict.verdict, cause.effect, *values, "or", *cause.alternatives)
+            print_causes(name, write_recording(Path(folder), MODEL_B.replace(text_b, text_a)))
+    for name, arguments in BLOCK_DIFFERENCES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            print_causes(name, write_block_recording(Path(folder), **arguments))
+
+
+def print_causes(name: str, path: Path) -> None:
+    """Print the verdict on a recording and its causes."""
+    verdict = simgap.explain(path).answer
+    for cause in verdict.causes:
+        values = [f"{number.value:.4g}" for number in cause.coefficients.values()]
+        print(name, verdict.verdict, cause.effect, *values, "or", *cause.alternatives)
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
 
     A step of RK4 costs 3.3 times as much as one of the other integrators.
     """
-    step, integrator = model_settings
+    step, integrator, *_ = model_settings
     cost = {"RK4": 3.3}
     settings_by_cost = []
     for parts in (1, 2, 5, MAX_STEP_DIVISIONS):
@@ -123,7 +123,7 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
             if (parts, name) != (1, integrator):
                 settings_by_cost.append((parts * cost.get(name, 1.0), parts, name))
     for _, parts, name in sorted(settings_by_cost, key=lambda entry: entry[0]):
-        yield IntegratorSettings(step / parts, name)
+        yield model_settings._replace(timestep=step / parts, integrator=name)
 
 
 class _ReferenceMotions:
@@ -169,7 +169,9 @@ class _ReferenceMotions:
         """
         for parts in (1, 2, 5):
             coarse, refined = (
-                self.of(IntegratorSettings(model_settings.timestep / n, "RK4"))
+                self.of(
+                    model_settings._replace(timestep=model_settings.timestep / n, integrator="RK4")
+                )
                 for n in (parts, 2 * parts)
             )
             if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
@@ -178,7 +180,11 @@ class _ReferenceMotions:
             extrapolated = []
             for n in (parts, 2 * parts):
                 coarse, refined = (
-                    self.of(IntegratorSettings(model_settings.timestep / k, STIFF_INTEGRATOR))
+                    self.of(
+                        model_settings._replace(
+                            timestep=model_settings.timestep / k, integrator=STIFF_INTEGRATOR
+                        )
+                    )
                     for k in (n, 2 * n)
                 )
                 extrapolated.append(2.0 * refined - coarse)  # (1)

@@ -673,6 +673,19 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
     return sorted(useful, key=lambda value: value.squares)[:MAX_TRIED_EFFECTS]
 
 
+def find_lowest_scan(search: EffectSearch) -> float:
+    """Return the lowest sum of squares of scans of all effects at contacts; infinite without any.
+
+    The initial states are those that were estimated with the present model.
+    """
+    states, lowest = search.evaluator.initial_state_guesses, np.inf
+    for value in _list_effects_at_contacts(search):
+        for width in SCAN_WIDTHS:
+            value = _scan(search, value, width, states)
+        lowest = min(lowest, value.squares)
+    return lowest
+
+
 def _list_nearby_values(
     search: EffectSearch, value: _ScannedValue, distances: Array
 ) -> list[_ScannedValue]:

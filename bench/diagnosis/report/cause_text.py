@@ -260,16 +260,19 @@ _MODEL_FILE_ERROR_FORMATTERS: Mapping[str, Callable[[str, Sequence[FittedValue]]
 _STEP_ERROR_TEXTS = {
     "numerics.step": "the time step of the model file is too long",
     "numerics.integrator": "the integrator of the model file is not accurate enough",
+    "numerics.cone": "the model file has another friction cone",
+    "numerics.impratio": "the model file has another impedance ratio of friction",
+    "numerics.noslip": "the model file has another number of iterations without slip",
+    "numerics.solver": "the model file has another constraint solver",
+    "numerics.iterations": "the model file has another number of iterations of the solver",
 }
-"""Description of a too coarse time step or integrator of the model file; the cause names the
-correction.
-"""
+"""Description of wrong numerical settings of the model file; the cause names the correction."""
 
 
 def list_values(cause: Cause) -> list[tuple[str, str]]:
     """List the coefficients of a cause by name, with their intervals and units."""
-    # The corrected step was chosen, not estimated, and an integrator is not a number.
-    if cause.effect == "numerics.integrator":
+    # The corrected step was chosen, not estimated, and some options are words.
+    if cause.effect in ("numerics.integrator", "numerics.cone", "numerics.solver"):
         return []
     if cause.effect == "numerics.step":
         steps = cause.coefficients.values()

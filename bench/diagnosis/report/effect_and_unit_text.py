@@ -34,10 +34,13 @@ _AT = {
 NUMERICS_NAMES = {
     "numerics.step": "too long a time step",
     "numerics.integrator": "an inaccurate integrator",
+    "numerics.cone": "another friction cone",
+    "numerics.impratio": "another impedance ratio of friction",
+    "numerics.noslip": "another number of iterations without slip",
+    "numerics.solver": "another constraint solver",
+    "numerics.iterations": "another number of iterations of the solver",
 }
-"""Names of a too coarse time step or integrator as causes; they are errors of the model file, not
-effects.
-"""
+"""Names of numerical settings as causes; they are errors of the model file, not effects."""
 _WRONG = re.compile(r"an? (wrong|misplaced) ")
 """Pattern of nouns that name a wrong value, not a missing effect."""
 

@@ -169,7 +169,8 @@ def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -
         return robot
     spec = robot.spec.copy()
     for name, value in settings.items():
-        setattr(spec.option, name, value)
+        # The options of a spec accept whole numbers only where the compiled options have them.
+        setattr(spec.option, name, type(getattr(option, name))(value))
     return replace(robot, spec=spec)
 
 
@@ -188,7 +189,7 @@ class MujocoBatch:
     Args:
         robot: robot to simulate.
         derived: whether masses or armatures change, from which MuJoCo derives constants.
-        settings: options of the model: timestep (seconds), integrator (its number).
+        settings: options of the model by name, such as timestep (seconds).
         count: batch size.
     """
 
@@ -636,7 +637,7 @@ class BatchCache:
         """
         if added in self._refused:
             raise RefusedModelError(self._refused[added])
-        key = (derived, count, *settings.values())
+        key = (derived, count, *settings.items())
         try:
             variant = self._get_variant(added)
             if key not in variant.batches:

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sims.robot.fitted_causes import FittedCause
+from sims.robot.integrator_settings import OPTION_EFFECTS
 from sims.robot.model_field_effects import get_write_order
 from sims.robot.robot_model import RobotModel
 
@@ -82,6 +84,11 @@ class MjcfAttribute(NamedTuple):
 
 def _make_reader(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
     return lambda fields, field_address: fields[name][0, getattr(field_address, address)]
+
+
+def _read_option(name: str, fields: Fields, field_address: Any) -> Any:  # noqa: ARG001
+    """Read an option of the model from its fields."""
+    return fields[f"opt.{name}"][0]
 
 
 class FieldAddress(NamedTuple):
@@ -167,9 +174,10 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
         MjcfAttribute("solref", "solref", _make_reader("pair_solref")),
     ),
     "option": (
-        MjcfAttribute("timestep", "timestep", lambda f, _: f["opt.timestep"][0]),
-        MjcfAttribute("integrator", "integrator", lambda f, _: f["opt.integrator"][0]),
-        MjcfAttribute("gravity", "gravity", lambda f, _: f["opt.gravity"][0]),
+        *(
+            MjcfAttribute(name, name, partial(_read_option, name))
+            for name in (*OPTION_EFFECTS.values(), "gravity")
+        ),
     ),
     "compiler": (),
 }
@@ -189,12 +197,14 @@ _NAMES = (
 FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
 ANGLE_ATTRIBUTES = frozenset({"ref", "springref"})
 """Attributes of a hinge in the unit of the file's angles."""
-INTEGER_ATTRIBUTES = frozenset({"nsample", "interp"})
+INTEGER_ATTRIBUTES = frozenset({"nsample", "interp", "noslip_iterations", "iterations"})
 ENUM_ATTRIBUTES: Mapping[str, str] = {
     "dyntype": "mjtDyn",
     "gaintype": "mjtGain",
     "biastype": "mjtBias",
     "integrator": "mjtIntegrator",
+    "cone": "mjtCone",
+    "solver": "mjtSolver",
 }
 """Attributes whose values are words, and the MuJoCo enumerations of these words."""
 
@@ -202,7 +212,7 @@ ENUM_ATTRIBUTES: Mapping[str, str] = {
 def copy_model_fields(model: Any) -> Fields:
     """Copy the fields of a compiled model that store attributes."""
     fields = {name: np.array(getattr(model, name))[None] for name in _NAMES}
-    for name in ("timestep", "integrator", "gravity"):
+    for name in (*OPTION_EFFECTS.values(), "gravity"):
         fields[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
     return fields
 
@@ -561,25 +571,20 @@ def _write_constant_force(
     return "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
 
 
-def _write_time_step(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
-    """Write a time step in seconds as the option of the model file."""
-    (step,) = cause.coefficients
-    fields["opt.timestep"][0] = step
-    return None
+def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+    """Write an option of the model file, such as the time step in seconds.
 
-
-def _write_integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
-    """Write MuJoCo's number of an integrator as the option of the model file."""
+    An option that is a word in the file has MuJoCo's number of the word.
+    """
     (number,) = cause.coefficients
-    fields["opt.integrator"][0] = int(number)
+    fields[f"opt.{OPTION_EFFECTS[cause.effect]}"][0] = number
     return None
 
 
 CommandWriter = Callable[[Fields, RobotModel, FittedCause], UnstatableReason]
 
 COMMAND_WRITERS: Mapping[str, CommandWriter] = {
-    "numerics.step": _write_time_step,
-    "numerics.integrator": _write_integrator,
+    **dict.fromkeys(OPTION_EFFECTS, _write_option),
     "input.gain": _write_input_gain,
     "input.bias": _write_input_bias,
     "input.saturation": _write_saturation,

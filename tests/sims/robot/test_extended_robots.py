@@ -166,6 +166,9 @@ def test_a_model_file_that_has_changed_is_one_line(model, path):
         ("damping@*", "damping@wrist", "unknown place of effect drag.linear"),
         ('integrator = "RK4"', 'integrator = "leapfrog"', r"numerics.integrator: .* found 'leapf"),
         ("timestep = 0.0005", "timestep = -1", r"numerics.timestep: expected more than 0 s"),
+        ("timestep = 0.0005", 'cone = "round"', r"numerics.cone: expected pyramidal | elliptic"),
+        ("timestep = 0.0005", "iterations = -1", r"numerics.iterations: expected at least 0"),
+        ("timestep = 0.0005", "gravity = 1", r"numerics.gravity: expected one of timestep"),
         ("timestep = 0.0005", "timestep = nan", r"numerics.timestep: expected a number"),
         ('joint = "elbow"', 'joint = "wrist"', r"unknown joint 'wrist'; there are: elbow"),
     ],
@@ -192,7 +195,7 @@ def test_it_conforms_as_a_plugin_does(model, path):
 
 def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
     """As explain passes it: the robot reference is that of the file, only the time step differs."""
-    finer = IntegratorSettings(0.002, "implicitfast")
+    finer = IntegratorSettings(0.002, "implicitfast", (("cone", 1), ("impratio", 10.0)))
     found = kind.with_integrator_settings(finer)
     fitted = replace(model, engine="mujoco", kind=found, robot=get_robot_reference(found))
     assert fitted.robot.digest == model.robot.digest
@@ -206,6 +209,10 @@ def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
     changed = collect_causes(fitted)
     assert changed["numerics.step"]["step"].value == 0.002
     assert changed["numerics.integrator"]["integrator"].value == 3
+    assert (
+        changed["numerics.cone"]["cone"].stated,
+        changed["numerics.impratio"]["impratio"].value,
+    ) == (0, 10)
 
 
 def test_two_models_are_distinguished(model, path, kind, tmp_path):

@@ -163,6 +163,11 @@ def test_the_robot_stays_as_it_is(tmp_path: Path) -> None:
 def test_numerics_are_options(tmp_path: Path) -> None:
     """The step and the integrator that repair a model are in its options."""
     causes = {"numerics.step": {"coefficient": number(5e-4, "s")}, "numerics.integrator": one(1.0)}
+    options = {"cone": 1.0, "impratio": 20.0, "noslip": 5.0, "solver": 0.0, "iterations": 30.0}
+    causes |= {f"numerics.{name}": one(value) for name, value in options.items()}
     model = apply_causes(robot(tmp_path), causes).model
+    assert (model.opt.cone, model.opt.impratio) == (mujoco.mjtCone.mjCONE_ELLIPTIC, 20.0)
+    assert (model.opt.noslip_iterations, model.opt.iterations) == (5, 30)
+    assert model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
     assert model.opt.timestep == 5e-4
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4

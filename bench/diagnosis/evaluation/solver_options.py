@@ -1,0 +1,128 @@
+"""Alternative options of MuJoCo's solver and integrator, and how well they explain recorded runs.
+
+Two simulators of one model file can differ in options that change the motion where geoms touch: the
+friction cone, the ratio of the friction's impedance to that of the normal force (`impratio`), the
+iterations that prevent slip, the constraint solver and its iterations, and the integrator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.core.simulator import Array
+from sims.robot.integrator_settings import (
+    CONE_IDS,
+    INTEGRATOR_IDS,
+    SOLVER_IDS,
+    IntegratorSettings,
+    read_option,
+)
+from sims.robot.robot_simulator import RobotSimulator
+
+IMPEDANCE_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Values of `impratio` that are tried; model files state numbers between 1 and 100."""
+NOSLIP_ITERATIONS = (0, 5)
+"""Numbers of iterations without slip that are tried: without, and with as many as usual."""
+SOLVER_ITERATIONS = (1, 3, 10, 30, 100)
+"""Numbers of iterations of the solver that are tried."""
+MIN_DISTINCT_CHANGE = 0.05
+"""Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
+MIN_SQUARES_DECREASE = 20.0
+"""Minimum decrease of the sum of squares by an alternative, in units of the noise."""
+
+
+class OptionAlternative(NamedTuple):
+    """Settings with other options than those in use.
+
+    Attributes:
+        numerics: the settings.
+        squares: sum of squares of the residual with them, in units of the noise.
+    """
+
+    numerics: IntegratorSettings
+    squares: float
+
+
+def rank_option_alternatives(
+    evaluator: RunEvaluator, noise: NoiseModel, theta: Array, initial_states: Array
+) -> list[OptionAlternative]:
+    """Simulate the runs with alternative options, and rank those that explain them better.
+
+    An alternative is left out if the sum of squares does not decrease clearly, or if a better one
+    makes the same motion.
+
+    Args:
+        evaluator: the runs of a robot.
+        noise: noise of each channel.
+        theta: (P,) parameters of the model.
+        initial_states: (R, s) initial states.
+
+    Returns:
+        The alternatives, the smallest sum of squares first.
+    """
+    kind = evaluator.kind
+    assert issubclass(kind, RobotSimulator)
+    is_recorded = np.isfinite(evaluator.observed)
+
+    def simulate(numerics: IntegratorSettings) -> Array:
+        """Return the simulated readings in units of the noise, zero where none is recorded."""
+        other = kind.with_integrator_settings(numerics)
+        simulator = other(evaluator.recording.constants, evaluator.channels)
+        count = len(evaluator.prepared_runs)
+        rows = np.tile(theta[: evaluator.system_parameter_count], (count, 1))
+        states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
+        scenarios = [run.scenario for run in evaluator.prepared_runs]
+        evaluator.simulation_count += count
+        motion = simulator.simulate_batch(rows, scenarios, states)
+        simulator.close()
+        return np.where(is_recorded, motion, 0.0) / noise.sigma
+
+    observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma
+    samples = max(int(is_recorded.sum()), 1)
+    limit = float(np.square(simulate(kind.numerics) - observed).sum()) - MIN_SQUARES_DECREASE
+    ranked: list[tuple[OptionAlternative, Array]] = []
+    for numerics in _iterate_alternatives(kind):
+        evaluator.search_control.check_not_stopped()
+        motion = simulate(numerics)
+        squares = float(np.square(motion - observed).sum())
+        if squares < limit:
+            ranked.append((OptionAlternative(numerics, squares), motion))
+    ranked.sort(key=lambda pair: pair[0].squares)
+    distinct: list[tuple[OptionAlternative, Array]] = []
+    for alternative, motion in ranked:
+        differences = [float(np.square(motion - known).sum()) / samples for _, known in distinct]
+        if all(difference >= MIN_DISTINCT_CHANGE**2 for difference in differences):
+            distinct.append((alternative, motion))
+    return [alternative for alternative, _ in distinct]
+
+
+def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSettings]:
+    """Yield the settings with other values of one option, or of the solver and its iterations.
+
+    Alternatives that differ less from common settings come first.
+    """
+    settings = kind.numerics
+    present = settings.to_model_options()
+    for name in ("cone", "impratio", "noslip_iterations", "solver", "iterations"):
+        present.setdefault(name, read_option(kind.robot, name))
+    values = {
+        "cone": list(CONE_IDS.values()),
+        "impratio": IMPEDANCE_RATIOS,
+        "noslip_iterations": NOSLIP_ITERATIONS,
+        "integrator": list(INTEGRATOR_IDS.values()),
+    }
+    for name, numbers in values.items():
+        for number in numbers:
+            if number != present[name]:
+                yield settings.replace_options({name: number})
+    for solver in (present["solver"], *SOLVER_IDS.values()):
+        for iterations in (present["iterations"], *SOLVER_ITERATIONS[::-1]):
+            changed = {"solver": solver, "iterations": iterations}
+            options = {name: n for name, n in changed.items() if n != present[name]}
+            if options:
+                yield settings.replace_options(options)

@@ -1,0 +1,83 @@
+"""Tests that options of MuJoCo's solver are causes if the recorded simulator has other ones."""
+
+import mujoco
+import pytest
+
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
+from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
+from bench.diagnosis.explain import _ExplainRun, explain
+from bench.diagnosis.explain_options import ExplainOptions
+from bench.diagnosis.report.effect_and_unit_text import format_effect
+from sims.robot.integrator_settings import OPTION_EFFECTS, IntegratorSettings
+from tests.bench.diagnosis.block_recordings import write_block_recording
+
+
+def rank(path):
+    """Return the ranked alternatives of a recording from its stated initial states."""
+    run = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
+    try:
+        evaluator = run.fitting
+        return rank_option_alternatives(
+            evaluator, run.noise, evaluator.get_nominal_theta(), evaluator.initial_state_guesses
+        )
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize(
+    ("planted", "options"),
+    [
+        ('cone="elliptic"', {"cone": 1}),
+        ('iterations="1"', {"iterations": 1}),
+        ('impratio="20"', {"impratio": 20.0}),
+    ],
+)
+def test_the_planted_option_explains_the_recording_best(tmp_path, planted, options):
+    best, *others = rank(write_block_recording(tmp_path, planted))
+    assert dict(best.numerics.solver_options) == options
+    assert best.numerics.integrator == "implicitfast"
+    # Two of three runs are for fitting: 1200 readings of noise. A solver that does not converge
+    # amplifies differences of its warm start.
+    if "iterations" not in options:
+        assert best.squares == pytest.approx(1200, rel=0.15)
+    assert all(other.squares > best.squares for other in others)
+
+
+def test_no_alternative_explains_a_clean_recording_better(tmp_path):
+    assert rank(write_block_recording(tmp_path)) == []
+
+
+def test_settings_replace_options_by_number():
+    settings = IntegratorSettings(0.002, "RK4", (("cone", 1),))
+    assert settings.replace_options({"impratio": 10.0, "integrator": 0}) == (
+        0.002,
+        "Euler",
+        (("cone", 1), ("impratio", 10.0)),
+    )
+    assert settings.to_document() == {"timestep": 0.002, "integrator": "RK4", "cone": "elliptic"}
+
+
+def test_every_option_has_a_name_in_texts():
+    assert all(format_effect(effect) != effect for effect in OPTION_EFFECTS)
+
+
+@pytest.mark.slow
+def test_a_planted_cone_is_the_only_cause_and_is_written_into_the_model_file(tmp_path):
+    explanation = explain(write_block_recording(tmp_path, 'cone="elliptic"'))
+    (cause,) = explanation.answer.causes
+    assert explanation.answer.verdict == "named"
+    assert cause.effect == "numerics.cone"
+    number = cause.coefficients["coefficient"]
+    assert (number.stated, number.value) == (0.0, 1.0)
+    explanation.write(tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "extended.xml"))
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert 'cone = "elliptic"' in (tmp_path / "out" / "extended.toml").read_text()
+
+
+@pytest.mark.slow
+def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
+    changed = ('friction="0.6"', 'friction="0.7"')
+    answer = explain(write_block_recording(tmp_path, change=changed)).answer
+    assert [cause.effect for cause in answer.causes] == ["contact.friction@ground/foot"]
+    assert answer.causes[0].coefficients["coefficient"].value == pytest.approx(0.1, rel=0.05)
