@@ -69,6 +69,26 @@ def test_imports_run_downwards_and_never_in_a_circle(imports):
     assert circle({**imports, "bench.core.plugin_registries": {"bench.api.compare"}})[:1] != []
 
 
+REFERENCE_SIMULATORS = (
+    "case_generation.ball_reference", "case_generation.joint_reference",
+    "case_generation.cause_sizes", "machine_cases.machine_dynamics",
+    "machine_cases.reference_motion",
+)  # fmt: skip
+"""Modules that simulate and size hidden causes, also those of the robots in `tests/exams`."""
+
+
+@pytest.mark.parametrize("module", REFERENCE_SIMULATORS)
+def test_reference_simulators_share_no_code_with_what_their_cases_test(imports, module):
+    seen, left = set(), [f"bench.diagnosis_benchmark.{module}"]
+    while left:
+        name = left.pop()
+        seen.add(name)
+        if name != "sims.core.simulator":  # Types of arrays and scenarios.
+            left += [other for other in imports[name] if other not in seen]
+    others = {n for n in seen if not n.startswith("bench.diagnosis_benchmark.")}
+    assert others == {"sims.core.simulator"}
+
+
 @pytest.mark.parametrize(
     ("module", "line", "contract"),
     [

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
+from bench.diagnosis_benchmark.result_tables import compute_share
 from tests.exams.exam import LEVELS, NOT_DRAWN
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
@@ -39,11 +39,10 @@ def share(good, exact=False):
 
     The interval is Wilson's, or Clopper-Pearson's with `exact`.
     """
-    count, total = int(np.sum(good)), len(good)
-    if not total:
+    row = compute_share(int(np.sum(good)), len(good), exact)
+    if not row["of"]:
         return 0, 0, None, None, None
-    interval = binomtest(count, total).proportion_ci(0.95, method="exact" if exact else "wilson")
-    return count, total, count / total, interval.low, interval.high
+    return row["count"], row["of"], row["share"], row["low"], row["high"]
 
 
 def drawn(table):

@@ -18,6 +18,8 @@ from bench.diagnosis_benchmark.case_generation import effect_coefficients, effec
 from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_for_size
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
+    MIN_DISTINCT_SIZE,
+    MIN_SIMPLER_RESIDUAL,
     BenchmarkCase,
     RecordingConditions,
     RequestedConditions,
@@ -38,12 +40,6 @@ from sims.recording.recording_writer import write_recording
 SYSTEMS = ("ball", "pendulum", "slider")
 SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
 
-# Minimum RMS residual, in units of the noise, if only one of two effects or no unmodelled cause is
-# in the model.
-MIN_DISTINCT_SIZE = 1.0
-# Minimum RMS residual, in units of the noise, with the simpler form of an effect; below it, the
-# simpler form is a correct answer.
-MIN_SIMPLER_RESIDUAL = 0.4
 SIMPLER_EFFECTS = {
     "friction.direction": ("drag.linear",),
     "friction.load_direction": ("friction.load",),
@@ -251,9 +247,7 @@ def _draw_single(
             effect_sizing.compute_refitted_residual(setting, observed, simpler_effect)
             for simpler_effect in SIMPLER_EFFECTS[name]
         )
-        if unexplained < MIN_SIMPLER_RESIDUAL:
-            return None
-    return replace(case, effects={name: c}, size=target_size, beyond=unexplained)
+    return case.hide({name: c}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
 
 
 def find_coefficients(
@@ -320,11 +314,7 @@ def _draw_pair(
         effect_sizing.compute_refitted_residual(setting, observed, name, effects[name])
         for name in effects
     )
-    return (
-        replace(case, effects=effects, size=target_size, beyond=unexplained)
-        if unexplained >= MIN_DISTINCT_SIZE
-        else None
-    )
+    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE)
 
 
 def _order_input_effects(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
@@ -379,14 +369,8 @@ def _draw_unmodelled(
         return None
     strength, _ = found
     _, unexplained = effect_sizing.find_best_effect(setting, observed(strength))
-    hidden_case = replace(
-        case,
-        effects={name: compute_coefficients(strength)},
-        size=target_size,
-        beyond=unexplained,
-        source="scipy",
-    )
-    return hidden_case if unexplained >= MIN_DISTINCT_SIZE else None
+    effects = {name: compute_coefficients(strength)}
+    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE, source="scipy")
 
 
 def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:

@@ -346,6 +346,16 @@ def draw_input_signal(
     return signal
 
 
+MIN_DISTINCT_SIZE = 1.0
+"""Minimum RMS residual that a wrong answer must leave, in units of the noise.
+
+A wrong answer is one of two hidden effects alone, or library effects for an unmodelled cause.
+"""
+MIN_SIMPLER_RESIDUAL = 0.4
+"""Minimum RMS residual that the simpler form of an effect must leave, in units of the noise.
+
+Below it, the simpler form is a correct answer.
+"""
 CASE_KINDS = ("clean", "single", "double", "foreign")
 """Kinds of cases: nothing hidden, one effect, two effects, or a cause outside the library."""
 
@@ -395,6 +405,30 @@ class BenchmarkCase:
     parameters: dict[str, float] = field(default_factory=dict)
     beyond: float | None = None
     asked: RequestedConditions = ANY_CONDITIONS
+
+    def hide(
+        self,
+        effects: Mapping[str, tuple[float, ...]],
+        size: float,
+        beyond: float | None,
+        min_beyond: float,
+        **changes: Any,
+    ) -> BenchmarkCase | None:
+        """Hide causes in a case.
+
+        Args:
+            effects: coefficients of the causes by name.
+            size: their size.
+            beyond: RMS residual that the best wrong answer leaves; None if none was tested.
+            min_beyond: minimum of `beyond`: below it, the wrong answer would be correct.
+            **changes: further changed attributes.
+
+        Returns:
+            The case; None if it is rejected.
+        """
+        if beyond is not None and beyond < min_beyond:
+            return None
+        return replace(self, effects=dict(effects), size=size, beyond=beyond, **changes)
 
     def to_json(self) -> dict[str, Any]:
         """Convert to plain values for JSON."""

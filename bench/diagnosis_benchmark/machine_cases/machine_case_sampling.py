@@ -7,7 +7,6 @@ motion, after the part is projected out that changes of parameters and initial s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -19,6 +18,8 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import (
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
+    MIN_DISTINCT_SIZE,
+    MIN_SIMPLER_RESIDUAL,
     BenchmarkCase,
     RequestedConditions,
     make_case_rng,
@@ -38,16 +39,6 @@ from sims.core.simulator import Array
 
 MACHINE_NAMES = tuple(MACHINES)
 """Names of the machines."""
-MIN_DISTINCT_SIZE = 1.0
-"""Minimum RMS residual that a wrong answer must leave, in units of the noise.
-
-A wrong answer is one of two hidden effects alone, or library effects for an unmodelled cause.
-"""
-MIN_SIMPLER_RESIDUAL = 0.4
-"""Minimum RMS residual that the simpler form of an effect must leave, in units of the noise.
-
-Below it, the simpler form is a correct answer.
-"""
 SIMPLER_EFFECTS = {"friction.stribeck": "friction.coulomb"}
 _FINITE_DIFFERENCE_STEP = 1e-4
 """Finite-difference step: relative for a parameter, rad or rad/s for an initial state."""
@@ -183,9 +174,7 @@ def _hide_one_effect(
         simpler_effect = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
         other_effects = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
         unexplained = _compute_unexplained_size(conditions, {name: c}, {}, other_effects, rng)
-        if unexplained < MIN_SIMPLER_RESIDUAL:
-            return None
-    return replace(case, effects={name: c}, size=target_size, beyond=unexplained)
+    return case.hide({name: c}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
 
 
 def _find_sized_coefficients(
@@ -254,11 +243,7 @@ def _hide_two_effects(
     unexplained = min(
         _compute_unexplained_size(conditions, effects, {}, [name], rng) for name in effects
     )
-    return (
-        replace(case, effects=effects, size=target_size, beyond=unexplained)
-        if unexplained >= MIN_DISTINCT_SIZE
-        else None
-    )
+    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE)
 
 
 def _hide_unmodelled_cause(
@@ -296,11 +281,7 @@ def _hide_unmodelled_cause(
         for n in hidden_causes.list_effect_places(case.system, e)
     ]
     unexplained = _compute_unexplained_size(conditions, {}, hidden, library_effects, rng)
-    return (
-        replace(case, effects=hidden, size=target_size, beyond=unexplained)
-        if unexplained >= MIN_DISTINCT_SIZE
-        else None
-    )
+    return case.hide(hidden, target_size, unexplained, MIN_DISTINCT_SIZE)
 
 
 def _compute_unexplained_size(

@@ -12,6 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    MIN_DISTINCT_SIZE,
+    MIN_SIMPLER_RESIDUAL,
+)
 from tests.exams.exam import (
     Case,
     Exam,
@@ -48,16 +52,6 @@ QUICK = (
     ("single", "arm2-motor", "mass.scale"), ("clean", "arm2-servo", "any"),
     ("single", "arm2-servo", "drag.linear"), ("single", "arm2-servo", "input.delay"),
 )  # fmt: skip
-MIN_RESIDUAL_WITHOUT_CAUSE = 1.0
-"""Smallest residual without the full cause in the model, in units of the noise.
-
-The model has only one of two causes or, for an unmodelled cause, one effect at the same joint.
-"""
-TELLING = 0.4
-"""Smallest residual with the simpler form of an effect, in units of the noise.
-
-Below it, the simpler form is the right answer.
-"""
 STANDARD = Standard(max_set=4, equal_below=1.05)
 
 
@@ -276,7 +270,7 @@ def _single(item, setting, effect, rng):
     gauge, beyond = gauge_of(item.name), None
     if simpler := simpler_changes(hidden, gauge):
         beyond = cause_sizing.left(gauge.change(hidden), simpler)
-        if beyond < TELLING:
+        if beyond < MIN_SIMPLER_RESIDUAL:
             return None
     return replace(item, effects=hidden, size=size, beyond=beyond)
 
@@ -311,7 +305,7 @@ def _double(item, setting, effect, rng):
     size = min(first[1], second[1])
     return (
         replace(item, effects=both, size=size, beyond=beyond)
-        if beyond >= MIN_RESIDUAL_WITHOUT_CAUSE
+        if beyond >= MIN_DISTINCT_SIZE
         else None
     )
 
@@ -329,7 +323,7 @@ def _foreign(item, setting, effect, rng):
     others = _near(item.robot, setting, joint, gauge, rng)
     beyond = min(cause_sizing.left(change, [other]) for other in others)
     shown = replace(item, effects=hidden, size=found[1], beyond=beyond)
-    return shown if beyond >= MIN_RESIDUAL_WITHOUT_CAUSE else None
+    return shown if beyond >= MIN_DISTINCT_SIZE else None
 
 
 def _near(robot, setting, joint, gauge, rng):
