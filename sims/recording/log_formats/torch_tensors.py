@@ -1,15 +1,17 @@
-"""Read tensors of PyTorch files (``.pt``, ``.pth``) without torch and without unpickling.
+"""Read tensors of PyTorch files (``.pt``, ``.pth``) without torch and without running their code.
 
 The files are zip archives. An archive holds ``data.pkl``, a pickle program that builds lists and
-dictionaries of tensors; their numbers are in ``data/0``, ``data/1`` and so on. The program is read
-step by step (`pickletools`). Only steps that build containers and tensors are carried out: no name
-in it is imported or called. (Layout: pytorch, torch/serialization.py.)
+dictionaries of tensors; their numbers are in ``data/0``, ``data/1`` and so on. The names in the
+program are restricted as in "Restricting Globals" of Python's documentation of pickle: none is
+imported or called. (Layout: pytorch, torch/serialization.py.)
 """
 
 from __future__ import annotations
 
-import pickletools
+import io
+import pickle
 import zipfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,12 +37,6 @@ _NUMBER_TYPES = {
 """Number type of each torch storage class."""
 
 
-class _Name(NamedTuple):
-    """Name of a class or function in the program, which is never imported."""
-
-    text: str
-
-
 class _Storage(NamedTuple):
     """Numbers in the archive: their storage class, and the name of their archive entry."""
 
@@ -57,13 +53,52 @@ class _Tensor(NamedTuple):
     stride: tuple[int, ...]
 
 
-class _Other(NamedTuple):
-    """Object of another class, which is left out."""
+class _UnknownObject:
+    """Object of any other class, which is left out: it ignores its arguments and its content."""
 
-    name: str
+    def __init__(self, *_: object) -> None:
+        """Ignore what the object was made from."""
+
+    def __call__(self, *_: object) -> _UnknownObject:
+        """Return this object for the result of a call to it."""
+        return self
+
+    def __setstate__(self, _: object) -> None:
+        """Ignore the attributes of the object."""
+
+    append = extend = __setstate__
+
+    def __setitem__(self, _key: object, _value: object) -> None:
+        """Ignore an entry of the object."""
 
 
-_STACK_MARK = _Other("mark")
+class _TensorUnpickler(pickle._Unpickler):
+    """Unpickler that makes containers and tensors only; no name in the file is imported.
+
+    It is the one in Python, because the one in C allocates memory for any number in the program.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what stands for a class or function in the program."""
+        if module == "torch" and name.endswith("Storage"):
+            return name
+        return _KNOWN_NAMES.get(f"{module}.{name}", _UnknownObject)
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        """Return a storage from ("storage", class, key, device, number of entries)."""
+        _, kind, key, *_ = pid
+        return _Storage(kind, str(key))
+
+
+def _make_tensor(storage: _Storage, offset: int, size: Any, stride: Any, *_: object) -> _Tensor:
+    return _Tensor(storage, int(offset), tuple(map(int, size)), tuple(map(int, stride)))
+
+
+_KNOWN_NAMES = {
+    "torch._utils._rebuild_tensor_v2": _make_tensor,
+    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
+    "collections.OrderedDict": OrderedDict,
+}
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
@@ -108,7 +143,7 @@ def _read_tensors(
     if archive.getinfo(programs[0]).file_size > MAX_PROGRAM:
         raise InputError(f"{path}: data.pkl is too large for a log of tensors")
     folder = programs[0].removesuffix("data.pkl")
-    content = _run_pickle_program(archive.read(programs[0]))
+    content = _TensorUnpickler(io.BytesIO(archive.read(programs[0]))).load()
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     for name, value in _flatten_containers("", content, 0):
@@ -130,7 +165,9 @@ def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, An
     children: list[tuple[Any, Any]] = []
     if isinstance(value, dict):
         children = list(value.items())
-    elif type(value) in (list, tuple) and any(map(_is_container, value)):
+    elif type(value) in (list, tuple) and any(
+        isinstance(child, dict | list | _Tensor) for child in value
+    ):
         children = list(enumerate(value))
     if not children or depth > MAX_DEPTH:
         return [(name or "tensor", value)]
@@ -140,11 +177,6 @@ def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, An
         if len(entries) > MAX_COLUMNS:
             raise ValueError("too many entries")
     return entries
-
-
-def _is_container(value: Any) -> bool:
-    """Return whether a value is a tensor, or may contain some."""
-    return isinstance(value, dict | list | _Tensor)
 
 
 def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
@@ -176,118 +208,3 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
     for length, stride in zip(tensor.size, tensor.stride, strict=True):
         indices = indices[..., None] + stride * np.arange(length)
     return make_read_only(stored_numbers[indices].astype(np.float64))
-
-
-def _run_pickle_program(program: bytes) -> Any:
-    """Carry out the steps of a program that build containers and tensors.
-
-    Raises:
-        ValueError: The program contains another step.
-    """
-    stack: list[Any] = []
-    memo: dict[int, Any] = {}
-    for step, argument, _ in pickletools.genops(program):
-        opcode = step.name
-        if opcode in ("PROTO", "FRAME"):
-            continue
-        if opcode == "STOP":
-            return stack[-1]
-        if opcode == "MARK":
-            stack.append(_STACK_MARK)
-        elif opcode in ("BINPUT", "LONG_BINPUT", "PUT"):
-            memo[int(str(argument))] = stack[-1]
-        elif opcode == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif opcode in ("BINGET", "LONG_BINGET", "GET"):
-            stack.append(memo[int(str(argument))])
-        elif opcode in _CONSTANTS:
-            stack.append(_CONSTANTS[opcode])
-        elif opcode in ("EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE"):
-            empty: dict[str, Any] = {"EMPTY_DICT": {}, "EMPTY_LIST": [], "EMPTY_TUPLE": ()}
-            stack.append(empty[opcode])
-        elif opcode == "GLOBAL":
-            stack.append(_Name(str(argument).replace(" ", ".")))
-        elif opcode == "STACK_GLOBAL":
-            attribute, module = stack.pop(), stack.pop()
-            stack.append(_Name(f"{module}.{attribute}"))
-        elif opcode == "POP":
-            stack.pop()
-        elif argument is not None and opcode.startswith(_NUMBERS_AND_TEXTS):
-            stack.append(argument)
-        else:
-            _build_object(opcode, stack)
-    raise ValueError("the program has no end")
-
-
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_NUMBERS_AND_TEXTS = (
-    "BININT", "INT", "LONG", "BINFLOAT", "FLOAT", "BINUNICODE", "SHORT_BINUNICODE", "UNICODE",
-    "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES",
-)  # fmt: skip
-"""Beginnings of the names of steps that push a number or a text onto the stack."""
-
-
-def _build_object(opcode: str, stack: list[Any]) -> None:
-    """Carry out one instruction of the pickle program that builds an object from the stack.
-
-    Only containers and tensors are built; nothing is imported or called.
-    """
-    if opcode in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
-        mark_index = max(i for i, value in enumerate(stack) if value is _STACK_MARK)
-        values = stack[mark_index + 1 :]
-        del stack[mark_index:]
-        if opcode == "TUPLE":
-            stack.append(tuple(values))
-        elif opcode == "LIST":
-            stack.append(values)
-        elif opcode == "DICT":
-            stack.append(dict(zip(values[::2], values[1::2], strict=True)))
-        elif opcode == "APPENDS":
-            _as_list(stack[-1]).extend(values)
-        else:
-            _as_dict(stack[-1]).update(zip(values[::2], values[1::2], strict=True))
-    elif opcode in ("TUPLE1", "TUPLE2", "TUPLE3"):
-        count = int(opcode[-1])
-        values = stack[-count:]
-        del stack[-count:]
-        stack.append(tuple(values))
-    elif opcode == "APPEND":
-        value = stack.pop()
-        _as_list(stack[-1]).append(value)
-    elif opcode == "SETITEM":
-        value, key = stack.pop(), stack.pop()
-        _as_dict(stack[-1])[key] = value
-    elif opcode == "BINPERSID":
-        # ("storage", class, key, device, number of entries)
-        _, kind, key, *_ = stack.pop()
-        stack.append(_Storage(kind.text.rpartition(".")[2], str(key)))
-    elif opcode in ("REDUCE", "NEWOBJ"):
-        arguments, made_by = stack.pop(), stack.pop()
-        stack.append(_evaluate_call(made_by, arguments))
-    elif opcode == "BUILD":
-        stack.pop()  # attributes of an object
-    else:
-        raise ValueError(f"unknown step {opcode}")
-
-
-def _evaluate_call(function: Any, arguments: Any) -> Any:
-    """Return the result of a call in the program: a tensor, a dictionary, or a placeholder."""
-    name = function.text if isinstance(function, _Name) else ""
-    if name == "torch._utils._rebuild_tensor_v2":
-        storage, offset, size, stride, *_ = arguments
-        return _Tensor(storage, int(offset), tuple(map(int, size)), tuple(map(int, stride)))
-    if name == "torch._utils._rebuild_parameter":
-        return arguments[0]
-    if name == "collections.OrderedDict":
-        return {}
-    return _Other(name)
-
-
-def _as_list(value: Any) -> list[Any]:
-    """Return a list unchanged, and a new list, which is discarded, for any other value."""
-    return value if isinstance(value, list) else []
-
-
-def _as_dict(value: Any) -> dict[Any, Any]:
-    """Return a dictionary unchanged, and a new one, which is discarded, for any other value."""
-    return value if isinstance(value, dict) else {}
