@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +15,9 @@ from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
 from bench.diagnosis.datasheet.datasheet_subject import make_subject
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
-from bench.diagnosis.search.verdict_rules import VERDICT_MEANINGS
 from bench.diagnosis.verdict import Verdict
 from bench.logs.joined_recordings import load_joined
+from bench.studies.explanation_verification import read_verdict
 from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
@@ -101,40 +100,8 @@ def check_joint_exists(
     make_subject(kind, options.joint)
 
 
-def _check_verdict(verdict: Verdict) -> Verdict:
-    """Check the types of those parts of a verdict that are used here, and return it.
-
-    Raises:
-        ValueError: A part is invalid.
-    """
-    texts: list[object] = [verdict.verdict]
-    numbers: list[object] = []
-    for cause in verdict.causes:
-        texts += [cause.effect, *cause.alternatives]
-        numbers.append(cause.p_value)
-    for candidate in verdict.candidates:
-        texts.append(candidate.effect)
-        numbers += [candidate.p_value, candidate.heldout_gain or 0.0]
-    if not all(isinstance(text, str) for text in texts) or verdict.verdict not in VERDICT_MEANINGS:
-        raise ValueError("a name is not text")
-    if not all(isinstance(number, int | float) for number in numbers):
-        raise ValueError("a number is not a number")
-    return verdict
-
-
 def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
     """Read the results that explain has written to a folder."""
-    path = folder / "verdict.json"
-    try:
-        verdict = _check_verdict(
-            Verdict.from_document(json.loads(path.read_text(encoding="utf-8")))
-        )
-    except OSError as error:
-        remedy = "name a folder that simgap explain has written"
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(
-            f"{path}: expected a verdict of simgap explain, found other text"
-        ) from None
+    verdict = read_verdict(folder)
     extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)
     return replace(extended, kind=kind), verdict

@@ -8,7 +8,6 @@ is conservative. Holm's correction is over all numbers.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +21,7 @@ import pandas as pd
 from bench.benchmark.statistics.paired_tests import correct_holm
 from bench.benchmark.storage.provenance import read_environment
 from bench.diagnosis.verdict import Verdict
-from bench.schemas import find_violations
-from sims.core.files import get_first_line
+from bench.studies.explanation_verification import EXTENDED_MODEL_FILE, read_verdict
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
@@ -131,7 +129,6 @@ def format_number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-VERDICT, EXTENDED = "verdict.json", "extended.toml"
 _MAX_COMPARED_CANDIDATES = 5
 """Number of the best candidates of each explanation that are compared."""
 _HELD_OUT = ("rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high")
@@ -183,18 +180,8 @@ def load_side(folder: Path) -> ExplanationSide:
     Raises:
         InputError: the folder has no explanation, or it is damaged.
     """
-    path = folder / VERDICT
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        violations = find_violations(document, "verdict")
-        verdict = Verdict.from_document(document) if not violations else None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        violations, verdict = [get_first_line(error)], None
-    if verdict is None:
-        raise InputError(f"{path}: expected a verdict of simgap explain; {violations[0]}")
-    title = str(read_toml(folder / EXTENDED).get("title", ""))
+    verdict = read_verdict(folder)
+    title = str(read_toml(folder / EXTENDED_MODEL_FILE).get("title", ""))
     return ExplanationSide(folder, verdict, title, read_environment(folder))
 
 

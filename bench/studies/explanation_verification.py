@@ -95,8 +95,12 @@ def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVer
         verification.checked.append(line)
         print_line(line)
 
-    verdict = _read_verdict(folder, verification)
-    if verdict is None:
+    try:
+        verdict = read_verdict(folder)
+    except InvalidVerdictError as error:
+        verification.doubts.extend(
+            VerificationFailure(VERDICT_FILE, 0, line) for line in error.violations
+        )
         return verification
     note(f"{VERDICT_FILE}: valid for the JSON schema verdict: {verdict.verdict}")
     try:
@@ -126,17 +130,40 @@ def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVer
     return verification
 
 
-def _read_verdict(folder: Path, verification: ExplanationVerification) -> Verdict | None:
-    """Read the verdict of an explanation; add a doubt and return None if it is not valid."""
+class InvalidVerdictError(InputError):
+    """Error of a verdict that cannot be read.
+
+    Attributes:
+        violations: what is wrong with it, one line each.
+    """
+
+    def __init__(self, message: str, violations: Sequence[str]) -> None:
+        super().__init__(message)
+        self.violations = violations
+
+
+def read_verdict(folder: Path) -> Verdict:
+    """Read the verdict of an explanation.
+
+    Raises:
+        InvalidVerdictError: it is missing, or violates its JSON schema.
+    """
+    path = folder / VERDICT_FILE
     try:
-        document = json.loads((folder / VERDICT_FILE).read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"))
         violations = find_violations(document, "verdict")
         if not violations:
             return Verdict.from_document(document)
-    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+    except OSError as error:
+        remedy = "name a folder that simgap explain has written"
+        raise InvalidVerdictError(
+            f"{path}: cannot be read ({error.strerror}); {remedy}", [get_first_line(error)]
+        ) from None
+    except (ValueError, RecursionError, KeyError, TypeError) as error:
         violations = [get_first_line(error)]
-    verification.doubts.extend(VerificationFailure(VERDICT_FILE, 0, line) for line in violations)
-    return None
+    raise InvalidVerdictError(
+        f"{path}: expected a verdict of simgap explain; {violations[0]}", violations
+    )
 
 
 def _find_differing_numbers(

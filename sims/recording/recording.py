@@ -230,20 +230,34 @@ def read_recording(
     else:
         table = csv_path
         parts = read_table(csv_path, *columns, list(description.extra))
+    model = model_in(description_path, meta)
+    recording = _assemble_recording(table, parts, description, description_path, model)
+    if whole:
+        return recording
+    return replace(recording, runs=_split_runs(description_path, recording.runs, folds))
+
+
+def _assemble_recording(
+    table: Path,
+    parts: Sequence[CsvRun],
+    description: RecordingDescription,
+    description_path: Path,
+    model: ModelFileReference | None,
+) -> Recording:
+    """Make a recording in SI units from the tables of its runs and its description."""
     check_run_names(description_path, description.runs, [part.name for part in parts])
     switched = apply_drive_switches(
         table, [_make_run(table, part, description) for part in parts], description.switches
     )
-    runs = switched.runs if whole else _split_runs(description_path, switched.runs, folds)
     return Recording(
         table,
         description.system,
         description.title,
         description.constants,
         description.noise,
-        runs,
+        switched.runs,
         description.extra,
-        model_in(description_path, meta),
+        model,
         (*(note for part in parts for note in part.notes), *switched.notes),
     )
 
@@ -313,21 +327,7 @@ def recording_of_frame(
     document = build_frame_description(path, indexed_frame, declared, meta, units)
     description = check_description(path, document, declared)
     parts = read_frame(path, indexed_frame, description)
-    check_run_names(path, description.runs, [part.name for part in parts])
-    switched = apply_drive_switches(
-        path, [_make_run(path, part, description) for part in parts], description.switches
-    )
-    return Recording(
-        path,
-        description.system,
-        description.title,
-        description.constants,
-        description.noise,
-        switched.runs,
-        description.extra,
-        model_in(path, document),
-        switched.notes,
-    )
+    return _assemble_recording(path, parts, description, path, model_in(path, document))
 
 
 def split_held_out(recording: Recording, folds: bool = False) -> Recording:

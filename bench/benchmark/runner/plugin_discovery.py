@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.benchmark.isolation.isolation_errors import RunEndedError, with_isolation
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
@@ -61,12 +61,17 @@ class Plugin:
 class TunerStub(Tuner):
     """Stub of a tuner whose code is not in this process, with its description."""
 
-    module: ClassVar[str] = ""
-    source_digest: ClassVar[str] = ""
+
+class DiagnoserStub(Diagnoser):
+    """Stub of a diagnoser whose code is not in this process, with its description."""
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Raise an error, because a stub cannot diagnose."""
+        raise NotImplementedError
 
 
-def make_tuner_stub(description: dict[str, Any]) -> type[TunerStub]:
-    """Make the stub class of a tuner from its description."""
+def _make_stub(base: type, description: dict[str, Any]) -> Any:
+    """Make the stub class of a tuner or diagnoser from its description."""
     fields: dict[str, Any] = {
         "name": str(description["name"]),
         "stochastic": description["stochastic"] is not False,
@@ -77,33 +82,7 @@ def make_tuner_stub(description: dict[str, Any]) -> type[TunerStub]:
         "__doc__": str(description["says"]),
         "__module__": __name__,
     }
-    stub: type[TunerStub] = type(fields["name"], (TunerStub,), fields)
-    return stub
-
-
-class DiagnoserStub(Diagnoser):
-    """Stub of a diagnoser whose code is not in this process, with its description."""
-
-    module: ClassVar[str] = ""
-    source_digest: ClassVar[str] = ""
-
-    def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Raise an error, because a stub cannot diagnose."""
-        raise NotImplementedError
-
-
-def make_diagnoser_stub(description: dict[str, Any]) -> type[DiagnoserStub]:
-    """Make the stub class of a diagnoser from its description."""
-    fields: dict[str, Any] = {
-        "name": str(description["name"]),
-        "learned": description["learned"] is True,
-        "module": str(description["module"]),
-        "source_digest": str(description["source"]),
-        "__doc__": str(description["says"]),
-        "__module__": __name__,
-    }
-    stub: type[DiagnoserStub] = type(fields["name"], (DiagnoserStub,), fields)
-    return stub
+    return type(fields["name"], (base,), fields)
 
 
 def register_plugins(plugins: Iterable[Plugin]) -> None:
@@ -115,14 +94,11 @@ def register_plugins(plugins: Iterable[Plugin]) -> None:
     plugins = list(plugins)
     load_plugins(plugin.path for plugin in plugins if plugin.is_loaded)
     for plugin in plugins:
+        path = Path(plugin.path) if plugin.path else None
         for description in plugin.tuners:
-            tuners.announce(
-                make_tuner_stub(description), Path(plugin.path) if plugin.path else None
-            )
+            tuners.announce(_make_stub(TunerStub, description), path)
         for description in plugin.diagnosers:
-            diagnosers.announce(
-                make_diagnoser_stub(description), Path(plugin.path) if plugin.path else None
-            )
+            diagnosers.announce(_make_stub(DiagnoserStub, description), path)
 
 
 _known_plugins: dict[str, Plugin] = {}

@@ -6,6 +6,7 @@ Rows of runs are those of runs.parquet and of the parts of a journal.
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,7 +35,6 @@ from bench.benchmark.storage.table_schemas import (
 )
 from sims.core.files import get_first_line
 from sims.core.simulator import InputError
-from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +64,7 @@ class CsvTable:
         """Read and check the whole file; a wrong cell becomes an error that names its line."""
         self._path, self._remedy = path, remedy
         self._text = self._read_text()
-        self._header = self._split_record(next(self._iterate_records(), (1, ""))[1])
+        self._header = next(self._iterate_records(), (1, []))[1]
         declared = columns(self._header) if callable(columns) else columns
         try:
             present_columns = select_declared_columns(self._header, declared)
@@ -140,38 +140,28 @@ class CsvTable:
 
     def _refuse_ragged(self) -> None:
         """Raise an error for the first line whose number of cells differs from the header's."""
-        for number, record in self._iterate_records():
-            cells = len(self._split_record(record))
-            if cells != len(self._header):
-                reason = f"expected {len(self._header)} cells, found {cells}"
+        for number, cells in self._iterate_records():
+            if len(cells) != len(self._header):
+                reason = f"expected {len(self._header)} cells, found {len(cells)}"
                 raise InputError(f"{self._path}, line {number}: {reason}; {self._remedy}")
 
-    def _split_record(self, record: str) -> list[str]:
-        """Split one CSV record into its cells.
+    def _iterate_records(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield the cells of every record with its first line number, without blank lines.
 
-        A record is a line, or several lines if a quoted cell has line breaks.
+        Raises:
+            InputError: A record cannot be split into cells.
         """
+        reader = csv.reader(io.StringIO(self._text, newline=""), strict=True)
+        first = 1
         try:
-            return next(csv.reader([record], strict=True), [])
+            for cells in reader:
+                if len(cells) > 1 or "".join(cells).strip():
+                    yield first, cells
+                first = reader.line_num + 1
         except csv.Error as error:
-            raise self.make_error(
-                None, f"expected cells, found {format_value(record)} ({error})"
+            raise InputError(
+                f"{self._path}, line {first}: expected cells, found {error}; {self._remedy}"
             ) from None
-
-    def _iterate_records(self) -> Iterator[tuple[int, str]]:
-        """Yield every record with its first line number; quoted text may span several lines."""
-        first, is_in_quotes = 1, False
-        parts: list[str] = []
-        for number, line in enumerate(self._text.split("\n"), start=1):
-            if not is_in_quotes:
-                first, parts = number, []
-            parts.append(line)
-            # A quote within quotes is written twice.
-            is_in_quotes ^= line.count('"') % 2 == 1
-            if not is_in_quotes and "".join(parts).strip():
-                yield first, "\n".join(parts).removesuffix("\r")
-        if is_in_quotes:
-            yield first, "\n".join(parts)
 
     def _get_line_number(self, row: int) -> int:
         """Return the line number of a row; the first record is the header."""

@@ -70,9 +70,10 @@ def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
         InputError: They are of two kinds, or one is neither.
     """
     from bench.studies import diff_comparisons, diff_explanations
+    from bench.studies.explanation_verification import VERDICT_FILE
     from sims.core.simulator import InputError
 
-    is_explanation = [(folder / diff_explanations.VERDICT).is_file() for folder in (a, b)]
+    is_explanation = [(folder / VERDICT_FILE).is_file() for folder in (a, b)]
     if all(is_explanation):
         return diff_explanations.ExplanationDiff(
             diff_explanations.load_side(a), diff_explanations.load_side(b)

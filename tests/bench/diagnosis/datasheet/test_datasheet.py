@@ -185,7 +185,7 @@ def test_a_damaged_verdict_is_refused(
     document = explained.answer.to_document()
     (document if key in document else document["causes"][0])[key] = value
     (tmp_path / "verdict.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="expected a verdict of simgap explain, found other text"):
+    with pytest.raises(InputError, match=f"expected a verdict of simgap explain; .*{key}"):
         datasheet(log, explained=tmp_path)
 
 
