@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -295,6 +296,14 @@ class Subject:
         noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
         runs = tuple(_rescale_run(run, factors) for run in recording.runs)
         return replace(recording, noise=noise, runs=runs)
+
+    @cached_property
+    def noise_floor(self) -> Array:
+        """Standard deviation of the noise of each channel (C,), in the specified units."""
+        evaluator = self.evaluator(self.recording)
+        sigma = compute_noise_floor(evaluator, self.recording).sigma
+        evaluator.close()
+        return sigma
 
     def evaluator(self, recording: Recording) -> RunEvaluator:
         """Return a run evaluator of a recording's runs for fitting, without any effects."""
@@ -601,9 +610,10 @@ def _build_rescaled_evaluator(
         The run evaluator, which the caller closes, and the noise with the standard deviation sigma
         (C,) of each channel and no autocorrelation.
     """
-    recording = subject.rescale(factors)
-    evaluator = subject.evaluator(recording)
-    sigma = compute_noise_floor(evaluator, recording).sigma
+    evaluator = subject.evaluator(subject.rescale(factors))
+    # The noise is scaled with its channel.
+    scales = np.abs([factors.get(name, 1.0) for name in evaluator.channels])
+    sigma = subject.noise_floor * scales
     return evaluator, NoiseModel(sigma, np.zeros(len(sigma)))
 
 
