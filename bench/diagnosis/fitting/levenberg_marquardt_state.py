@@ -24,7 +24,7 @@ They are recomputed when predictions become poor: when ρ is far from 1, or F ha
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -93,10 +93,13 @@ class KnownJacobian(NamedTuple):
     Attributes:
         free_indices: (q,) indices of these parameters in theta.
         jacobian: (R, T, C, q) derivatives.
+        is_at_start: whether they are those at the start itself, so that a fit that has converged
+            there need not compute them again.
     """
 
     free_indices: Indices
     jacobian: Array
+    is_at_start: bool = False
 
     def drop_parameters(self, indices: Collection[int]) -> KnownJacobian:
         """Return the derivatives without the columns of some parameters (indices in theta).
@@ -180,6 +183,13 @@ class TrajectoryFit:
     def make_start(self) -> FitStart:
         """Return a start with which another fit continues from this one."""
         return FitStart(self.effects, self.theta, self.initial_states)
+
+    def make_start_with_derivatives(self) -> FitStart:
+        """Return a start that also has the derivatives by the parameters, if they are its own."""
+        start = self.make_start()
+        if not self.is_own_jacobian:
+            return start
+        return replace(start, known_jacobian=self.get_known_jacobian()._replace(is_at_start=True))
 
 
 @dataclass(frozen=True)

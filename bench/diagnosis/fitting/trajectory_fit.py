@@ -302,7 +302,7 @@ class TrajectoryFitter:
                         point, jacobian=np.concatenate([parameter_jacobian, state_jacobian], axis=3)
                     ),
                 )
-                problem.has_own_jacobian = False
+                problem.has_own_jacobian = point.start.known_jacobian.is_at_start
 
     @property
     def _updates_derivatives(self) -> bool:

@@ -432,7 +432,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
     fitter = TrajectoryFitter(
         context.evaluator, search.noise, search.fixed_parameters, is_final_fit=True
     )
-    starts = [model.fit.make_start() for model in near_models]
+    starts = [model.fit.make_start_with_derivatives() for model in near_models]
     for model, fit in zip(near_models, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
         if fit.cost < model.fit.cost:
             search.add_fit(fit)

@@ -287,11 +287,11 @@ class PredictionErrorSearch(EffectSearch):
         return scores.p_value, scores.effects[0] if scores.effects else ""
 
     def make_final_start(self, model: FittedModel) -> FitStart:
-        """Return the start of a final fit, with derivatives by initial states about the model.
+        """Return the start of a final fit, with derivatives about the model.
 
-        The filter of the model has them already.
+        The fit of the model has those by parameters, and its filter those by initial states.
         """
-        start = model.fit.make_start()
+        start = model.fit.make_start_with_derivatives()
         if not model.effects or has_series(self.evaluator, model.effects):
             return start
         followed = self._search_context.filters.get_similar_filter(model)

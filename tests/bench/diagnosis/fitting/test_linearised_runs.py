@@ -1,12 +1,16 @@
 """Tests of linearised robot runs, and of whether the motion forgets its initial state."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario
 from tests.sims.robot.test_robot_motion import kind_of
@@ -87,3 +91,27 @@ def test_a_simulated_element_is_not_simulated_again(tmp_path):
     there.discretisation_correction = np.full(there.observed.shape, 1.0)
     np.testing.assert_array_equal(there.simulate(theta, runs, states), first + 1.0)
     assert there.simulation_count == 4
+
+
+def test_a_fit_that_continues_from_a_converged_one_simulates_nothing(tmp_path):
+    there = evaluator(tmp_path, ARM.format(damping=0.4, drive=SERVO))
+    name, theta = "drag.linear@hinge", there.get_nominal_theta().copy()
+    theta[there.coefficient_slices[name]] = 0.05
+    fitter = TrajectoryFitter(
+        there, NoiseModel(np.array([1e-3]), np.zeros(1)), frozenset(), is_final_fit=True
+    )
+    (fit,) = fitter.fit_models([FitStart((name,), theta, there.initial_state_guesses)], 20)
+    assert fit.is_own_jacobian
+    np.testing.assert_allclose(fit.theta[there.coefficient_slices[name]], 0.0, atol=1e-3)
+    count = there.simulation_count
+    (continued,) = fitter.fit_models([fit.make_start_with_derivatives()], 20)
+    assert there.simulation_count == count
+    assert continued.is_own_jacobian
+    np.testing.assert_array_equal(continued.theta, fit.theta)
+    np.testing.assert_array_equal(continued.jacobian, fit.jacobian)
+    # Without them, each run is simulated once more, with the coefficient displaced.
+    fitter.fit_models([fit.make_start()], 20)
+    assert there.simulation_count == count + 2
+    # Derivatives of another point are not those at the start.
+    start = replace(fit, is_own_jacobian=False).make_start_with_derivatives()
+    assert start.known_jacobian is None
