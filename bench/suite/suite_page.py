@@ -335,7 +335,13 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
 def _build_cells(
     tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]
 ) -> list[dict[str, Any]]:
-    """Build name, description and error curves of each cell, a problem with one target range."""
+    """Build name, description and error curves of each cell, a problem with one target range.
+
+    Args:
+        tables: tables of the suite.
+        page: page to which tables and charts are added.
+        styles: styles of marks by name of the tuner.
+    """
     points = [k for k in _CURVE_POINTS if k <= tables.suite.budget]
     parts = []
     for cell, curves in tables.curves.items():
@@ -377,7 +383,13 @@ def _build_cells(
 
 
 def _make_rank_panel(tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]) -> Panel:
-    """Make the panel of mean ranks against the number of simulations."""
+    """Make the panel of mean ranks against the number of simulations.
+
+    Args:
+        tables: tables of the suite.
+        page: page to which tables and charts are added.
+        styles: styles of marks by name of the tuner.
+    """
     page.add_table("mean-ranks", tables.ranks[tables.ranks["training"] == FREE], _DIGITS)
     series = tuple(
         Series(name, "mean_rank", style, {"tuner": name})
@@ -443,7 +455,13 @@ def find_stored_runs(version: str) -> SuiteRuns | None:
 
 
 def _print_results(tables: SuiteTables, new_runs: SuiteRuns, print_line: PrintLine) -> None:
-    """Print the headline, the mean ranks and the losses of the reference methods."""
+    """Print the headline, the mean ranks and the losses of the reference methods.
+
+    Args:
+        tables: tables of the suite.
+        new_runs: errors of the runs that were added to the suite.
+        print_line: prints one line of text.
+    """
     targets = new_runs.runs.groupby("cell")["target"].nunique()
     stored_tuners = [name for name in tables.suite.tuners if name not in new_runs.tuners]
     count = (

@@ -207,6 +207,12 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
     Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
     with `friction_form` soft, the file's solver parameters remain.
+
+    Args:
+        fields: model fields of the batch elements, changed in place.
+        robot: robot as read from its model file.
+        place: name of the joint.
+        c: (K, L) coefficients of the effect.
     """
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
@@ -256,6 +262,12 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
     `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
     Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
+
+    Args:
+        fields: model fields of the batch elements, changed in place.
+        robot: robot as read from its model file.
+        place: name of the joint.
+        c: (K, L) coefficients of the effect.
     """
     number = robot.joint(place).id
     tilted_elements = np.flatnonzero(c.any(axis=0))
@@ -293,6 +305,12 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
     the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
     the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
+
+    Args:
+        fields: model fields of the batch elements, changed in place.
+        robot: robot as read from its model file.
+        place: name of the body.
+        c: (K, L) coefficients of the effect.
     """
     number = robot.body(place).id
     loaded = np.flatnonzero(c[0])
@@ -318,6 +336,12 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     """Restrict the force range of an actuator to [-c, c], eq. (5), in batch elements with c > 0.
 
     `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
+
+    Args:
+        fields: model fields of the batch elements, changed in place.
+        robot: robot as read from its model file.
+        place: name of the actuator.
+        c: (K, L) coefficients of the effect.
     """
     number = robot.actuator(place).id
     is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]

@@ -205,6 +205,11 @@ def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
 def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
     """Send proposals to the harness, and evaluations to the tuner.
 
+    Args:
+        channel: message channel to the harness.
+        steps: generator of the tuner, which yields proposals.
+        task: task of the target.
+
     Raises:
         StopIteration: the tuner stopped.
         GeneratorExit: the harness ends the run.

@@ -421,6 +421,11 @@ def _train_learned_entries(
 ) -> dict[tuple[str, int], Exception]:
     """Train every learned entry with each of its seeds.
 
+    Args:
+        pool: worker pool that makes the calls.
+        results: prepared run of the experiment, to which weights are added.
+        progress: makes progress callbacks.
+
     Returns:
         Exception by label and seed of each training that failed.
 

@@ -236,6 +236,12 @@ def _run_isolated(
 ) -> tuple[RunTrace, Written, float]:
     """Execute a run whose tuner has an isolated process.
 
+    Args:
+        experiment: the experiment.
+        order: request of the run.
+        task: task of the target.
+        evaluate: function that simulates points and computes their losses.
+
     Returns:
         The trace, the files that the tuner wrote, and the seconds of its imports.
     """

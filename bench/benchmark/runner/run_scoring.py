@@ -119,7 +119,13 @@ def build_rows(
 def _build_parameter_columns(
     problem: TuningProblem, target: Target, outcome: RunOutcome
 ) -> dict[str, Any]:
-    """Build columns of parameter errors, proposals, recommendations and true parameters."""
+    """Build columns of parameter errors, proposals, recommendations and true parameters.
+
+    Args:
+        problem: tuning problem of the experiment.
+        target: target with its true parameters.
+        outcome: outcome of the run.
+    """
     cube = problem.cube
     recommended = cube.to_physical(outcome.trace.recommendations)
     proposed = cube.to_physical(outcome.trace.proposals)

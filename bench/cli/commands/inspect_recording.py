@@ -173,6 +173,11 @@ def _find_differing_conventions(
 
     The corrections are lines of keys of the description.
 
+    Args:
+        options: parsed arguments of the command.
+        recording: the recording.
+        kind: simulator class.
+
     Raises:
         InputError: A corrected description is requested, but nothing differs.
     """

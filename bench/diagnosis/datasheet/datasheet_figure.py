@@ -167,7 +167,13 @@ def _draw_heading(figure: Figure, content: SheetContent) -> float:
 
 
 def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> float:
-    """Draw the table of identified numbers; return the height of the space below, as a share."""
+    """Draw the table of identified numbers; return the height of the space below, as a share.
+
+    Args:
+        figure: figure to draw on.
+        content: content of the data sheet.
+        top: height of the top of the table, as a share of the page.
+    """
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
     rows = [
         (

@@ -232,6 +232,11 @@ def _linearise_extended(
     """Simulate the runs with the extended simulator, and compute its derivatives at this point.
 
     Only the initial states are fitted; parameters and coefficients keep their values.
+
+    Args:
+        evaluator: the runs.
+        extended: the extended simulator.
+        noise: noise of each channel.
     """
     theta = build_theta(evaluator, extended)
     (prediction,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])

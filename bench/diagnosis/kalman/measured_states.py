@@ -177,6 +177,11 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     """Compute the joint forces of a run by MuJoCo's inverse dynamics.
 
     Positions, velocities and accelerations are estimated from the recorded positions first.
+
+    Args:
+        robot: robot as read from its model file.
+        recording: the recording.
+        run: the recorded run.
     """
     model = robot.compiled
     states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
@@ -203,6 +208,11 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tup
     """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
 
     A velocity that is not recorded is NaN. Noise that is not stated is estimated.
+
+    Args:
+        robot: robot as read from its model file.
+        recording: the recording.
+        run: the recorded run.
     """
     readings = []
     for joint in robot.joints:

@@ -348,7 +348,13 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
 def _find_competing_effects(
     context: SearchContext, model: FittedModel, name: str
 ) -> list[_CompetingEffect]:
-    """Return the effects that are nearly as good by the regression in place of the given one."""
+    """Return the effects that are nearly as good by the regression in place of the given one.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+        name: name of the effect to replace.
+    """
     evaluator = context.evaluator
     regression, columns = context.columns.regression(model)
     remaining = regression.make_regression_without(columns[name])

@@ -157,7 +157,13 @@ def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bound
 
 
 def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
-    """Maximise the likelihood of the innovations with effects in the filter's model."""
+    """Maximise the likelihood of the innovations with effects in the filter's model.
+
+    Args:
+        context: context of the search.
+        followed: the runs, followed by a filter.
+        names: names of the effects.
+    """
     base_log_likelihood = context.filters.base.log_likelihood
     min_gain = max(
         MIN_STEP_GAIN_SHARE * (followed.log_likelihood - base_log_likelihood), MIN_STEP_GAIN

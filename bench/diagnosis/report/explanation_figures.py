@@ -188,6 +188,12 @@ def _label_rows(
     """Write the names of the candidates next to their rows, the first at the top.
 
     A name is bold unless the status of the candidate is "not needed".
+
+    Args:
+        axis: axes to draw on.
+        report: report data.
+        candidates: candidate effects in the order of the report.
+        names: names of the candidates, the first at the top.
     """
     axis.set_yticks(np.arange(len(candidates)), names, fontsize=_NAME_SIZE, linespacing=1.15)
     axis.set_ylim(len(candidates) - 0.5, -0.5)
@@ -201,6 +207,11 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
     """Draw which share of the held-out gap each candidate closes, with its 95 % interval.
 
     Each candidate is a row, in the given order. One that was not simulated has no mark.
+
+    Args:
+        axis: axes to draw on.
+        report: report data.
+        candidates: candidate effects in the order of the report.
     """
     lowest = 0.0
     for row, candidate in enumerate(candidates):

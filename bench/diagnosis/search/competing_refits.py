@@ -100,6 +100,11 @@ def _make_swapped_start(
 
     A law with several coefficients converges to slightly different values each time, which would
     make equivalent models look different.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the fitted model.
+        other_model: competing model.
     """
     (added_effect,), (removed_effect,) = (
         set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
@@ -151,6 +156,11 @@ def _is_competitive(search: EffectSearch, other_model: FittedModel, model: Fitte
 
     Merit is the penalised log-likelihood, and the excess residual the RMS residual in units of the
     noise, minus one. Merit is misleading if the residual has structure.
+
+    Args:
+        search: the search, with all fitted models.
+        other_model: competing model.
+        model: the fitted model.
     """
     if (
         abs(model.penalised_log_likelihood - other_model.penalised_log_likelihood)

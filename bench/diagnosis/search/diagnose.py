@@ -362,6 +362,11 @@ def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackO
 
     The p-value of the best missing effect (`p_value`) comes from an earlier score test, or from one
     that is made here if the residual is above the noise.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the fitted model.
+        lack_of_fit: result of the lack-of-fit test.
     """
     p_value = search.best_p_values.get(frozenset(model.effects))
     # A model with a residual above the noise was not scored, because the search did not need it.

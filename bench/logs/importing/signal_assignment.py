@@ -274,7 +274,13 @@ def _compare_with_derivative(
 
 
 def _confirm_unit(comparison: VelocityComparison | None, column: LogColumn, joint: Joint) -> str:
-    """Return the unit in which a velocity is its position's derivative; empty if there is none."""
+    """Return the unit in which a velocity is its position's derivative; empty if there is none.
+
+    Args:
+        comparison: comparison with the position's derivative; None if there is none.
+        column: column of the log.
+        joint: joint of the robot.
+    """
     if comparison is None or comparison.correlation < MIN_CORRELATION:
         return ""
     si = f"{joint.unit}/s"
@@ -430,6 +436,11 @@ class ColumnAssigner:
 
         The unit is the one that the log states, or the user, or the one that fits the range of the
         joint. Return None, with a message, if there is no such unit.
+
+        Args:
+            column: column of the log.
+            joint: joint of the robot.
+            placement: reason for assigning the column to its joint.
         """
         if column.unit:
             if not is_convertible(column.unit, joint.unit):
@@ -490,7 +501,13 @@ class ColumnAssigner:
                 self._assign_undriven(column, joint, placement)
 
     def _assign_undriven(self, column: LogColumn, joint: Joint, placement: Placement) -> None:
-        """Assign a command of a joint that the model does not drive: a servo or a force."""
+        """Assign a command of a joint that the model does not drive: a servo or a force.
+
+        Args:
+            column: column of the log.
+            joint: joint of the robot.
+            placement: reason for assigning the column to its joint.
+        """
         quantity = column_guessing.get_commanded_role(column)
         if quantity == "force":
             self._assign_force(column, joint, f"force.{joint.name}", placement)
@@ -510,6 +527,12 @@ class ColumnAssigner:
         """Assign a column as command of an actuator, or report that the quantity is wrong.
 
         A motor takes a torque or force, a servo a position or velocity.
+
+        Args:
+            column: column of the log.
+            joint: joint of the robot.
+            placement: reason for assigning the column to its joint.
+            actuator: actuator that receives the command.
         """
         given_quantity = column_guessing.get_commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)

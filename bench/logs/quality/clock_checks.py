@@ -291,6 +291,11 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
 
     All coordinates share the stamps, so a coordinate that moves as expected clears them; another
     one may belong to a link without inertia in the model file.
+
+    Args:
+        recording: the recording.
+        run: the recorded run.
+        kind: simulator class.
     """
     # The forces of a system with its own stepping are not accessible.
     if not issubclass(kind, SystemSimulator) or (kind.own_engine and not kind.has_model):
@@ -351,6 +356,11 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
 
     The system is at rest, so drag and friction do not act; D is the number of coordinates.
+
+    Args:
+        recording: the recording.
+        run: the recorded run.
+        system: system of the recording.
     """
     count = run.times.size
     values = {**recording.constants, **run.constants}

@@ -440,7 +440,13 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
 def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input gain a into the actuator: gain times 1 + a (1), range divided by it (2)."""
+    """Write an input gain a into the actuator: gain times 1 + a (1), range divided by it (2).
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
+    """
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not can_scale:
@@ -458,6 +464,11 @@ def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     """Write an input bias b into the actuator: shift its force by gain b (1), its range by -b (2).
 
     `input_factor` is the factor 1 + a of an input gain that is in the fields already.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
     """
     actuator, (b,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if not actuator.linear:
@@ -474,6 +485,11 @@ def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     """Write a saturation of the input at ±s as a narrower control range, eq. (2).
 
     A saturation s of zero or less has no effect, as in the simulation.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
     """
     actuator, (s,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if s <= 0:
@@ -493,6 +509,11 @@ def _write_delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unsta
     """Write an input delay in seconds into the actuator's delay and history buffer.
 
     The returned text begins with +, which marks a note about a cause that was written.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
     """
     actuator, (delay,) = _Actuator(fields, robot, cause.place), cause.coefficients
     step = float(fields["opt.timestep"][0])
@@ -518,6 +539,11 @@ def _write_lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unstata
 
     `lag` is the time constant in seconds. The returned text begins with +, which marks a note
     about a cause that was written.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
     """
     import mujoco
 
@@ -544,6 +570,11 @@ def _write_constant_force(
     A joint with a linear spring gets another rest position: force = stiffness times
     displacement. Otherwise an actuator of the joint gets a bias, if no force limit would clip
     it. The result is None, a note that begins with +, or the reason why neither is possible.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficients.
     """
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
