@@ -122,22 +122,20 @@ class _CallbackContexts:
         only their addresses. The table of contexts has one row of 64-bit integers per
         element.
         """
-        program = compiled.program_layout
-        joint_addresses = compiled.addresses
-        joints = joint_addresses.velocities.size
-        layout = program._asdict()
-        layout |= {"positions": joint_addresses.positions, "velocities": joint_addresses.velocities}
+        layout = compiled.layout
+        self._dofs = compiled.addresses.velocities
+        joints, states = self._dofs.size, layout["next_states"].size
         shared: dict[str, NDArray[Any]] = {
-            name: np.ascontiguousarray(values, dtype=np.int64)
+            name: np.ascontiguousarray(
+                values, dtype=np.float64 if values.dtype.kind == "f" else np.int64
+            )
             for name, values in layout.items()
             if isinstance(values, np.ndarray)
         }
-        shared["step"] = np.array([compiled.step])
         self._arrays = list(shared.values())
         self._registers: list[Array] = []
-        self._acceleration_registers = slice(program.a, program.a + joints)
+        self._acceleration_registers = slice(layout["a"], layout["a"] + joints)
         self._accelerations: Array = mujoco_batch.batch.bind("qacc")
-        self._dofs = joint_addresses.velocities
         common = layout | {name: values.ctypes.data for name, values in shared.items()}
         has_friction = bool(compiled.has_dry_friction.any())
         inputs = compiled.input_values
@@ -149,7 +147,7 @@ class _CallbackContexts:
                 "registers": registers,
                 "losses": np.ascontiguousarray(losses[batch_index]),
                 "input_values": np.ascontiguousarray(inputs[:, :, batch_index]),
-                "scratch": np.zeros(joints + program.next_states.size + 1),
+                "scratch": np.zeros(joints + states + 1),
             }
             self._registers.append(registers)
             self._arrays += element_arrays.values()
@@ -157,11 +155,11 @@ class _CallbackContexts:
             context = CallbackContext(
                 **common,
                 **addresses,
-                code_rows=len(program.code),
+                code_rows=len(layout["code"]),
                 register_count=len(registers),
                 joints=joints,
                 friction_rows=int((loss[batch_index] > 0).sum()) if has_friction else 0,
-                states=program.next_states.size,
+                states=states,
                 inputs=inputs.shape[1],
                 steps=steps,
                 evaluations_per_step=4

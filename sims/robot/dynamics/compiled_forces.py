@@ -79,42 +79,6 @@ class _Program(NamedTuple):
     states: NDArray[np.intp]
 
 
-class ProgramLayout(NamedTuple):
-    """Instructions of a step, and the registers of its inputs and outputs.
-
-    Attributes:
-        code: instructions (n, 5).
-        begin: first instruction of a step.
-        end: index after the last instruction of a step.
-        t: register of the time at the beginning of a step.
-        midpoint: register of the time at the middle of a step.
-        past: register of the interval over which hidden states advance.
-        x: first register of the positions.
-        v: first register of the velocities.
-        a: first register of the accelerations.
-        first_input: first register of the inputs.
-        first_state: first register of the hidden states.
-        forces: registers (D,) of the forces.
-        limits: registers (D,) of the limits of dry friction.
-        next_states: registers (H,) of the hidden states after a step.
-    """
-
-    code: NDArray[np.int64]
-    begin: int
-    end: int
-    t: int
-    midpoint: int
-    past: int
-    x: int
-    v: int
-    a: int
-    first_input: int
-    first_state: int
-    forces: NDArray[np.intp]
-    limits: NDArray[np.intp]
-    next_states: NDArray[np.intp]
-
-
 class _Tracing:
     """Traced state of a robot, and programs of the effects that are evaluated at it.
 
@@ -321,32 +285,33 @@ class CompiledForces:
         return self._stacked_inputs
 
     @property
-    def step(self) -> float:
-        """Step length in seconds."""
-        return self._source.step
+    def layout(self) -> dict[str, Any]:
+        """Fields of `CallbackContext` that are equal for all batch elements.
 
-    @property
-    def program_layout(self) -> ProgramLayout:
-        """Instructions of a step, and the registers of its inputs and outputs."""
+        They are numbers of registers and instructions, and arrays.
+        """
         instructions = self._program.instructions
         _, begin, end, _ = instructions.ends.tolist()
         x, v, a, *_ = (rows.start for rows in self._motion)
-        return ProgramLayout(
-            code=instructions.code,
-            begin=begin,
-            end=end,
-            t=self._t,
-            midpoint=self._midpoint_time,
-            past=self._state_interval,
-            x=x,
-            v=v,
-            a=a,
-            first_input=self._u.start,
-            first_state=self._states.start,
-            forces=self._program.force,
-            limits=self._program.limit,
-            next_states=self._program.states,
-        )
+        return {
+            "code": instructions.code,
+            "begin": begin,
+            "end": end,
+            "t": self._t,
+            "midpoint": self._midpoint_time,
+            "past": self._state_interval,
+            "x": x,
+            "v": v,
+            "a": a,
+            "first_input": self._u.start,
+            "first_state": self._states.start,
+            "forces": self._program.force,
+            "limits": self._program.limit,
+            "next_states": self._program.states,
+            "positions": self.addresses.positions,
+            "velocities": self.addresses.velocities,
+            "step": np.array([self._source.step]),
+        }
 
     def begin(self, joint_states: JointStates) -> None:
         """Set the hidden states at the beginning of a motion.

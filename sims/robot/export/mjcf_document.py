@@ -6,7 +6,7 @@ It relates the elements of the source text to their numbers in the compiled mode
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -206,7 +206,7 @@ class XmlText:
             self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
         )
         parts = []
-        inserted = [(child.before, _render_new_element(child)) for child in tag.inserted]
+        inserted = [(child.before, format_element(child.name, child.new)) for child in tag.inserted]
         for comments, element in [*tag.within, *inserted]:
             for line in [
                 *map(self._render_comment, comments),
@@ -248,9 +248,15 @@ class XmlText:
         return line if not line.strip() else b""
 
 
-def _render_new_element(tag: XmlElement) -> str:
-    attributes = [_render_attribute(name, value).decode() for name, value in tag.new.items()]
-    return f"<{' '.join([tag.name, *attributes])}/>"
+def format_element(name: str, attributes: Mapping[str, str]) -> str:
+    """Format an XML element without content.
+
+    Args:
+        name: name of the element.
+        attributes: values by name, not escaped.
+    """
+    parts = [_render_attribute(key, value).decode() for key, value in attributes.items()]
+    return f"<{' '.join([name, *parts])}/>"
 
 
 def _render_attribute(name: str, value: str) -> bytes:
@@ -455,8 +461,7 @@ class MjcfDocument:
         if compilers:
             compilers[-1].new |= absolute_folders
         else:
-            attribute_text = " ".join(f'{key}="{value}"' for key, value in absolute_folders.items())
-            self.root.within.append(([], f"<compiler {attribute_text}/>"))
+            self.root.within.append(([], format_element("compiler", absolute_folders)))
 
     def to_text(self) -> str:
         """Return the text with all changes; changed files replace their include elements."""

@@ -20,7 +20,13 @@ from sims.robot.export.mjcf_attributes import (
     get_enum_word,
     list_all_attributes,
 )
-from sims.robot.export.mjcf_document import MjcfDocument, XmlElement, format_number, format_numbers
+from sims.robot.export.mjcf_document import (
+    MjcfDocument,
+    XmlElement,
+    format_element,
+    format_number,
+    format_numbers,
+)
 
 _ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 """Attributes that are alternatives to ``quat`` and ``diaginertia``."""
@@ -98,8 +104,7 @@ class MjcfWriter:
             return
         if not values:
             return
-        attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
-        self.document.root.within.append((list(comments), f"<option {attributes}/>"))
+        self.document.root.within.append((list(comments), format_element("option", values)))
 
     def _keep_masses(self) -> None:
         """Change compiler settings so that MuJoCo uses inertials as specified."""
@@ -138,8 +143,7 @@ class MjcfWriter:
         if not values:
             _add_comments(body, comments)
             return
-        attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
-        body.within.append((list(comments), f"<inertial {attributes}/>"))
+        body.within.append((list(comments), format_element("inertial", values)))
 
     def _list_attributes_before(self, element: ModelElement) -> Mapping[str, Values]:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))

@@ -34,6 +34,7 @@ from sims.robot.export.mjcf_document import (
     FILE_ELEMENTS,
     MjcfDocument,
     NotEditableError,
+    format_element,
     format_heading,
     format_number,
     format_numbers,
@@ -194,8 +195,8 @@ def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
         for name in ("friction", "solref", "solimp"):
             attributes[name] = format_numbers(tuple(getattr(pair, name)))
         attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
-        text = " ".join(f'{name}="{value}"' for name, value in attributes.items())
-        document.root.within.append(([], f"<contact><pair {text}/></contact>"))
+        pair_text = format_element("pair", attributes)
+        document.root.within.append(([], f"<contact>{pair_text}</contact>"))
 
 
 def _render_series_joint(second: Any) -> str:
@@ -219,8 +220,7 @@ def _render_series_joint(second: Any) -> str:
         attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
         attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
     attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
-    text = " ".join(f'{name}="{value}"' for name, value in attributes.items())
-    return f"<joint {text}/>"
+    return format_element("joint", attributes)
 
 
 def _render_urdf(
@@ -373,8 +373,7 @@ def render_default_class(
         tag, attributes = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
-        attribute_text = "".join(f' {key}="{value}"' for key, value in attributes.items())
-        lines.append(f"  <{tag}{attribute_text}/>")
+        lines.append(f"  {format_element(tag, attributes)}")
     return "\n".join([*lines, "</default>"])
 
 
