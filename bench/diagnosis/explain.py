@@ -592,7 +592,7 @@ class _ExplainRun:
         if self.fitting.filtered_runs is None:
             if self.fitting.is_in_contact:
                 # This import is needed for robots only.
-                from bench.diagnosis.kalman.contact_proposals import propose_contact_effects
+                from bench.diagnosis.search.contact_search import propose_contact_effects
 
                 # A search that has to end early still gives its best model.
                 with suppress(SearchStoppedError):
@@ -743,7 +743,7 @@ class _ExplainRun:
         ):
             if self._has_contacts:
                 # This import is needed for robots only.
-                from bench.diagnosis.kalman.contact_proposals import set_first_states_in_contact
+                from bench.diagnosis.kalman.cubature_filter import set_first_states_in_contact
 
                 theta = evaluator.get_nominal_theta()
                 set_first_states_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
@@ -848,7 +848,7 @@ class _ExplainRun:
         ):
             return base
         # This import is needed for robots only.
-        from bench.diagnosis.kalman.contact_proposals import find_lowest_scan
+        from bench.diagnosis.search.contact_search import find_lowest_scan
 
         file_options = self._rate_options(base)
         if file_options.is_noise_like:

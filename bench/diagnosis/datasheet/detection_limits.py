@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
@@ -39,7 +40,6 @@ from bench.diagnosis.identifiability import CONFOUNDING_CORRELATION, MIN_DETECTA
 from bench.diagnosis.score_extended import build_theta
 from bench.diagnosis.search.candidate_directions import (
     NONLINEAR_COEFFICIENT_KINDS,
-    CandidateDirection,
     DirectionSet,
     compute_directions,
     compute_responses,

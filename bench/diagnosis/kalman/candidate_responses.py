@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.filter_and_smoother import (
@@ -36,7 +37,6 @@ from bench.diagnosis.kalman.filter_and_smoother import (
     fit_process_noise,
 )
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
-from bench.diagnosis.search.candidate_directions import CandidateDirection
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around
@@ -43,7 +44,6 @@ from bench.diagnosis.prediction_error.regression_columns import (
 )
 from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
 from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
-from bench.diagnosis.search.candidate_directions import CandidateDirection
 from bench.diagnosis.search.start_selection import add_effect_to_start
 from sims.core.simulator import Array
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.coefficient_bounds import (
     clip_coefficients,
     compute_coefficient_bounds,
@@ -31,7 +32,7 @@ from bench.diagnosis.prediction_error.regression_selection import (
     identify,
     regress,
 )
-from bench.diagnosis.search.candidate_directions import CandidateDirection, iterate_first_probes
+from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import JointHatForce, list_hat_probes
 from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.simulator import Array

@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
-from bench.diagnosis.search.candidate_directions import CandidateDirection
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
     CandidateScores,

@@ -21,6 +21,7 @@ from itertools import product
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.coefficient_bounds import (
     MIN_CYCLES_PER_RUN,
 )
@@ -76,27 +77,6 @@ END_STOP_DEPTH_SHARES = (0.005, 0.02, 0.08, 0.2)
 """Depths of end stops that are tried, as shares of the range of the coordinate."""
 END_STOP_STIFFNESS_SHARES = (0.003, 0.03, 0.3, 3.0)
 """Stiffnesses of end stops that are tried, as shares of the largest plausible one."""
-
-
-@dataclass(frozen=True)
-class CandidateDirection:
-    """One candidate direction.
-
-    Attributes:
-        effect: name of the effect.
-        grid_point: number of the grid point; directions of one group act together.
-        coefficient_index: index of the coefficient that scales it.
-        coefficients: (k,) coefficients that are simulated.
-        can_be_negative: whether the scaling coefficient may be negative.
-        is_single_size: whether the direction is valid only at this size.
-    """
-
-    effect: str
-    grid_point: int
-    coefficient_index: int
-    coefficients: Array
-    can_be_negative: bool
-    is_single_size: bool = False
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.search.candidate_directions import (
-    CandidateDirection,
     DirectionSet,
     compute_responses,
 )

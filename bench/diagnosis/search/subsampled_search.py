@@ -18,7 +18,6 @@ from bench.diagnosis.search.competing_refits import (
     refine_best_model,
     select_decisive,
 )
-from bench.diagnosis.search.contact_search import search_in_contact
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
     MAX_P_VALUE_FIRST_EFFECT,
@@ -42,6 +41,9 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
     """
     # Thinned runs would begin in contact without an estimate of their initial states.
     if search.evaluator.is_in_contact:
+        # This import is needed for robots only.
+        from bench.diagnosis.search.contact_search import search_in_contact
+
         return search_in_contact(search)
     thinned_runs = thin_runs(search.evaluator)
     if thinned_runs is None:
