@@ -121,24 +121,12 @@ def _describe_system(kind: Any) -> JsonDocument:
 
     `kind` is the class of the system; a parameter has its bounds, its training range and its unit.
     """
-    parameters = [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "nominal": p.nominal,
-            "bounds": p.bounds,
-            "training": p.training,
-            "log": p.log,
-            "says": p.says,
-        }
-        for p in kind.parameters
-    ]
-    constants = [
-        {"name": c.name, "unit": c.unit, "value": c.value, "says": c.says} for c in kind.constants
-    ]
     return {
-        "parameters": parameters,
-        "constants": constants,
+        "parameters": [
+            _pick(p, "name", "unit", "nominal", "bounds", "training", "log", "says")
+            for p in kind.parameters
+        ],
+        "constants": [_pick(c, "name", "unit", "value", "says") for c in kind.constants],
         "inputs": _describe_channels(kind.inputs),
         "states": [{"name": name, "value": value} for name, value in kind.states.items()],
         "channels": _describe_channels(kind.channels),
@@ -146,7 +134,12 @@ def _describe_system(kind: Any) -> JsonDocument:
 
 
 def _describe_channels(channels: Iterable[Any]) -> list[JsonDocument]:
-    return [{"name": c.name, "unit": c.unit, "says": c.says} for c in channels]
+    return [_pick(c, "name", "unit", "says") for c in channels]
+
+
+def _pick(part: Any, *names: str) -> JsonDocument:
+    """Return some attributes of an object by name."""
+    return {name: getattr(part, name) for name in names}
 
 
 def list_effects() -> list[JsonDocument]:
@@ -178,8 +171,7 @@ def _describe_effect_properties(effect: Any) -> JsonDocument:
         for c in effect.coefficients
     ]
     return {
-        "noun": effect.noun,
-        "hook": effect.hook,
+        **_pick(effect, "noun", "hook"),
         "places": getattr(effect, "at", None),
         "needs": effect.needs,
         "contains": list(effect.contains),
@@ -209,17 +201,12 @@ def list_experiments() -> list[JsonDocument]:
         missing = availability(each)
         documents.append(
             {
-                "name": each.name,
-                "says": each.says,
+                **_pick(each, "name", "says"),
                 "skipped": missing.skipped or None,
                 "needs": missing.data_set.command if missing.data_set else None,
-                "title": each.title,
-                "tags": list(each.tags),
-                "simulator": each.simulator,
+                **_pick(each, "title", "tags", "simulator"),
                 "model": each.model or None,
-                "ranges": list(each.ranges),
-                "targets": each.targets,
-                "budget": each.budget,
+                **_pick(each, "ranges", "targets", "budget"),
                 "tuners": [asdict(entry)["label"] for entry in each.tuners],
                 "tuners_skipped": dict(missing.tuners),
             }
@@ -406,25 +393,17 @@ def list_places(model: Path) -> JsonDocument:
         "about": list(format_robot_summary(kind)),
         "joints": [
             {
-                "name": joint.name,
-                "kind": joint.kind,
-                "range": joint.range,
-                "unit": joint.unit,
-                "effort": joint.effort,
+                **_pick(joint, "name", "kind", "range", "unit", "effort"),
                 "effort_unit": joint.force_unit,
             }
             for joint in kind.robot.joints
         ],
         "actuators": [
-            {"name": a.name, "kind": a.kind, "joint": a.joint, "range": a.range, "force": a.force}
-            for a in kind.robot.actuators
+            _pick(a, "name", "kind", "joint", "range", "force") for a in kind.robot.actuators
         ],
-        "bodies": [
-            {"name": body.name, "mass": body.mass, "aliases": body.aliases}
-            for body in kind.robot.bodies
-        ],
-        "inputs": [{"name": c.name, "unit": c.unit} for c in kind.inputs],
-        "channels": [{"name": c.name, "unit": c.unit, "says": c.says} for c in kind.channels],
+        "bodies": [_pick(body, "name", "mass", "aliases") for body in kind.robot.bodies],
+        "inputs": [_pick(c, "name", "unit") for c in kind.inputs],
+        "channels": _describe_channels(kind.channels),
         "effects": effects_by_kind,
         "free": list(kind.system.list_mujoco_words()),
     }

@@ -114,26 +114,32 @@ class SearchProgress:
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage; see `ProgressListener`."""
         self._name, self._total, self._done = name, total, 0
+        self._redraw_if_due()
 
     def advance(self, count: int = 1) -> None:
         """Finish steps of the stage; see `ProgressListener`."""
         self._done += count
+        self._redraw_if_due()
 
     def found(self, effects: Sequence[str], share: float) -> None:
         """Store the best model so far; see `ProgressListener`."""
         # 99.96 % must not be shown as 100 %.
         percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
         self._best = " + ".join(effects), percent
+        self._redraw_if_due()
 
     def completed(self, share: float) -> None:
         """Estimate the remaining time from the share done; see `ProgressListener`."""
         # A model with more effects makes the share smaller, but a bar must not go back.
-        if share <= self._share:
-            return
-        self._share = min(share, 1.0)
-        self._estimated_at = self._clock()
-        if self._share >= MIN_SHARE_FOR_ESTIMATE:
-            self._estimate = self.elapsed() * (1.0 - self._share) / self._share
+        if share > self._share:
+            self._share = min(share, 1.0)
+            self._estimated_at = self._clock()
+            if self._share >= MIN_SHARE_FOR_ESTIMATE:
+                self._estimate = self.elapsed() * (1.0 - self._share) / self._share
+        self._redraw_if_due()
+
+    def _redraw_if_due(self) -> None:
+        """Show the state after an event; a display does so, and the state alone does nothing."""
 
     def elapsed(self) -> float:
         """Return the seconds since the search began."""
@@ -291,36 +297,6 @@ class ProgressDisplay(SearchProgress):
             self._erase_live_line()
             self._print_waiting()
         self._silent = True
-
-    def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a stage and show it.
-
-        Args:
-            name: Name of the stage.
-            total: Number of its steps; None if unknown.
-        """
-        super().stage(name, total)
-        self._redraw_if_due()
-
-    def advance(self, count: int = 1) -> None:
-        """Finish steps of the stage and show it."""
-        super().advance(count)
-        self._redraw_if_due()
-
-    def found(self, effects: Sequence[str], share: float) -> None:
-        """Store the best model so far and show it.
-
-        Args:
-            effects: Effects of the model.
-            share: Share of the gap that it closes.
-        """
-        super().found(effects, share)
-        self._redraw_if_due()
-
-    def completed(self, share: float) -> None:
-        """Store the share done and show it."""
-        super().completed(share)
-        self._redraw_if_due()
 
     def note(self, text: str) -> None:
         """Print a permanent line: above the live line on a terminal."""

@@ -27,13 +27,12 @@ _NOT_APPLICABLE_PREFIX = "not applicable: "
 """Prefix of the line of a check that does not apply to the subject."""
 _LEFT_OUT = "not tested: "
 """Prefix of the line of a check that was not run."""
-_MARKS = {_EXPECTED_FAILURE_PREFIX: "known ", _NOT_APPLICABLE_PREFIX: "-     ", _LEFT_OUT: "-     "}
 _OUTCOMES = {
-    _EXPECTED_FAILURE_PREFIX: "known",
-    _NOT_APPLICABLE_PREFIX: "not applicable",
-    _LEFT_OUT: "not tested",
+    _EXPECTED_FAILURE_PREFIX: ("known", "known "),
+    _NOT_APPLICABLE_PREFIX: ("not applicable", "-     "),
+    _LEFT_OUT: ("not tested", "-     "),
 }
-"""Outcome for programs, by the prefix of a line."""
+"""Outcome for programs and label for people, by the prefix of a line."""
 
 
 class SuiteResult(NamedTuple):
@@ -54,12 +53,12 @@ class SuiteResult(NamedTuple):
     @property
     def has_passed(self) -> bool:
         """True if no check failed."""
-        return all(_get_outcome(line) != "failed" for line in self.lines.values())
+        return all(_classify_line(line)[0] != "failed" for line in self.lines.values())
 
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
         checks = [
-            {"check": title, "outcome": _get_outcome(line), "says": line.strip()}
+            {"check": title, "outcome": _classify_line(line)[0], "says": line.strip()}
             for title, line in self.lines.items()
         ]
         return {
@@ -144,7 +143,7 @@ def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], Non
     for check, line in _run_all_checks(kind, name, plugins):
         lines[title_of(check)] = line
         error_text = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
-        print_line(f"{_get_outcome_label(line)}  {title_of(check)}{error_text}")
+        print_line(f"{_classify_line(line)[1]}  {title_of(check)}{error_text}")
     checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
     print_line(f"{kind} {name} ({checked.qualified}): {_summarise_checks(checked)}")
     return checked
@@ -152,7 +151,7 @@ def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], Non
 
 def _summarise_checks(checked: SuiteResult) -> str:
     """Summarise how many checks failed and how many were not run."""
-    outcomes = [_get_outcome(line) for line in checked.lines.values()]
+    outcomes = [_classify_line(line)[0] for line in checked.lines.values()]
     unrun_counts = {
         outcome: outcomes.count(outcome) for outcome in ("not tested", "not applicable")
     }
@@ -165,20 +164,12 @@ def _summarise_checks(checked: SuiteResult) -> str:
     return f"all {checked_count} checks passed{other_counts}"
 
 
-def _get_outcome(line: str) -> str:
-    """Return the outcome that a check's line stands for; an empty line is a passed check."""
-    for prefix, outcome in _OUTCOMES.items():
+def _classify_line(line: str) -> tuple[str, str]:
+    """Return outcome and label of the check with a line; an empty line is a passed check."""
+    for prefix, outcome_and_label in _OUTCOMES.items():
         if line.startswith(prefix):
-            return outcome
-    return "failed" if line else "passed"
-
-
-def _get_outcome_label(line: str) -> str:
-    """Return the label printed before a check's title; an empty line is a passed check."""
-    for prefix, mark in _MARKS.items():
-        if line.startswith(prefix):
-            return mark
-    return "FAILED" if line else "ok    "
+            return outcome_and_label
+    return ("failed", "FAILED") if line else ("passed", "ok    ")
 
 
 def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
@@ -206,7 +197,7 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
                 )
                 lost_workers += isinstance(end, Exception) and not isinstance(end, InputError)
                 line = _format_check_end(end)
-            if _get_outcome(line) == "failed":
+            if _classify_line(line)[0] == "failed":
                 failed.append(check)
             yield check, line.strip().replace("\n", "\n        ")
 

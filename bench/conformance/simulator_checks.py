@@ -32,10 +32,6 @@ _GROWTH_RATIO = 2.5
 """Ratio of velocity changes above which the effect of a force has grown."""
 
 
-def _as_own_simulator(kind: type[Simulator]) -> type[OwnSimulator] | None:
-    return kind if issubclass(kind, OwnSimulator) else None
-
-
 _NOT_OWN = NotApplicable("it is not a subclass of OwnSimulator")
 
 
@@ -56,35 +52,32 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     `observe` must return a number for every channel, coordinate, rate and level. `inertia` must
     return a number or a positive definite matrix (D, D). `apply_force` must accept (D,).
     """
-    user_class = _as_own_simulator(kind)
-    if user_class is None:
+    if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
-    forced = user_class.apply_force is not OwnSimulator.apply_force
-    heavy = user_class.inertia is not OwnSimulator.inertia
+    forced = kind.apply_force is not OwnSimulator.apply_force
+    heavy = kind.inertia is not OwnSimulator.inertia
     hook = "apply_force" if forced else "inertia"
     if forced or heavy:
         expected = f"the attributes coordinates and rates with {hook}"
-        check(bool(user_class.coordinates), expected, "none", user_class.__name__)
-    simulator = user_class()
+        check(bool(kind.coordinates), expected, "none", kind.__name__)
+    simulator = kind()
     names = [c.name for c in simulator.channels]
     _start_run(simulator)
     try:
         for _ in range(2):
             observation = simulator.observe()
-            for name in dict.fromkeys(
-                [*names, *user_class.coordinates, *user_class.rates, *user_class.levels]
-            ):
+            for name in dict.fromkeys([*names, *kind.coordinates, *kind.rates, *kind.levels]):
                 observed(simulator, observation, name)
             if heavy:
-                _check_inertia(user_class, inertia_of(simulator))
+                _check_inertia(kind, inertia_of(simulator))
             if forced:
-                simulator.apply_force(np.zeros(len(user_class.coordinates)))
+                simulator.apply_force(np.zeros(len(kind.coordinates)))
             _make_step(simulator)
     except InputError as error:
-        message = str(error).removeprefix(f"simulator {user_class.name}: ")
+        message = str(error).removeprefix(f"simulator {kind.name}: ")
         expected_text, _, found_text = message.partition(", found ")
         raise CheckError(
-            f"{expected_text}; found {found_text or 'it is not'}; see {user_class.__name__}"
+            f"{expected_text}; found {found_text or 'it is not'}; see {kind.__name__}"
         ) from None
     finally:
         simulator.close()
@@ -109,13 +102,11 @@ def _check_inertia(kind: type[OwnSimulator], value: float | Array) -> None:
 
 def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
     """Check that twice as many steps of half the length lead to about the same state."""
-    user_class = _as_own_simulator(kind)
-    if user_class is None:
+    if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
-    simulator = user_class()
+    simulator = kind()
     full_change, half_change = (
-        _compute_scaled_change(simulator, user_class.time_step / n, _COMPARED_STEPS * n)
-        for n in (1, 2)
+        _compute_scaled_change(simulator, kind.time_step / n, _COMPARED_STEPS * n) for n in (1, 2)
     )
     simulator.close()
     has_moved = np.abs(full_change) > _MIN_MOTION
@@ -126,7 +117,7 @@ def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | 
         f"{2 * _COMPARED_STEPS} steps of time_step / 2 to reach the same state as "
         f"{_COMPARED_STEPS} of time_step"
     )
-    location = f"{user_class.__name__}.step: the engine must step by `seconds`"
+    location = f"{kind.__name__}.step: the engine must step by `seconds`"
     check(ratio < _MAX_DISTANCE_RATIO, expected, f"{ratio:.2g} times as far", location)
     return None
 
@@ -167,18 +158,17 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
     It must not act in the next run.
     """
-    user_class = _as_own_simulator(kind)
-    if user_class is None:
+    if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
-    if user_class.apply_force is OwnSimulator.apply_force:
+    if kind.apply_force is OwnSimulator.apply_force:
         return NotApplicable("it takes no forces (it has no method apply_force)")
-    simulator, location = user_class(), f"{user_class.__name__}.apply_force"
+    simulator, location = kind(), f"{kind.__name__}.apply_force"
     unforced = _simulate_motion(simulator, None)
-    for place, name in enumerate(user_class.coordinates):
+    for place, name in enumerate(kind.coordinates):
         forced = unforced
         size = 1.0
         while is_bitwise_equal(unforced, forced) and size <= _MAX_TRIED_FORCE:
-            force = np.zeros(len(user_class.coordinates))
+            force = np.zeros(len(kind.coordinates))
             force[place] = size
             forced = _simulate_motion(simulator, force)
             size *= 10.0
@@ -190,9 +180,9 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
             location,
         )
         is_restored = is_bitwise_equal(unforced, _simulate_motion(simulator, None))
-        reset = f"{user_class.__name__}.reset: it must remove a force that was applied"
+        reset = f"{kind.__name__}.reset: it must remove a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
-        velocity = np.abs(forced - unforced)[:, len(user_class.coordinates) + place]
+        velocity = np.abs(forced - unforced)[:, len(kind.coordinates) + place]
         has_grown = 0.0 < velocity[1] * _GROWTH_RATIO < velocity[_CHECKED_STEP]
         expected = f"a force along {name} to act in the next step alone"
         check(not has_grown, expected, "that it acts in later steps too", location)
@@ -216,19 +206,18 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
     """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
-    user_class = _as_own_simulator(kind)
-    if user_class is None:
+    if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
-    if user_class.put is OwnSimulator.put or not user_class.levels:
+    if kind.put is OwnSimulator.put or not kind.levels:
         return NotApplicable("its levels cannot be set (it has no method put)")
-    simulator, location = user_class(), f"{user_class.__name__}.put"
-    for name in user_class.levels:
+    simulator, location = kind(), f"{kind.__name__}.put"
+    for name in kind.levels:
         _start_run(simulator)
         _make_step(simulator)
-        levels_before = {level: float(simulator.observe()[level]) for level in user_class.levels}
+        levels_before = {level: float(simulator.observe()[level]) for level in kind.levels}
         expected_levels = {**levels_before, name: 0.9 * levels_before[name] + 0.01}
         simulator.put({name: expected_levels[name]})
-        found_levels = {level: float(simulator.observe()[level]) for level in user_class.levels}
+        found_levels = {level: float(simulator.observe()[level]) for level in kind.levels}
         is_same = np.allclose(
             list(found_levels.values()), list(expected_levels.values()), rtol=1e-9, atol=1e-12
         )

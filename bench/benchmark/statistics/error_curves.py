@@ -14,7 +14,7 @@ training range.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -58,12 +58,17 @@ class RunCurves:
             self.failed[mask],
         )
 
-    def select(self, **values: str) -> RunCurves:
+    def select(self, **values: object) -> RunCurves:
         """Return the runs whose key columns have the given values."""
         mask = np.ones(len(self.keys), dtype=bool)
         for name, value in values.items():
             mask &= (self.keys[name] == value).to_numpy(dtype=bool)
         return self.select_mask(mask)
+
+    def split_problems(self) -> Iterator[tuple[str, str, RunCurves]]:
+        """Iterate over the experiments and ranges; yield both names and the runs there."""
+        for (experiment, kind), _ in self.keys.groupby(["experiment", "range"], sort=False):
+            yield str(experiment), str(kind), self.select(experiment=experiment, range=kind)
 
     def list_tuners(self) -> list[str]:
         """Return the tuner labels in the order of their first run."""

@@ -201,15 +201,14 @@ def build_ert_table(curves: RunCurves, levels: tuple[float, ...], budget: int) -
         Table with the columns `ERT_COLUMNS`; the intervals are over targets.
     """
     lines = []
-    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        range_curves = curves.select(experiment=str(experiment), range=str(kind))
+    for experiment, kind, range_curves in curves.split_problems():
         for tuner in range_curves.list_tuners():
             tuner_curves = range_curves.select(tuner=tuner)
             for level in levels:
                 effort = compute_effort(tuner_curves, level, budget)
                 # All tuners use the same draws, so that differences between targets cancel in
                 # comparisons.
-                resamples = draw_target_resamples(len(effort.successes), str(experiment), str(kind))
+                resamples = draw_target_resamples(len(effort.successes), experiment, kind)
                 low, high = compute_percentile_interval(effort.compute_ert(resamples))
                 counts = int(effort.successes.sum()), effort.runs, int(tuner_curves.failed.sum())
                 lines.append(

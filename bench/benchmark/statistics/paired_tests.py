@@ -72,10 +72,8 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
         Holm's correction is over all pairs of an experiment and range.
     """
     parts = []
-    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        logs = build_log_error_table(
-            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
-        )
+    for experiment, kind, problem_curves in curves.split_problems():
+        logs = build_log_error_table(problem_curves, floor=floor)
         lines = [
             (experiment, kind, a, b, *compare_pair(logs[a].to_numpy(), logs[b].to_numpy()))
             for a, b in itertools.combinations(logs.columns, 2)

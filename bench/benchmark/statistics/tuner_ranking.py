@@ -106,10 +106,9 @@ def rank_tuners(curves: RunCurves, budget: int, floor: float) -> pd.DataFrame:
         error is larger.
     """
     parts = []
-    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        part = curves.select(experiment=str(experiment), range=str(kind))
+    for experiment, kind, part in curves.split_problems():
         for k, ranking in _compute_rankings(part, budget, floor).items():
-            parts.append(_build_verdict_rows(ranking, part, (str(experiment), str(kind), k)))
+            parts.append(_build_verdict_rows(ranking, part, (experiment, kind, k)))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=RANKING_COLUMNS)
 
 
@@ -252,10 +251,8 @@ def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.Dat
         Ranks with one row per problem and one column per tuner.
     """
     rows = {}
-    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        logs = build_log_error_table(
-            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
-        )
+    for experiment, kind, problem_curves in curves.split_problems():
+        logs = build_log_error_table(problem_curves, floor=floor)
         rows[f"{experiment} {kind}"] = logs.median(axis=0)
     medians = pd.DataFrame(rows).T.dropna(axis="columns")
     # Rounding gives errors that differ by the last bit the same rank.
