@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from bench.diagnosis import explain as explaining
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
-from bench.diagnosis.search.candidate_directions import CandidateDirection, DirectionSet
+from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.score_test import ScoreTest
 from sims import effects
 from sims.systems.slider import SliderSystem

@@ -45,6 +45,7 @@ DIFFERENCES = {
 """Text of the model file of B, and of that of A, by name of the difference."""
 BLOCK_DIFFERENCES = {
     "cone": {"options": 'cone="elliptic"'},
+    "impratio": {"options": 'impratio="20"'},
     "friction": {"change": ('friction="0.6"', 'friction="0.7"')},
 }
 """Differences of the block on a plane, as arguments of `write_block_recording`."""
