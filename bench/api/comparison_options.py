@@ -6,15 +6,15 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from bench.benchmark.problem.experiment import Experiment
 from bench.core.options import option
-from bench.core.plugin_registries import diagnosers
-from bench.core.plugin_registries import tuners as registered
 from methods.tuner import Tuner
 from sims.core.argument_checks import Count, Expected, Files, Name, Names, Natural, Seconds
 from sims.core.simulator import InputError, make_unknown_name_error
+
+if TYPE_CHECKING:
+    from bench.benchmark.problem.experiment import Experiment
 
 Tuners: TypeAlias = Annotated[
     Sequence[Name | type[Tuner]],
@@ -106,6 +106,8 @@ def apply_changes(
     Raises:
         InputError: A tuner or diagnoser does not exist.
     """
+    from bench.core.plugin_registries import tuners as registered
+
     if experiment.diagnosis:
         return _choose_diagnosers(experiment, labels, changes)
     experiment = experiment.chosen(**changes)
@@ -124,6 +126,8 @@ def _choose_diagnosers(
     experiment: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
 ) -> Experiment:
     """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
+    from bench.core.plugin_registries import diagnosers
+
     sample = changes.get("targets")
     table = dict(experiment.diagnosis)
     if sample is not None:
@@ -143,6 +147,8 @@ def get_tuner_label(tuner: str | type[Tuner]) -> str:
     Raises:
         InputError: it is neither a name nor a subclass of Tuner.
     """
+    from bench.core.plugin_registries import tuners as registered
+
     if isinstance(tuner, str):
         return tuner
     if not (inspect.isclass(tuner) and issubclass(tuner, Tuner)):

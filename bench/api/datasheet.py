@@ -17,7 +17,6 @@ from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.verdict import Verdict
 from bench.logs.joined_recordings import load_joined
-from bench.studies.explanation_verification import read_verdict
 from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
@@ -102,6 +101,9 @@ def check_joint_exists(
 
 def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
     """Read the results that explain has written to a folder."""
+    # Imported here, because it imports pandas, which most data sheets do not need.
+    from bench.studies.explanation_verification import read_verdict
+
     verdict = read_verdict(folder)
     extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)
     return replace(extended, kind=kind), verdict

@@ -10,16 +10,15 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from bench.cli.output import EXIT_CODES, JsonDocument
-from bench.core.plugin_registries import make_robot_simulator
-from bench.logs.recording_summary import format_robot_summary
-from sims import effects
 from sims.core.plain_values import append_unit, format_unit
-from sims.robot.robot_model import RobotModel
-from sims.robot.robot_simulator import RobotSimulator
-from sims.robot.robot_system import RobotSystem
+
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
+    from sims.robot.robot_simulator import RobotSimulator
+    from sims.robot.robot_system import RobotSystem
 
 _OPTION_TYPES = {
     "_StoreTrueAction": "flag",
@@ -369,7 +368,10 @@ _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {
 
 def format_places(model: Path) -> Iterator[str]:
     """Yield lines about a model file's places and signals, and the effects that can act there."""
-    kind = cast(type[RobotSimulator], make_robot_simulator(model))
+    from bench.core.plugin_registries import make_robot_simulator
+    from bench.logs.recording_summary import format_robot_summary
+
+    kind = cast("type[RobotSimulator]", make_robot_simulator(model))
     yield from format_robot_summary(kind)
     yield from _format_joints(kind.robot)
     yield from _format_actuators(kind)
@@ -386,7 +388,10 @@ def format_places(model: Path) -> Iterator[str]:
 
 def list_places(model: Path) -> JsonDocument:
     """Build the JSON document of the places of a model file."""
-    kind = cast(type[RobotSimulator], make_robot_simulator(model))
+    from bench.core.plugin_registries import make_robot_simulator
+    from bench.logs.recording_summary import format_robot_summary
+
+    kind = cast("type[RobotSimulator]", make_robot_simulator(model))
     effects_by_kind = list_effects_by_place_kind(kind.system)
     return {
         "model": model,
@@ -442,6 +447,8 @@ def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
 
 def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]]:
     """Return the names of effects that can act on a robot, by the kind of their places."""
+    from sims import effects
+
     names_by_kind: dict[str, list[str]] = {}
     for name in effects.list_names():
         effect = effects.get_effect(name)

@@ -8,13 +8,15 @@ soft, so that a joint at rest creeps; effects add stiff friction.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.system import System
-from sims.robot.robot_model import RobotModel
+
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
 
 INTEGRATOR_IDS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
 """Numbers of MuJoCo's integrators (mjtIntegrator), by their names in a model file."""

@@ -114,7 +114,7 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
         The JSON document of the command, and its exit code (0).
     """
     from bench.api.recordings import simulate
-    from bench.cli.shared_options import build_simulation_spec_args
+    from bench.cli.key_value_args import build_simulation_spec_args
     from bench.core.plugin_registries import load_plugins
     from bench.logs.synthetic_recording import SimulationSpec, check_output_path
 
