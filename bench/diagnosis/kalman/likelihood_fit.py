@@ -159,13 +159,16 @@ def compute_likelihood_step(
 
     Args:
         followed: the runs, filtered with the present parameters.
-        bounds: bounds of the parameters that change, by index; they limit the step.
+        bounds: bounds of the parameters that change, by index; they limit the step. A set
+            without effects has none.
 
     Returns:
         The change of all parameters (P,), and the predicted gain in log-likelihood for linear
         innovations.
     """
     indices = list(bounds)
+    if not indices:
+        return np.zeros_like(followed.theta), 0.0
     derivatives, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
     gram, cross = derivatives.T @ derivatives, derivatives.T @ target.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)

@@ -9,6 +9,7 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns, _linearise_run
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
+from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.logs.joined_recordings import load_joined
 
 LOG = Path(__file__).parents[4] / "examples/robot/log.csv"
@@ -75,3 +76,9 @@ def test_parameter_responses_are_differences_of_whole_filters(followed):
         error = np.linalg.norm(responses[..., column] - expected) / np.linalg.norm(expected)
         # A gain also scales the predicted deviations, which are small.
         assert error < (0.02 if names[column].startswith("sensor") else 2e-3), names[column]
+
+
+def test_a_set_without_effects_has_no_step(followed):
+    step, gain = compute_likelihood_step(followed, {})
+    assert not step.any()
+    assert gain == 0.0
