@@ -136,15 +136,17 @@ class PredictionErrorSearch(EffectSearch):
         best = friction
         if not is_explained(context, best):
             best = select_more_likely(best, fit_quick_selection(context, selected))
+        selected_with_shapes = selected
         if self._should_continue(best):
-            selected = select_with_shapes(context, selected)
-            best = select_more_likely(best, fit_quick_selection(context, selected))
+            selected_with_shapes = select_with_shapes(context, selected)
+            best = select_more_likely(best, fit_quick_selection(context, selected_with_shapes))
         if self._should_continue(best):
-            best = self._add_missing_effects(best, selected, friction)
+            with context.columns.without_added_effects():
+                best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
-            best = select_more_likely(best, fit_series_effects(context, selected))
+            best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
         if not best.effects:
-            best = fit_selection(context, selected)
+            best = fit_selection(context, selected_with_shapes)
         return fit_single_in_place(context, best)
 
     def _should_continue(self, best: FittedModel) -> bool:

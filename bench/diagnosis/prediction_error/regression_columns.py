@@ -6,7 +6,8 @@ the model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -64,7 +65,8 @@ class LibraryColumns:
 
     filters: ModelFilters
     _library: Columns | None = None
-    _base_regression: tuple[Columns, Regression] | None = None
+    _initial_library: Columns | None = None
+    _base_regressions: list[tuple[Columns, Regression]] = field(default_factory=list)
     _hats: Columns | None = None
     _regressions: dict[tuple[str, ...], tuple[Array, ModelRegression]] = field(default_factory=dict)
 
@@ -82,9 +84,11 @@ class LibraryColumns:
     def base_regression(self) -> Regression:
         """Regression of the innovations of the base model on the candidates of the library."""
         library = self.library
-        if self._base_regression is None or self._base_regression[0] is not library:
-            self._base_regression = library, regress(self.filters.base, library)
-        return self._base_regression[1]
+        for known, regression in self._base_regressions:
+            if known is library:
+                return regression
+        self._base_regressions.append((library, regress(self.filters.base, library)))
+        return self._base_regressions[-1][1]
 
     @property
     def hats(self) -> Columns:
@@ -98,11 +102,27 @@ class LibraryColumns:
     def take_over(self, other: LibraryColumns) -> None:
         """Reuse the columns of another search of the same runs."""
         self._library, self._hats = other._library, other._hats
-        self._base_regression = other._base_regression
+        self._initial_library, self._base_regressions = (
+            other._initial_library,
+            other._base_regressions,
+        )
 
     def add(self, names: Sequence[str]) -> None:
         """Add effects to the candidates of the library."""
+        self._initial_library = self._initial_library or self.library
         self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
+
+    @contextmanager
+    def without_added_effects(self) -> Iterator[None]:
+        """Leave out the added effects in a context, because they are slow to try."""
+        library = self.library
+        self._library = self._initial_library or library
+        self._regressions.clear()
+        try:
+            yield
+        finally:
+            self._library = library
+            self._regressions.clear()
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return small trial coefficients (probes) of effects; their responses are regressors."""

@@ -365,7 +365,11 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
         context: context of the search.
         selected: the previous selection.
     """
-    evaluator, joints = context.evaluator, np.flatnonzero(selected.followed.missing_forces).tolist()
+    evaluator, missing_forces = context.evaluator, selected.followed.missing_forces
+    # A selection that leaves no force missing but does not explain simulated runs is wrong.
+    if not missing_forces.any():
+        missing_forces = context.filters.base.missing_forces
+    joints = np.flatnonzero(missing_forces).tolist()
     effects_with_shapes = [
         n for n in evaluator.library if has_many_shapes(n) and acts_at_joint(evaluator, n, joints)
     ]

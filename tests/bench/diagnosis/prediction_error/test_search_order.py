@@ -1,0 +1,62 @@
+"""Effects with many shapes are tried before the slow searches."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.explain import explain
+from bench.diagnosis.explain_options import ExplainOptions
+
+ARM = """<mujoco model="arm">
+<option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body>
+  <joint name="hinge" axis="0 1 0" damping="0.1" armature="0.01"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.8"/>
+</body></worldbody>
+<actuator><position name="servo" joint="hinge" kp="20" kv="1"/></actuator>
+</mujoco>"""
+RIPPLE = 0.35
+"""Amplitude of the ripple, N m."""
+PERIOD = 0.4
+"""Period of the ripple, rad."""
+SAMPLES = 300
+
+
+def write_recording(folder):
+    """Record three runs in plain MuJoCo, with a torque that varies with the angle."""
+    (folder / "arm.xml").write_text(ARM)
+    model = mujoco.MjModel.from_xml_string(ARM)
+    rng = np.random.default_rng(3)
+    lines = ["run,t,u.servo,q.hinge"]
+    for run in range(3):
+        data = mujoco.MjData(model)
+        phases = rng.uniform(0.0, 6.0, 2)
+        for sample in range(SAMPLES):
+            t = 0.01 * sample
+            command = 0.9 * np.sin(2.0 * t + phases[0]) + 0.4 * np.sin(5.1 * t + phases[1])
+            if sample == 0:
+                data.qpos[0] = command
+            reading = data.qpos[0] + rng.normal(0.0, 1e-3)
+            lines.append(f"{run},{t:.2f},{command:.8g},{reading:.8g}")
+            data.ctrl[0] = command
+            for _ in range(5):
+                data.qfrc_applied[0] = RIPPLE * np.sin(2.0 * np.pi * data.qpos[0] / PERIOD)
+                mujoco.mj_step(model, data)
+    path = folder / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    (folder / "log.toml").write_text(
+        'model = "arm.xml"\n'
+        '[channels."q.hinge"]\nunit = "rad"\nnoise = 0.001\n'
+        '[inputs."u.servo"]\nunit = "rad"\n'
+    )
+    return path
+
+
+def test_a_ripple_is_found_with_few_simulations(tmp_path):
+    answer = explain([write_recording(tmp_path)], ExplainOptions()).answer
+    (cause,) = answer.causes
+    assert cause.effect == "force.ripple@hinge"
+    numbers = {name: number.value for name, number in cause.coefficients.items()}
+    assert np.hypot(numbers["sine"], numbers["cosine"]) == pytest.approx(RIPPLE, rel=0.03)
+    assert numbers["period"] == pytest.approx(PERIOD, rel=0.01)
+    assert answer.simulations < 400
