@@ -146,8 +146,7 @@ class PredictionErrorSearch(EffectSearch):
             best = select_more_likely(best, fit_quick_selection(context, selected_with_shapes))
             self._check_simple_friction(best)
         if self._should_continue(best):
-            with context.columns.without_added_effects():
-                best = self._add_missing_effects(best, selected, friction)
+            best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
         if not best.effects:

@@ -6,8 +6,7 @@ the model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -65,7 +64,6 @@ class LibraryColumns:
 
     filters: ModelFilters
     _library: Columns | None = None
-    _initial_library: Columns | None = None
     _base_regressions: list[tuple[Columns, Regression]] = field(default_factory=list)
     _hats: Columns | None = None
     _regressions: dict[tuple[str, ...], tuple[Array, ModelRegression]] = field(default_factory=dict)
@@ -102,27 +100,11 @@ class LibraryColumns:
     def take_over(self, other: LibraryColumns) -> None:
         """Reuse the columns of another search of the same runs."""
         self._library, self._hats = other._library, other._hats
-        self._initial_library, self._base_regressions = (
-            other._initial_library,
-            other._base_regressions,
-        )
+        self._base_regressions = other._base_regressions
 
     def add(self, names: Sequence[str]) -> None:
         """Add effects to the candidates of the library."""
-        self._initial_library = self._initial_library or self.library
         self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
-
-    @contextmanager
-    def without_added_effects(self) -> Iterator[None]:
-        """Leave out the added effects in a context, because they are slow to try."""
-        library = self.library
-        self._library = self._initial_library or library
-        self._regressions.clear()
-        try:
-            yield
-        finally:
-            self._library = library
-            self._regressions.clear()
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return small trial coefficients (probes) of effects; their responses are regressors."""
