@@ -221,14 +221,7 @@ def _make_median_chart(
 ) -> ComparisonChart:
     """Make panels of median errors against simulations, for pairs of a metric and a range."""
     statistics, budget = view.statistics, view.experiment.budget
-    ticks = tuple(float(k) for k in select_checkpoints(budget))
-    x_axis = Axis(
-        "simulations used on the target",
-        "symlog",
-        ("symlog", "linear"),
-        ticks,
-        ends=(-0.08, budget * 1.1),
-    )
+    x_axis = _make_simulations_axis(budget)
     frames, panels = [], []
     for metric, kind in keys:
         medians = statistics.compute_median_curves(metric, kind)
@@ -286,18 +279,23 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
     return ComparisonChart(panels, {"distance": table}, "after", _make_notes(view))
 
 
-def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of runtime distributions over all thresholds."""
-    table = view.statistics.runtime_distribution
-    budget = int(table["simulations"].max())
+def _make_simulations_axis(budget: int) -> Axis:
+    """Make the axis of the number of simulations, up to a budget."""
     ticks = tuple(float(k) for k in select_checkpoints(budget))
-    x_axis = Axis(
+    return Axis(
         "simulations used on the target",
         "symlog",
         ("symlog", "linear"),
         ticks,
         ends=(-0.08, budget * 1.1),
     )
+
+
+def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of runtime distributions over all thresholds."""
+    table = view.statistics.runtime_distribution
+    budget = int(table["simulations"].max())
+    x_axis = _make_simulations_axis(budget)
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panels = []
     for kind in dict.fromkeys(table["range"]):

@@ -38,7 +38,7 @@ from bench.diagnosis.fitting.base_fit import (
     fit_wider,
     use_bounds,
 )
-from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, make_soft_kind
@@ -192,6 +192,11 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
     from bench.diagnosis.prediction_error.inactive_drives import remove_inactive_drives
 
     return remove_inactive_drives(recording, kind)
+
+
+def _rate_model(search: EffectSearch, model: FittedModel) -> tuple[float, float]:
+    """Return the penalised log-likelihood and the excess RMS residual of a fitted model."""
+    return model.penalised_log_likelihood, search.compute_excess_residual(model)
 
 
 class _SearchResult(NamedTuple):
@@ -944,10 +949,7 @@ class _ExplainRun:
             return None
         if finding.early_stop is not None or self.search_control.is_over():
             return None
-        merits = (
-            finding.model.penalised_log_likelihood,
-            result.search.compute_excess_residual(finding.model),
-        )
+        merits = _rate_model(result.search, finding.model)
         is_better = is_finer_model_better(
             merits, (options.penalised_log_likelihood, options.residual - 1.0)
         )
@@ -960,11 +962,7 @@ class _ExplainRun:
         file_options = self._rate_options(result.base)
         self._use_options(options, file_options)
         other = self._finish_base_and_search(options.base)
-        other_merits = (
-            other.finding.model.penalised_log_likelihood,
-            other.search.compute_excess_residual(other.finding.model),
-        )
-        if is_finer_model_better(merits, other_merits):
+        if is_finer_model_better(merits, _rate_model(other.search, other.finding.model)):
             return other
         self._restore_evaluators(evaluators, before)
         self.changed_options = None
@@ -1118,10 +1116,7 @@ class _ExplainRun:
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
-        present_merit = (
-            finding.model.penalised_log_likelihood,
-            search.compute_excess_residual(finding.model),
-        )
+        present_merit = _rate_model(search, finding.model)
         present_evaluators = RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
@@ -1179,7 +1174,7 @@ class _ExplainRun:
             (models.add_fit(subset_fit) for subset_fit in fits),
             key=lambda model: model.penalised_log_likelihood,
         )
-        return best.penalised_log_likelihood, models.compute_excess_residual(best)
+        return _rate_model(models, best)
 
     def _get_nearby_starts(self, base: BaseFit) -> Array | None:
         """Return starting values for a fit with another step; None for the default starts.

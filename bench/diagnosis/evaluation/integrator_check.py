@@ -12,6 +12,7 @@ no scheme qualifies, the first-order error of an implicit scheme is extrapolated
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,7 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     """
     kind = evaluator.kind
     assert issubclass(kind, RobotSimulator)
-    motions = _ReferenceMotions(evaluator, noise, kind)
+    motions = _ReferenceMotions(evaluator, noise)
     model_settings = kind.numerics
     reference = motions.reference(model_settings)
     if reference is None:
@@ -126,13 +127,37 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
         yield model_settings._replace(timestep=step / parts, integrator=name)
 
 
+def simulate_with_settings(
+    evaluator: RunEvaluator, numerics: IntegratorSettings, theta: Array, initial_states: Array
+) -> Array:
+    """Simulate the first runs of a robot with other settings, without effects.
+
+    Args:
+        evaluator: the runs.
+        numerics: settings of the integrator and the solver.
+        theta: (P,) parameters.
+        initial_states: (R, s) initial states of the first R runs.
+
+    Returns:
+        Readings (R, T, C), NaN after the end of a run.
+    """
+    kind = evaluator.kind
+    assert issubclass(kind, RobotSimulator)
+    count = len(initial_states)
+    parameters = np.tile(theta[: evaluator.system_parameter_count], (count, 1))
+    states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
+    scenarios = [run.scenario for run in evaluator.prepared_runs[:count]]
+    evaluator.simulation_count += count
+    other_kind = kind.with_integrator_settings(numerics)
+    with closing(other_kind(evaluator.recording.constants, evaluator.channels)) as simulator:
+        return simulator.simulate_batch(parameters, scenarios, states)
+
+
 class _ReferenceMotions:
     """Motions of the first runs with any step and integrator, each simulated once."""
 
-    def __init__(
-        self, evaluator: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]
-    ) -> None:
-        self._evaluator, self._kind, self._noise = evaluator, kind, noise
+    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
+        self._evaluator, self._noise = evaluator, noise
         self._checked_runs = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
         self._motions: dict[IntegratorSettings, Array] = {}
 
@@ -148,18 +173,8 @@ class _ReferenceMotions:
         No effects are active. The result is (R, T, C).
         """
         evaluator = self._evaluator
-        kind = self._kind.with_integrator_settings(numerics)
-        simulator = kind(evaluator.recording.constants, evaluator.channels)
-        count = len(self._checked_runs)
-        theta = np.tile(
-            evaluator.get_nominal_theta()[: evaluator.system_parameter_count], (count, 1)
-        )
-        states = dict(
-            zip(evaluator.state_names, evaluator.initial_state_guesses[:count].T, strict=True)
-        )
-        scenarios = [track.scenario for track in self._checked_runs]
-        evaluator.simulation_count += count
-        return simulator.simulate_batch(theta, scenarios, states)
+        states = evaluator.initial_state_guesses[: len(self._checked_runs)]
+        return simulate_with_settings(evaluator, numerics, evaluator.get_nominal_theta(), states)
 
     def reference(self, model_settings: IntegratorSettings) -> Array | None:
         """Return the converged motion of the robot (R, T, C); None if no integrator converges.

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.integrator_check import simulate_with_settings
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.simulator import Array
@@ -71,15 +72,7 @@ def rank_option_alternatives(
 
     def simulate(numerics: IntegratorSettings) -> Array:
         """Return the simulated readings in units of the noise, zero where none is recorded."""
-        other = kind.with_integrator_settings(numerics)
-        simulator = other(evaluator.recording.constants, evaluator.channels)
-        count = len(evaluator.prepared_runs)
-        rows = np.tile(theta[: evaluator.system_parameter_count], (count, 1))
-        states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
-        scenarios = [run.scenario for run in evaluator.prepared_runs]
-        evaluator.simulation_count += count
-        motion = simulator.simulate_batch(rows, scenarios, states)
-        simulator.close()
+        motion = simulate_with_settings(evaluator, numerics, theta, initial_states)
         return np.where(is_recorded, motion, 0.0) / noise.sigma
 
     observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma

@@ -29,10 +29,12 @@ from bench.diagnosis.prediction_error.effect_proposals import (
     SearchContext,
 )
 from bench.diagnosis.prediction_error.filters_with_effects import (
+    COMPETING_MODEL_MARGIN,
     GAUSS_NEWTON_STEPS,
     JOINT_MODEL,
     SERVO_MODEL,
     FilteredSet,
+    compute_comparison_margin,
     has_series,
     list_at_coupled_joints,
     list_joint_model_effects,
@@ -62,10 +64,6 @@ MAX_FIRST_EFFECTS = 2
 """Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
-COMPETING_MODEL_MARGIN = 20.0
-"""Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
-LINEARISATION_ERROR = 0.03
-"""Maximum relative error of a gain that is computed from linear responses."""
 
 
 def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
@@ -224,8 +222,8 @@ def _select_nearly_as_likely(
     """
     if not larger_sets:
         return ()
-    error = LINEARISATION_ERROR * context.filters.compute_gain(larger_sets[0].followed)
-    limit = _compute_criterion(context, larger_sets[0]) + COMPETING_MODEL_MARGIN + error
+    gain = context.filters.compute_gain(larger_sets[0].followed)
+    limit = _compute_criterion(context, larger_sets[0]) + compute_comparison_margin(gain)
     near_sets = [
         larger_set for larger_set in larger_sets if _compute_criterion(context, larger_set) <= limit
     ]
@@ -368,10 +366,7 @@ def _find_competing_effects(
         effect, loss = group.effect, own_gain - float(gains[i])
         if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
             continue
-        is_near = (
-            loss <= COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * own_gain
-            and near_count < MAX_COMPETING_EFFECTS
-        )
+        is_near = loss <= compute_comparison_margin(own_gain) and near_count < MAX_COMPETING_EFFECTS
         # Regression is inaccurate for a large effect, so effects at the same joint are tried.
         is_promising = effect in same_joint and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.

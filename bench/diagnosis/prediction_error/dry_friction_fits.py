@@ -16,6 +16,7 @@ from bench.diagnosis.friction_form_verdict import (
     replace_by_stateless_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
+from bench.diagnosis.prediction_error.filters_with_effects import compute_comparison_margin
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     drop_surplus_effects,
@@ -153,6 +154,29 @@ def check_filter(
     soft_log_likelihood = context.filters.log_likelihood(soft_start.theta, is_soft=True)
     if soft_log_likelihood > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
         raise SoftFrictionError(soft_start, is_preliminary)
+
+
+def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
+    """Raise `SoftFrictionError` if soft dry friction may explain the runs as a richer law does.
+
+    A law with several coefficients in the stiff form may imitate the soft form, which has one.
+    Filters are linear, so simulation decides if soft friction is nearly as likely.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+
+    Raises:
+        SoftFrictionError: soft friction is nearly as likely.
+    """
+    filters = context.filters
+    if filters.is_soft or not has_dry_friction(context.evaluator, model.effects):
+        return
+    count = sum(len(context.evaluator.get_coefficient_indices(name)) for name in model.effects)
+    followed = filters.get_filter(model)
+    margin = compute_comparison_margin(filters.compute_gain(followed))
+    margin += (count - 1) * context.search.parameter_penalty
+    check_filter(context, followed.log_likelihood - 0.5 * margin)
 
 
 def check_fit(context: SearchContext, model: FittedModel) -> None:

@@ -178,6 +178,24 @@ SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
 """Friction forces tried for dry friction in the soft form, as multiples of the missing force."""
 
 
+COMPETING_MODEL_MARGIN = 20.0
+"""Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
+LINEARISATION_ERROR = 0.03
+"""Maximum relative error of a gain that is computed from linear responses."""
+
+
+def compute_comparison_margin(gain: float) -> float:
+    """Return the maximum distance from a set at which simulation decides between two sets.
+
+    Args:
+        gain: gain of the set over the base model.
+
+    Returns:
+        The distance, like the gain, in twice the log-likelihood.
+    """
+    return COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * gain
+
+
 class FilteredSet(NamedTuple):
     """A set of effects in the model of a filter.
 

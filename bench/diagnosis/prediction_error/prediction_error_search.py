@@ -33,10 +33,7 @@ import numpy as np
 
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
-from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.competing_models import (
-    COMPETING_MODEL_MARGIN,
-    LINEARISATION_ERROR,
     add_to_dry_friction,
     add_to_model,
     fit_competing_models,
@@ -44,9 +41,9 @@ from bench.diagnosis.prediction_error.competing_models import (
     select_in_model,
 )
 from bench.diagnosis.prediction_error.dry_friction_fits import (
-    check_filter,
     check_fit,
     check_selection,
+    check_simple_friction,
     fit_dry_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
@@ -144,7 +141,7 @@ class PredictionErrorSearch(EffectSearch):
         if self._should_continue(best):
             selected_with_shapes = select_with_shapes(context, selected)
             best = select_more_likely(best, fit_quick_selection(context, selected_with_shapes))
-            self._check_simple_friction(best)
+            check_simple_friction(context, best)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
@@ -152,28 +149,6 @@ class PredictionErrorSearch(EffectSearch):
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
         return fit_single_in_place(context, best)
-
-    def _check_simple_friction(self, best: FittedModel) -> None:
-        """Compare a model of dry friction with soft dry friction, which has one coefficient.
-
-        A law with many shapes in the stiff form may imitate the soft form.
-
-        Args:
-            best: the best model so far.
-
-        Raises:
-            SoftFrictionError: soft friction is nearly as likely in a filter, so simulation decides.
-        """
-        context = self._search_context
-        if not has_dry_friction(self.evaluator, best.effects) or context.filters.is_soft:
-            return
-        indices = [i for name in best.effects for i in self.evaluator.get_coefficient_indices(name)]
-        surplus = (len(indices) - 1) * self.parameter_penalty
-        followed = context.filters.get_filter(best)
-        margin = COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * context.filters.compute_gain(
-            followed
-        )
-        check_filter(context, followed.log_likelihood - 0.5 * (margin + surplus))
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

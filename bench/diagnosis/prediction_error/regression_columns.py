@@ -64,7 +64,7 @@ class LibraryColumns:
 
     filters: ModelFilters
     _library: Columns | None = None
-    _base_regressions: list[tuple[Columns, Regression]] = field(default_factory=list)
+    _base_regression: tuple[Columns, Regression] | None = None
     _hats: Columns | None = None
     _regressions: dict[tuple[str, ...], tuple[Array, ModelRegression]] = field(default_factory=dict)
 
@@ -82,11 +82,9 @@ class LibraryColumns:
     def base_regression(self) -> Regression:
         """Regression of the innovations of the base model on the candidates of the library."""
         library = self.library
-        for known, regression in self._base_regressions:
-            if known is library:
-                return regression
-        self._base_regressions.append((library, regress(self.filters.base, library)))
-        return self._base_regressions[-1][1]
+        if self._base_regression is None or self._base_regression[0] is not library:
+            self._base_regression = library, regress(self.filters.base, library)
+        return self._base_regression[1]
 
     @property
     def hats(self) -> Columns:
@@ -100,7 +98,7 @@ class LibraryColumns:
     def take_over(self, other: LibraryColumns) -> None:
         """Reuse the columns of another search of the same runs."""
         self._library, self._hats = other._library, other._hats
-        self._base_regressions = other._base_regressions
+        self._base_regression = other._base_regression
 
     def add(self, names: Sequence[str]) -> None:
         """Add effects to the candidates of the library."""

@@ -126,8 +126,7 @@ def _fit_about_its_first_states(
     """Estimate the initial states with an effect, and scan and fit its coefficient about them."""
     _move_to_first_states_of(search, evaluators, _add_effect(search, value))
     states = search.evaluator.initial_state_guesses
-    for width in widths:
-        value = _scan(search, value, width, states)
+    value = _scan_in_turn(search, value, states, widths)
     model = search.fit_one(FitStart((value.name,), _add_effect(search, value), states))
     index = search.evaluator.coefficient_slices[value.name].start
     return model, value._replace(coefficient=float(model.fit.theta[index]))
@@ -254,11 +253,7 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
         The best value of each effect that explains a part of the discrepancy, the best effect
         first.
     """
-    found = []
-    for value in _list_effects_at_contacts(search):
-        for width in SCAN_WIDTHS:
-            value = _scan(search, value, width, base.fit.initial_states)
-        found.append(value)
+    found = _scan_effects_at_contacts(search, base.fit.initial_states)
     if not found:
         return []
     unchanged = _scan(search, found[0]._replace(coefficient=0.0), 0.0, base.fit.initial_states)
@@ -271,12 +266,23 @@ def find_lowest_scan(search: EffectSearch) -> float:
 
     The initial states are those that were estimated with the present model.
     """
-    states, lowest = search.evaluator.initial_state_guesses, np.inf
-    for value in _list_effects_at_contacts(search):
-        for width in SCAN_WIDTHS:
-            value = _scan(search, value, width, states)
-        lowest = min(lowest, value.squares)
-    return lowest
+    found = _scan_effects_at_contacts(search, search.evaluator.initial_state_guesses)
+    return min((value.squares for value in found), default=np.inf)
+
+
+def _scan_effects_at_contacts(search: EffectSearch, states: Array) -> list[_ScannedValue]:
+    """Return the best value of each effect at a contact over its range, from initial states."""
+    values = _list_effects_at_contacts(search)
+    return [_scan_in_turn(search, value, states, SCAN_WIDTHS) for value in values]
+
+
+def _scan_in_turn(
+    search: EffectSearch, value: _ScannedValue, states: Array, widths: Sequence[float]
+) -> _ScannedValue:
+    """Return the best value of scans with these widths, each about the best value of the last."""
+    for width in widths:
+        value = _scan(search, value, width, states)
+    return value
 
 
 def _list_nearby_values(

@@ -170,22 +170,19 @@ class LinearisationPoints:
         return bool((self._drives < 0).any())
 
     @property
-    def has_joints_only(self) -> bool:
-        """True if the state consists of positions and velocities of joints alone.
+    def steps_joints_by_runge_kutta(self) -> bool:
+        """True if the integrator is the classical Runge-Kutta method, for joints alone.
 
-        It has no activations, no hidden states of effects, and no floating or unlisted bodies.
+        The state then consists of the positions and velocities of joints. It has no activations, no
+        hidden states of effects, and no floating or unlisted bodies.
         """
         return (
-            not self.motion.act.shape[1]
+            forces_are_at_step_end(self._mujoco_batch.model)
+            and not self.motion.act.shape[1]
             and not self.hidden_state_effects
             and not self._floating
             and self._mujoco_batch.model.nv == self.motion.x.shape[1]
         )
-
-    @property
-    def uses_runge_kutta(self) -> bool:
-        """True if the integrator is the classical Runge-Kutta method."""
-        return forces_are_at_step_end(self._mujoco_batch.model)
 
     def step_displaced(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects, steps: int = 1

@@ -13,19 +13,19 @@ motion by
     dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t                                     (2)
 
 with the change da_t of the acceleration at the same state by the changed parameters, and the
-inertia matrix M_t. For the classical Runge-Kutta method with step h, whose step evaluates the
-dynamics four times, the quotients are those of the acceleration a(q, v, f, u) alone. With
+inertia matrix M_t (the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear
+Oscillations, 1983, section 1.3). Effect forces are evaluated along the motion, for all times at
+once. Changes of readings follow in the same way, with separate quotients.
+
+A step of the classical Runge-Kutta method with length h evaluates the dynamics four times. Its
+quotients follow from those of the acceleration a(q, v, f, u). With
 
     K = [[0, I], [da/dq, da/dv]],   L = [[0], [da/df]]
 
-held within a step, the method gives (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary
-Differential Equations I, 1993, section IV.2 of volume II for the polynomial)
+held within a step, and the stability function of the method (E. Hairer, G. Wanner, Solving Ordinary
+Differential Equations II, 1996, section IV.2, doi:10.1007/978-3-642-05221-7),
 
     A = I + P K,   B = P L,   P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24                 (3)
-
-(the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear Oscillations, 1983,
-section 1.3). Effect forces are evaluated along the motion, for all times at once. Changes of
-readings follow in the same way, with separate quotients.
 """
 
 from __future__ import annotations
@@ -143,12 +143,9 @@ class TangentModel:
 
     @property
     def _base_readings(self) -> Array:
-        return (self._base_accelerations if self._differs_accelerations else self._base_step)[1]
-
-    @property
-    def _differs_accelerations(self) -> bool:
-        """True if the quotients are those of accelerations, by (3)."""
-        return self._at.uses_runge_kutta and self._at.has_joints_only
+        return (
+            self._base_accelerations if self._at.steps_joints_by_runge_kutta else self._base_step
+        )[1]
 
     @cached_property
     def _base_accelerations(self) -> tuple[Array, Array]:
@@ -198,7 +195,7 @@ class TangentModel:
             ],
             "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
-        if self._differs_accelerations:
+        if self._at.steps_joints_by_runge_kutta:
             displaced = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
             base, base_readings = displaced()
         else:
@@ -214,7 +211,7 @@ class TangentModel:
                 readings[:, :, column] = (read - base_readings) / difference
             quotients.append((changes, readings))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
-        if self._differs_accelerations:
+        if self._at.steps_joints_by_runge_kutta:
             by_state, by_force, by_control = compute_runge_kutta_step(
                 by_state, by_force, by_control, self._motion.step
             )
