@@ -41,8 +41,8 @@ def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> Da
         before: (R, T, C) simulated by the base model.
         after: (R, T, C) simulated by the extended model.
     """
-    names = tuple(track.name for track in evaluator.prepared_runs)
-    times = tuple(track.scenario.times for track in evaluator.prepared_runs)
+    names = tuple(run_data.name for run_data in evaluator.prepared_runs)
+    times = tuple(run_data.scenario.times for run_data in evaluator.prepared_runs)
     return DataSplit(names, times, evaluator.observed, before, after)
 
 
@@ -85,10 +85,10 @@ def _list_parts(
     observed_mask = np.isfinite(evaluator.observed)
     runs, _, channels = observed_mask.shape
     parts: list[tuple[str, str, Mask]] = []
-    for r, track in enumerate(evaluator.prepared_runs):
+    for r, run_data in enumerate(evaluator.prepared_runs):
         is_run = np.arange(runs) == r
         mask = observed_mask & is_run[:, None, None]
-        parts.append(("run", track.name + mark, mask))
+        parts.append(("run", run_data.name + mark, mask))
     for c, name in enumerate(evaluator.channels):
         is_channel = np.arange(channels) == c
         parts.append(("channel", name, observed_mask & is_channel))
@@ -145,11 +145,11 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     ]
     for name in recorded_coordinates:
         values = simulated[:, :, evaluator.channels.index(name)]
-        for r, track in enumerate(evaluator.prepared_runs):
-            size = len(track.observed)
+        for r, run_data in enumerate(evaluator.prepared_runs):
+            size = len(run_data.observed)
             # A single sample has no slope.
             if size > 1:
-                slope = np.gradient(values[r, :size], track.scenario.times)
+                slope = np.gradient(values[r, :size], run_data.scenario.times)
                 squares[r, :size] += np.square(slope)
     return np.sqrt(np.nan_to_num(squares)) if recorded_coordinates else None
 
@@ -190,8 +190,8 @@ def _find_saturation(evaluator: RunEvaluator) -> Mask:
     It is empty for an input that is there most of the time, such as a square wave.
     """
     mask = np.zeros(evaluator.observed.shape[:2], dtype=bool)
-    for r, track in enumerate(evaluator.prepared_runs):
-        for signal in list(track.scenario.inputs.values())[:1]:
+    for r, run_data in enumerate(evaluator.prepared_runs):
+        for signal in list(run_data.scenario.inputs.values())[:1]:
             size = np.abs(signal)
             largest = max(float(size.max()), 1e-300)
             mask[r, : signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
@@ -299,8 +299,8 @@ def _iterate_variables(
 def _compute_run_times(evaluator: RunEvaluator) -> Array:
     """Return the time (R, T) in seconds since the start of each run, whatever its clock."""
     times = np.full(evaluator.observed.shape[:2], np.nan)
-    for r, track in enumerate(evaluator.prepared_runs):
-        times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
+    for r, run_data in enumerate(evaluator.prepared_runs):
+        times[r, : len(run_data.observed)] = run_data.scenario.times - run_data.scenario.times[0]
     return times
 
 
@@ -310,10 +310,10 @@ def _iterate_inputs(
     """Yield name, unit and values (R, T) of the recorded inputs with these names."""
     for channel in evaluator.kind.inputs:
         values = np.full(evaluator.observed.shape[:2], np.nan)
-        for r, track in enumerate(evaluator.prepared_runs):
-            signal = track.scenario.inputs.get(channel.name)
+        for r, run_data in enumerate(evaluator.prepared_runs):
+            signal = run_data.scenario.inputs.get(channel.name)
             if signal is not None and channel.name in names:
-                values[r, : len(track.observed)] = signal
+                values[r, : len(run_data.observed)] = signal
         if np.isfinite(values).any():
             yield channel.name, channel.unit, values
 
@@ -338,10 +338,10 @@ def _iterate_joint_variables(
         values = simulated[:, :, evaluator.channels.index(position)]
         yield f"position of {joint.name}", unit, values
         slopes = np.full_like(values, np.nan)
-        for r, track in enumerate(evaluator.prepared_runs):
-            size = len(track.observed)
+        for r, run_data in enumerate(evaluator.prepared_runs):
+            size = len(run_data.observed)
             if size > 1:
-                slopes[r, :size] = np.gradient(values[r, :size], track.scenario.times)
+                slopes[r, :size] = np.gradient(values[r, :size], run_data.scenario.times)
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
     elif rate in evaluator.channels:
         values = simulated[:, :, evaluator.channels.index(rate)]

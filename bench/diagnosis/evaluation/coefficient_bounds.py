@@ -134,7 +134,12 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
 def _restrict_to_physical(
     bounds: tuple[float, float], coefficient: Coefficient
 ) -> tuple[float, float]:
-    """Return a range restricted to the physical limits of a coefficient."""
+    """Return a range restricted to the physical limits of a coefficient.
+
+    Args:
+        bounds: lower and upper end of the range.
+        coefficient: coefficient of an effect, with its smallest and largest physical value.
+    """
     low, high = bounds
     if coefficient.least is not None:
         low = max(low, coefficient.least)
@@ -150,6 +155,12 @@ def _compute_fit_bounds(
 
     It is the plausible range, widened by a factor; times and frequencies are adapted to the length
     of the runs, because the data cannot show slower changes.
+
+    Args:
+        parameter: the coefficient as a parameter, with its unit and plausible range.
+        coefficient: its declaration by the effect.
+        effect: the effect.
+        evaluator: the runs, whose durations limit times and frequencies.
     """
     low, high = parameter.bounds
     longest_run = evaluator.longest_duration

@@ -273,7 +273,13 @@ class ForkedWorkerPool:
             raise error from _WorkerTracebackError(trace)
 
     def _wait_for_replies(self, pipes: list[Connection], evaluator: SharedState) -> list[Any]:
-        """Wait for replies and return their pipes; tell workers to stop if the search must end."""
+        """Wait for replies and return their pipes; tell workers to stop if the search must end.
+
+        Args:
+            pipes: pipes to the workers that have a task.
+            evaluator: the state on which the tasks work; its search control says when the search
+                must end.
+        """
         while True:
             ready_pipes = connection.wait(pipes, POLL_INTERVAL_SECONDS)
             if self._stop_flag is not None and evaluator.search_control.should_stop():
@@ -326,7 +332,12 @@ class _Pickler(pickle.Pickler):
 
 
 def _restore_axes(values: Array, order: Array) -> Array:
-    """Restore the order of axes that an array had before it was sent."""
+    """Restore the order of axes that an array had before it was sent.
+
+    Args:
+        values: the array, with its axes sorted by memory order.
+        order: for each original axis, its place in `values`.
+    """
     return values.transpose(order)
 
 

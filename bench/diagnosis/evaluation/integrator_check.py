@@ -211,8 +211,12 @@ class _ReferenceMotions:
         """Return the RMS difference in units of the noise; infinite if a simulation fails.
 
         Only available samples of the recording are compared.
+
+        Args:
+            first: (R, T, C) simulated channels of the checked runs.
+            second: (R, T, C) the same channels, simulated with other settings.
         """
-        observed_masks = [np.isfinite(track.observed) for track in self._checked_runs]
+        observed_masks = [np.isfinite(run_data.observed) for run_data in self._checked_runs]
         squares = []
         for run, observed_mask in enumerate(observed_masks):
             samples = slice(len(observed_mask))

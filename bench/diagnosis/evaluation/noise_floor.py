@@ -145,7 +145,12 @@ def add_minimal_noise(recording: Recording, channels: Sequence[str]) -> tuple[Re
 
 
 def _compute_added_noise(recording: Recording, name: str) -> float:
-    """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
+    """Return the standard deviation of the noise to add; 0 for noisy or constant channels.
+
+    Args:
+        recording: the recording.
+        name: name of the channel.
+    """
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
     min_sigma = INTEGRATION_ERROR_SHARE * compute_value_range(values)

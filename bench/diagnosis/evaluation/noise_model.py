@@ -108,7 +108,12 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
 
 
 def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:
-    """Return half the log-determinant of whitening at unit variance: -m/2 log(1 - φ²)."""
+    """Return half the log-determinant of whitening at unit variance: -m/2 log(1 - φ²).
+
+    Args:
+        observed_mask: (R, T, C) whether a sample is recorded.
+        phi: (C,) AR(1) correlation of each channel, or one for all.
+    """
     predecessor_counts = _has_predecessor(observed_mask).sum(axis=(0, 1))
     logarithms = np.log1p(-np.square(phi))
     return float(-0.5 * (predecessor_counts * logarithms).sum())
@@ -198,6 +203,10 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     """Return AR(1) correlations to try for a channel, near the residual's sample correlation.
 
     Zero (white noise) is always included.
+
+    Args:
+        residual: (R, T) residual of the channel.
+        observed_mask: (R, T) whether a sample is recorded.
     """
     has_predecessor = _has_predecessor(observed_mask)
     previous_samples = residual[:, :-1][has_predecessor]

@@ -107,6 +107,10 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
     """Return a guess of each initial state, from which fits start, by name.
 
     It is the specified value, or an estimate from the first samples, or the default.
+
+    Args:
+        run: the recorded run.
+        simulator: simulator with the default initial states.
     """
     system = simulator.system
     values = dict(simulator.states)
@@ -132,6 +136,10 @@ def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
     """Return a start height in metres from which the ball does not land during the run.
 
     If the height is not recorded, impacts cannot be identified.
+
+    Args:
+        run: the run; its constant ``gravity`` (m/s²) replaces that of the simulator.
+        simulator: simulator of the ball.
     """
     constant = simulator.constant_values.get("gravity", 9.81)
     gravity = float(run.constants.get("gravity", constant))

@@ -241,24 +241,24 @@ class RunEvaluator:
         """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
         shape = len(self.prepared_runs), self.lengths.max(), len(self.channels)
         observed = np.full(shape, np.nan)
-        for row, track in zip(observed, self.prepared_runs, strict=True):
-            row[: len(track.observed)] = track.observed
+        for row, run_data in zip(observed, self.prepared_runs, strict=True):
+            row[: len(run_data.observed)] = run_data.observed
         return observed
 
     def _get_longest_duration(self) -> float:
         """Return the duration of the longest run, in seconds."""
         # A duration of zero is replaced, because times are divided by it.
-        return max(track.duration for track in self.prepared_runs) or 1.0
+        return max(run_data.duration for run_data in self.prepared_runs) or 1.0
 
     def _get_time_span(self) -> tuple[float, float]:
         """Return the first and the last time stamp of all runs."""
-        stamps = [track.scenario.times for track in self.prepared_runs]
+        stamps = [run_data.scenario.times for run_data in self.prepared_runs]
         return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
 
     @property
     def sample_interval(self) -> float:
         """Median sample interval of the run sampled most often, in seconds; 0 if unknown."""
-        gaps = [np.diff(track.scenario.times) for track in self.prepared_runs]
+        gaps = [np.diff(run_data.scenario.times) for run_data in self.prepared_runs]
         return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
 
     def get_effect_travel(self, effect: str) -> float:
@@ -412,10 +412,18 @@ class RunEvaluator:
         return result
 
     def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
-        """Simulate a batch in several engine calls, without cache and discretisation correction.
+        """Simulate B batch elements in several engine calls, without cache and step correction.
 
-        Elements of different kinds are simulated separately, and large batches are split. Arguments
-        and result are those of `simulate`.
+        Elements of different kinds are simulated separately, and large batches are split.
+
+        Args:
+            theta: (B, P) parameters of each element.
+            runs: (B,) index of the run that each element simulates.
+            states: (B, s) initial states.
+            share: initial share of the runs that is simulated, from 0 to 1.
+
+        Returns:
+            Simulated channels (B, T, C); NaN after the simulated share.
         """
         self.simulation_count += len(theta)
         _, length, channels = self.observed.shape
@@ -601,7 +609,12 @@ class RunEvaluator:
         return result
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
-        """Return a scenario with the freed constants set from parameters (P,)."""
+        """Return a scenario whose freed constants, those that a fit estimates, have fitted values.
+
+        Args:
+            scenario: input of the simulator.
+            theta: (P,) parameters; the freed constants follow the parameters of the system.
+        """
         if not self.freed_constants:
             return scenario
         values = theta[self.system_parameter_count : self.base_indices.size].tolist()
@@ -681,7 +694,12 @@ def _is_effect_observable(effect: type[Effect], recorded_signals: set[str]) -> b
 
 
 def _simulate_engine_call(evaluator: RunEvaluator, *call: Any) -> Array:
-    """Simulate one engine call; a module-level function, so that workers can run it."""
+    """Simulate one engine call; a module-level function, so that workers can run it.
+
+    Args:
+        evaluator: the runs.
+        *call: arguments of `RunEvaluator.simulate_batch`.
+    """
     return evaluator.simulate_batch(*call)
 
 
@@ -715,7 +733,12 @@ def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Reco
 
 
 def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, slice]:
-    """Return the slice of theta of each effect, starting at index `first`."""
+    """Return the slice of theta of each effect, starting at index `first`.
+
+    Args:
+        simulator: simulator with all available effects.
+        first: number of base parameters, which precede the coefficients.
+    """
     slices = {}
     # Use the order of the simulator, which is the order of its parameters.
     for effect in simulator.effects:

@@ -78,7 +78,16 @@ def _take_every_nth(run: Run, factor: int) -> Run:
 
 
 def _average_input(times: Array, values: Array, first: Indices) -> Array:
-    """Return the mean of an input between kept samples; the value itself after the last one."""
+    """Return the mean (K,) of an input over the samples from each kept sample to the next one.
+
+    Args:
+        times: (T,) sample times in seconds.
+        values: (T,) input, held from each sample to the next one.
+        first: (K,) indices of the kept samples.
+
+    Returns:
+        Means, weighted by duration; after the last kept sample, the mean of the rest of the run.
+    """
     durations = np.diff(times, append=times[-1])
     # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
     durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
@@ -87,7 +96,15 @@ def _average_input(times: Array, values: Array, first: Indices) -> Array:
 
 
 def _keeps_samples(thinned_run: Run, run: Run, factor: int) -> bool:
-    """Return whether every channel keeps about its expected number of samples."""
+    """Return whether every channel keeps about its expected number of recorded samples.
+
+    A channel that is recorded at a lower rate than the others could lose nearly all its samples.
+
+    Args:
+        thinned_run: the run after subsampling.
+        run: the run before.
+        factor: every `factor`-th sample was kept.
+    """
     for name, values in run.channels.items():
         sample_count = int(np.isfinite(values).sum())
         thinned_count = int(np.isfinite(thinned_run.channels[name]).sum())

@@ -170,7 +170,16 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
 
 
 def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> Array:
-    """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
+    """Fit an autoregression by the Yule-Walker equations, with the order of Akaike's criterion.
+
+    Args:
+        values: (R, T) residual of one channel.
+        observed_mask: (R, T) whether a sample is recorded.
+        max_order: maximum number of weights.
+
+    Returns:
+        Weights a_k (p,) of eq. (1); empty if fewer than `MIN_INNOVATIONS` innovations are complete.
+    """
     filled = np.where(observed_mask, values, 0.0)
     covariances = _estimate_autocovariances(
         filled, observed_mask, min(max_order, observed_mask.shape[1] - 1)
@@ -184,7 +193,13 @@ def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> A
 
 
 def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
-    """Return the innovations (n,) minus their mean; the samples themselves if there are too few."""
+    """Return the innovations (n,) minus their mean; the samples themselves if there are too few.
+
+    Args:
+        filled: (R, T) residual of one channel, zero where it is not recorded.
+        observed_mask: (R, T) whether a sample is recorded.
+        weights: (p,) weights of the autoregression.
+    """
     innovations = _compute_innovations(filled, observed_mask, weights)
     if innovations.size < MIN_INNOVATIONS:
         return filled[observed_mask] if observed_mask.any() else np.zeros(1)
@@ -210,7 +225,12 @@ def _estimate_autocovariances(filled: Array, observed_mask: Mask, max_order: int
 
 
 def _select_order_by_aic(covariances: Array, count: int) -> Array:
-    """Return weights (p,) of the order p with the lowest n log var u + 2 p (H. Akaike, 1974)."""
+    """Return weights (p,) of the order p with the lowest n log var u + 2 p (H. Akaike, 1974).
+
+    Args:
+        covariances: (q + 1,) autocovariances at lags 0 to q, the maximum order.
+        count: number n of recorded samples.
+    """
     best = np.inf
     weights = np.zeros(0)
     for order in range(len(covariances)):
@@ -226,6 +246,11 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
 
     Times at which one of the required samples is missing are left out.
+
+    Args:
+        filled: (R, T) residual of one channel, zero where it is not recorded.
+        observed_mask: (R, T) whether a sample is recorded.
+        weights: (p,) weights of the autoregression.
     """
     order, length = weights.size, observed_mask.shape[1]
     predicted = np.zeros(1)
@@ -248,6 +273,10 @@ def _solve_yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
 
     The variance is infinite if the autoregression is not stationary, so that this order is not
     selected.
+
+    Args:
+        covariances: (q + 1,) autocovariances γ at lags 0 to q.
+        order: order p of the autoregression, at most q.
     """
     power = covariances[0]
     # Order zero is white noise; without power there is no signal.

@@ -215,7 +215,7 @@ class RigModel:
         self.step = float(np.median(np.diff(self.recorded_scenario.times)))
         self.largest_commands, self.median_commands = {}, {}
         for name in self.recorded_scenario.inputs:
-            signals = [track.scenario.inputs[name] for track in evaluator.prepared_runs]
+            signals = [run_data.scenario.inputs[name] for run_data in evaluator.prepared_runs]
             middle = float(np.median(np.concatenate(signals)))
             self.largest_commands[name] = max(
                 float(np.abs(values - middle).max()) for values in signals

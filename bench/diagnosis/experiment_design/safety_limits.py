@@ -57,7 +57,7 @@ class RigLimits:
         self.evaluator = evaluator
         self.past = self._simulate_monitored_channels(
             model,
-            [track.scenario for track in evaluator.prepared_runs],
+            [run_data.scenario for run_data in evaluator.prepared_runs],
             np.where(
                 np.isfinite(model.fit.initial_states),
                 model.fit.initial_states,

@@ -172,8 +172,10 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
 def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
 
-    They have the base parameters `initial_base` (b,), or the nominal ones and a regular grid over
-    the bounds.
+    Args:
+        evaluator: the runs, with the nominal parameters and their bounds.
+        initial_base: (b,) base parameters to start from; None for the nominal ones and a regular
+            grid over the bounds.
     """
     nominal = evaluator.get_nominal_theta()
     if initial_base is not None:
@@ -196,6 +198,10 @@ def _interpolate_bounds(parameter: Parameter, share: float) -> float:
     """Return the value at a share (0 to 1) of the way from the lower to the upper bound.
 
     Over a wide positive range, equal steps of the share multiply the value by equal factors.
+
+    Args:
+        parameter: parameter with lower and upper bound.
+        share: position between the bounds, from 0 to 1.
     """
     low, high = parameter.bounds
     if low > 0 and high / low > LOG_SCALE_RATIO:
@@ -258,7 +264,13 @@ def _is_sensitive(
     """Return whether the simulated runs depend on a parameter enough to estimate it.
 
     The test is the norm of the change of all samples, in units of the noise, if the parameter moves
-    over its whole range. `index` is the index of the parameter in theta.
+    over its whole range.
+
+    Args:
+        evaluator: the runs.
+        fit: fit of the base model, whose derivatives are used.
+        index: index of the parameter in theta.
+        noise: noise of each channel.
     """
     # A fixed parameter has no column.
     columns = np.flatnonzero(fit.free_indices == index)
@@ -284,6 +296,10 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
     """Return the indices in theta of fitted base parameters whose range should be widened.
 
     They are at a bound of their range, and physics allows values beyond this bound.
+
+    Args:
+        evaluator: the runs, with the present range of each parameter.
+        base: fit of the base model within these ranges.
     """
     places = []
     for i in evaluator.base_indices.tolist():
@@ -388,6 +404,10 @@ def _get_coefficient(kind: Any, name: str) -> Any:
     """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
 
     It is None for a parameter of the simulator itself.
+
+    Args:
+        kind: class of the simulator.
+        name: name of the freed parameter, such as ``EFFECT`` or ``EFFECT.COEFFICIENT``.
     """
     for effect in kind.system.freed_effects:
         for c in effect.coefficients:

@@ -256,7 +256,12 @@ class ModelSet:
         return [self.models[frozenset(start.effects)] for start in starts]
 
     def fit_one(self, start: FitStart, iterations: int = MAX_ITERATIONS) -> FittedModel:
-        """Fit a model from a start, and return the best known fit with the same effects."""
+        """Fit a model from a start, and return the best known fit with the same effects.
+
+        Args:
+            start: effects, and the parameters and initial states from which the fit starts.
+            iterations: maximum number of steps.
+        """
         return self.fit_all([start], iterations)[0]
 
     def _report_best(self) -> None:
@@ -343,6 +348,10 @@ class ModelSet:
 
         Each fit horizon is a longer part of the runs, with fewer models; the last horizon, whole
         runs, is left to the caller.
+
+        Args:
+            starts: starts of all fits.
+            noise: noise of each channel.
         """
         remaining_starts = list(starts)
         # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.

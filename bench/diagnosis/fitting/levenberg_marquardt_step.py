@@ -247,8 +247,15 @@ def _predict_decrease(
 ) -> float:
     """Return the decrease of the cost by a step if the residual were linear, eq. (6).
 
-    The damping is adapted to how well the actual decrease agrees with it. Arguments are those of
-    `_assemble_normal_equations`, with the steps `parameter_step` (q,) and `state_steps` (R, s).
+    The damping is adapted to how well the actual decrease agrees with it.
+
+    Args:
+        j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
+        r: (R, n) whitened residuals.
+        drift: (R, s) d of eq. (1).
+        prior: (s,) π of eq. (1).
+        parameter_step: (q,) step of the shared parameters.
+        state_steps: (R, s) steps of the initial states.
     """
     repeated = np.tile(parameter_step, (len(r), 1))
     steps = np.concatenate([repeated, state_steps], axis=1)

@@ -121,7 +121,14 @@ def compute_initial_state_derivatives(
 def _compute_initial_state_derivatives(
     evaluator: RunEvaluator, run: int, theta: Array, states: Array
 ) -> Array:
-    """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker."""
+    """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker.
+
+    Args:
+        evaluator: the runs.
+        run: index of the run.
+        theta: (P,) parameters.
+        states: (s,) initial state about which the run is linearised.
+    """
     return _get_linearisation(evaluator, run, theta, states).compute_initial_state_responses()
 
 
@@ -178,7 +185,7 @@ def correct_discretisation(
     assert issubclass(evaluator.kind, RobotSimulator)
     effects = [*evaluator.library, *evaluator.extra_effects]
     runs = len(evaluator.prepared_runs)
-    scenarios = [track.scenario for track in evaluator.prepared_runs]
+    scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
     lanes = np.tile(theta, (runs, 1))
     initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
     half_step_kind = evaluator.kind.with_half_step()

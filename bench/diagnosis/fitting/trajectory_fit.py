@@ -79,17 +79,17 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
         first = end
 
 
-def eliminate_losing_fits(problems: Sequence[FitState], lowest_cost: float) -> None:
+def eliminate_losing_fits(fit_states: Sequence[FitState], lowest_cost: float) -> None:
     """Mark fits as finished if several more steps would not bring them close to the best cost.
 
     Args:
-        problems: states of the fits; `is_finished` is set in place.
+        fit_states: states of the fits; `is_finished` is set in place.
         lowest_cost: lowest cost of other fits.
     """
-    best = min(lowest_cost, *(problem.point.cost for problem in problems))
-    for problem in problems:
-        problem.is_finished |= (
-            problem.point.cost - PREDICTED_DECREASE_FACTOR * problem.predicted_decrease
+    best = min(lowest_cost, *(fit_state.point.cost for fit_state in fit_states))
+    for fit_state in fit_states:
+        fit_state.is_finished |= (
+            fit_state.point.cost - PREDICTED_DECREASE_FACTOR * fit_state.predicted_decrease
             > best + ELIMINATION_MARGIN
         )
 
@@ -154,10 +154,10 @@ class TrajectoryFitter:
         Returns:
             The fits in the order of their starts.
         """
-        problems = [self._create_fit_state(start) for start in starts]
+        fit_states = [self._create_fit_state(start) for start in starts]
         for racing_round in iterate_rounds(iterations, is_racing):
             # Unfinished fits continue in groups, which exchange nothing within a round.
-            unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
+            unfinished = [i for i, fit_state in enumerate(fit_states) if not fit_state.is_finished]
             if not unfinished or (
                 racing_round.first
                 and self.evaluator.search_control.should_abandon_fit(
@@ -165,12 +165,12 @@ class TrajectoryFitter:
                 )
             ):
                 break
-            best = min(lowest_cost, *(problem.point.cost for problem in problems))
-            groups = self._group_fits(problems, unfinished)
+            best = min(lowest_cost, *(fit_state.point.cost for fit_state in fit_states))
+            groups = self._group_fits(fit_states, unfinished)
             calls = [
                 (
                     self._list_worker_arguments(),
-                    [problems[i] for i in g],
+                    [fit_states[i] for i in g],
                     racing_round,
                     is_racing,
                     best,
@@ -180,11 +180,11 @@ class TrajectoryFitter:
             for number, members in self.evaluator.worker_pool.map_unordered(
                 self.evaluator, _advance_group, calls
             ):
-                for i, problem in zip(groups[number], members, strict=True):
-                    problems[i] = problem
-                    if problem.is_finished or racing_round.last >= iterations:
+                for i, fit_state in zip(groups[number], members, strict=True):
+                    fit_states[i] = fit_state
+                    if fit_state.is_finished or racing_round.last >= iterations:
                         finished()
-        return [p.make_fit() for p in problems]
+        return [p.make_fit() for p in fit_states]
 
     def _list_worker_arguments(self) -> tuple[Any, ...]:
         """Return all fields except the run evaluator, which workers have already.
@@ -200,12 +200,16 @@ class TrajectoryFitter:
         )
 
     def _group_fits(
-        self, problems: Sequence[FitState], unfinished: Sequence[int]
+        self, fit_states: Sequence[FitState], unfinished: Sequence[int]
     ) -> list[list[int]]:
         """Split unfinished fits into groups of about `GROUP_COST_SAMPLES` simulated samples.
 
         Each group has models of one kind as far as possible. There is only one group if large
         engine calls cost less per batch element.
+
+        Args:
+            fit_states: states of all fits.
+            unfinished: indices of the unfinished ones.
         """
         evaluator = self.evaluator
         if not evaluator.is_cheap_to_split:
@@ -213,13 +217,13 @@ class TrajectoryFitter:
         runs, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
         element_count = (
-            sum(1 + problems[i].free_indices.size + state_count for i in unfinished) * runs
+            sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * runs
         )
         cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
         count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
         element_kinds = evaluator.group_compatible(
-            np.stack([problems[i].point.start.theta for i in unfinished])
+            np.stack([fit_states[i].point.start.theta for i in unfinished])
         )
         order = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
         parts = np.array_split(order, min(count, len(order)))
@@ -227,7 +231,7 @@ class TrajectoryFitter:
 
     def advance_round(
         self,
-        problems: Sequence[FitState],
+        fit_states: Sequence[FitState],
         racing_round: RacingRound,
         is_racing: bool,
         lowest_cost: float,
@@ -235,7 +239,7 @@ class TrajectoryFitter:
         """Advance fits by one racing round.
 
         Args:
-            problems: states of the fits.
+            fit_states: states of the fits.
             racing_round: the steps to make.
             is_racing: whether to stop fits that are far behind the best fit or behind
                 `lowest_cost`.
@@ -247,18 +251,18 @@ class TrajectoryFitter:
         # Mask of the samples that count, (R, T, C).
         sample_mask = self.evaluator.get_sample_mask(self.share)
         if not racing_round.first:
-            self._simulate_starts(problems, sample_mask)
+            self._simulate_starts(fit_states, sample_mask)
         for iteration in range(racing_round.first, racing_round.last):
             # In the first steps even the correct model may be far behind.
             if is_racing and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
-                eliminate_losing_fits(problems, lowest_cost)
+                eliminate_losing_fits(fit_states, lowest_cost)
             self._renew_derivatives(
-                problems,
+                fit_states,
                 sample_mask,
                 includes_waiting=not is_racing or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
-            trials = list(self._propose_trials(problems, sample_mask))
-            if not trials and any(p.is_waiting and not p.is_finished for p in problems):
+            trials = list(self._propose_trials(fit_states, sample_mask))
+            if not trials and any(p.is_waiting and not p.is_finished for p in fit_states):
                 continue
             # The caller checks whether the fit was stopped early here.
             if not trials or self.evaluator.search_control.should_abandon_fit(
@@ -270,39 +274,44 @@ class TrajectoryFitter:
                 if self._updates_derivatives
                 else self._simulate_points
             )
-            for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
-                self._accept_or_reject_trial(problem, point)
-        return list(problems)
+            for (fit_state, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
+                self._accept_or_reject_trial(fit_state, point)
+        return list(fit_states)
 
-    def _simulate_starts(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
-        """Simulate the start of each fit, and compute its derivatives unless they are known."""
-        known_problems = [p for p in problems if self._has_derivatives(p)]
-        unknown_problems = [p for p in problems if not self._has_derivatives(p)]
-        if unknown_problems:
+    def _simulate_starts(self, fit_states: Sequence[FitState], sample_mask: Mask) -> None:
+        """Simulate the start of each fit, and compute its derivatives unless they are known.
+
+        Args:
+            fit_states: states of the fits; they are moved to their starts in place.
+            sample_mask: (R, T, C) samples that count in the cost.
+        """
+        known_states = [p for p in fit_states if self._has_derivatives(p)]
+        unknown_states = [p for p in fit_states if not self._has_derivatives(p)]
+        if unknown_states:
             points = self._simulate_points(
-                [(p, p.point.start) for p in unknown_problems], sample_mask
+                [(p, p.point.start) for p in unknown_states], sample_mask
             )
-            for problem, point in zip(unknown_problems, points, strict=True):
-                self._move_to_point(problem, point)
-        if known_problems:
+            for fit_state, point in zip(unknown_states, points, strict=True):
+                self._move_to_point(fit_state, point)
+        if known_states:
             points = self._simulate_without_derivatives(
-                [(p, p.point.start) for p in known_problems], sample_mask
+                [(p, p.point.start) for p in known_states], sample_mask
             )
-            for problem, point in zip(known_problems, points, strict=True):
+            for fit_state, point in zip(known_states, points, strict=True):
                 assert point.start.known_jacobian is not None
                 state_jacobian = self._compute_initial_state_derivatives(
-                    problem, point.start, point.simulated.shape[1]
+                    fit_state, point.start, point.simulated.shape[1]
                 )
                 parameter_jacobian = point.start.known_jacobian.jacobian[
                     :, : point.simulated.shape[1]
                 ]
                 self._move_to_point(
-                    problem,
+                    fit_state,
                     replace(
                         point, jacobian=np.concatenate([parameter_jacobian, state_jacobian], axis=3)
                     ),
                 )
-                problem.has_own_jacobian = point.start.known_jacobian.is_at_start
+                fit_state.has_own_jacobian = point.start.known_jacobian.is_at_start
 
     @property
     def _updates_derivatives(self) -> bool:
@@ -314,47 +323,50 @@ class TrajectoryFitter:
         evaluator = self.evaluator
         return evaluator.has_linearisation or (evaluator.is_cheap_to_split and self.fits_parameters)
 
-    def _has_derivatives(self, problem: FitState) -> bool:
+    def _has_derivatives(self, fit_state: FitState) -> bool:
         """Return whether the derivatives by all fitted parameters are known near the start.
 
         This saves one simulation per parameter. Only robots reuse derivatives.
         """
-        known_jacobian = problem.point.start.known_jacobian
+        known_jacobian = fit_state.point.start.known_jacobian
         return (
             self.evaluator.has_linearisation
             and known_jacobian is not None
-            and np.array_equal(known_jacobian.free_indices, problem.free_indices)
+            and np.array_equal(known_jacobian.free_indices, fit_state.free_indices)
         )
 
     def _renew_derivatives(
-        self, problems: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
+        self, fit_states: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
     ) -> None:
         """Recompute the derivatives of fits whose present ones are not good enough.
 
-        Fits that can wait are included only if `includes_waiting` is true.
+        Args:
+            fit_states: states of the fits, updated in place.
+            sample_mask: (R, T, C) samples that count in the cost.
+            includes_waiting: whether fits that wait for new derivatives are included.
         """
-        stale_problems = [
+        stale_states = [
             p
-            for p in problems
+            for p in fit_states
             if p.is_jacobian_stale and not p.is_finished and (includes_waiting or not p.is_waiting)
         ]
-        if not stale_problems:
+        if not stale_states:
             return
-        for problem in stale_problems:
-            problem.jacobian_renewals += 1
-            if problem.needs_own_state_jacobian:
+        for fit_state in stale_states:
+            fit_state.jacobian_renewals += 1
+            if fit_state.needs_own_state_jacobian:
                 # Imported here, because only robots need it.
                 from bench.diagnosis.fitting.linearised_runs import (
                     compute_initial_state_derivatives,
                 )
 
-                start = problem.point.start
-                problem.own_state_jacobian = compute_initial_state_derivatives(
+                start = fit_state.point.start
+                fit_state.own_state_jacobian = compute_initial_state_derivatives(
                     self.evaluator, start.theta, start.initial_states
                 )
-        points = self._simulate_points([(p, p.point.start) for p in stale_problems], sample_mask)
-        for problem, point in zip(stale_problems, points, strict=True):
-            self._move_to_point(problem, point)
+        points = self._simulate_points([(p, p.point.start) for p in stale_states], sample_mask)
+        for fit_state, point in zip(stale_states, points, strict=True):
+            self._move_to_point(fit_state, point)
 
     def _create_fit_state(self, start: FitStart) -> FitState:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
@@ -397,13 +409,17 @@ class TrajectoryFitter:
         One engine call contains every run of every model with every unknown displaced, so it
         integrates over time only once. An initial state that is known in every run is not an
         unknown.
+
+        Args:
+            trials: each fit with the point to simulate.
+            sample_mask: (R, T, C) samples that count in the cost.
         """
         runs, size = self.evaluator.initial_state_guesses.shape
         state_indices = self._list_displaced_states()
-        steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
+        steps = [fit_state.compute_inward_steps(start.theta) for fit_state, start in trials]
         displaced_inputs = [
-            build_displaced_inputs(start, problem.free_indices, step, state_indices)
-            for (problem, start), step in zip(trials, steps, strict=True)
+            build_displaced_inputs(start, fit_state.free_indices, step, state_indices)
+            for (fit_state, start), step in zip(trials, steps, strict=True)
         ]
         # Batch elements are ordered by model, then by unknown, then by run.
         thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in displaced_inputs])
@@ -414,15 +430,15 @@ class TrajectoryFitter:
 
         points = []
         first = 0
-        for (problem, start), step in zip(trials, steps, strict=True):
+        for (fit_state, start), step in zip(trials, steps, strict=True):
             # The first element is not displaced; each other one has one unknown displaced.
-            end = first + 1 + problem.free_indices.size + state_indices.size
+            end = first + 1 + fit_state.free_indices.size + state_indices.size
             part = simulated[first:end]
             first = end
             jacobian = self._compute_derivatives(part, step, state_indices)
             if self.evaluator.has_linearisation:
-                jacobian[..., problem.free_indices.size :] = (
-                    self._compute_initial_state_derivatives(problem, start, part.shape[2])
+                jacobian[..., fit_state.free_indices.size :] = (
+                    self._compute_initial_state_derivatives(fit_state, start, part.shape[2])
                 )
             cost = self._compute_cost(part[0], start.initial_states, sample_mask)
             points.append(FitPoint(start, part[0], jacobian, cost))
@@ -434,6 +450,10 @@ class TrajectoryFitter:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
         `_accept_or_reject_trial` updates these derivatives if the point is accepted.
+
+        Args:
+            trials: each fit with the point to simulate.
+            sample_mask: (R, T, C) samples that count in the cost.
         """
         runs = len(self.evaluator.initial_state_guesses)
         simulated = self.evaluator.simulate(
@@ -446,10 +466,10 @@ class TrajectoryFitter:
             FitPoint(
                 start,
                 part,
-                problem.point.jacobian,
+                fit_state.point.jacobian,
                 self._compute_cost(part, start.initial_states, sample_mask),
             )
-            for (problem, start), part in zip(trials, simulated, strict=True)
+            for (fit_state, start), part in zip(trials, simulated, strict=True)
         ]
 
     def _list_displaced_states(self) -> Indices:
@@ -462,17 +482,22 @@ class TrajectoryFitter:
         return np.flatnonzero(~self.evaluator.known_state_mask.all(axis=0))
 
     def _compute_initial_state_derivatives(
-        self, problem: FitState, start: FitStart, samples: int
+        self, fit_state: FitState, start: FitStart, samples: int
     ) -> Array:
         """Return derivatives (R, T, C, s) by initial states, zero where a state is known.
 
         They are those of the fit itself, if it has any, or those that all models share.
+
+        Args:
+            fit_state: state of the fit.
+            start: parameters and initial states about which the runs are linearised.
+            samples: number T of samples of each run, the fitted share.
         """
         evaluator = self.evaluator
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        shared = problem.own_state_jacobian
+        shared = fit_state.own_state_jacobian
         if shared is None:
             shared = compute_state_jacobian(evaluator, start.theta, start.initial_states)
         derivatives = shared[:, :samples]
@@ -503,14 +528,28 @@ class TrajectoryFitter:
         jacobian[..., q:] *= ~known_mask[:, None, None, :]
         return jacobian
 
-    def _move_to_point(self, problem: FitState, point: FitPoint) -> None:
-        """Move a fit to a point with its derivatives, and adapt the difference steps to them."""
-        problem.point = point
-        problem.has_own_jacobian, problem.is_jacobian_stale, problem.is_waiting = True, False, False
-        problem.steps = compute_difference_steps(point.jacobian, self.noise, problem.widths)
+    def _move_to_point(self, fit_state: FitState, point: FitPoint) -> None:
+        """Move a fit to a point with its derivatives, and adapt the difference steps to them.
+
+        Args:
+            fit_state: state of the fit, changed in place.
+            point: the point, simulated together with its derivatives.
+        """
+        fit_state.point = point
+        fit_state.has_own_jacobian, fit_state.is_jacobian_stale, fit_state.is_waiting = (
+            True,
+            False,
+            False,
+        )
+        fit_state.steps = compute_difference_steps(point.jacobian, self.noise, fit_state.widths)
 
     def _compute_residual(self, simulated: Array, sample_mask: Mask) -> Array:
-        """Return observed minus simulated (R, T, C), zero where no sample counts."""
+        """Return observed minus simulated (R, T, C), zero where no sample counts.
+
+        Args:
+            simulated: (R, T, C) simulated channels.
+            sample_mask: (R, T, C) samples that count in the cost.
+        """
         residual: Array = np.where(sample_mask, self.evaluator.observed - simulated, 0.0)
         return residual
 
@@ -548,28 +587,36 @@ class TrajectoryFitter:
         return float((whitened * whitened).sum() + (deviation * deviation).sum())
 
     def _propose_trials(
-        self, problems: Sequence[FitState], sample_mask: Mask
+        self, fit_states: Sequence[FitState], sample_mask: Mask
     ) -> Iterator[_TrialStep]:
         """Propose the next point of each fit that is neither finished nor waiting.
 
         A fit without a useful step is marked as finished or waiting and yields nothing.
-        """
-        for problem in problems:
-            if problem.is_finished or problem.is_waiting:
-                continue
-            next_start = self._propose_trial(problem, sample_mask)
-            if next_start is not None:
-                yield problem, next_start
 
-    def _propose_trial(self, problem: FitState, sample_mask: Mask) -> FitStart | None:
+        Args:
+            fit_states: states of the fits.
+            sample_mask: (R, T, C) samples that count in the cost.
+        """
+        for fit_state in fit_states:
+            if fit_state.is_finished or fit_state.is_waiting:
+                continue
+            next_start = self._propose_trial(fit_state, sample_mask)
+            if next_start is not None:
+                yield fit_state, next_start
+
+    def _propose_trial(self, fit_state: FitState, sample_mask: Mask) -> FitStart | None:
         """Return the next parameters and initial states to try.
 
         If no decrease is predicted, mark the fit as finished or waiting, and return None.
+
+        Args:
+            fit_state: state of the fit.
+            sample_mask: (R, T, C) samples that count in the cost.
         """
-        point = problem.point
+        point = fit_state.point
         # There is no descent direction from a point that could not be simulated.
         if not np.isfinite(point.cost):
-            problem.is_finished = True
+            fit_state.is_finished = True
             return None
 
         unwhitened_residual = self._compute_residual(point.simulated, sample_mask)
@@ -579,55 +626,65 @@ class TrajectoryFitter:
         step = compute_gauss_newton_step(
             residual,
             jacobian,
-            problem.free_indices.size,
+            fit_state.free_indices.size,
             self._compute_state_deviation(point.start.initial_states),
             compute_state_prior(self.evaluator),
             self.evaluator.known_state_mask,
-            problem.damping,
-            problem.find_blocked_parameters(
+            fit_state.damping,
+            fit_state.find_blocked_parameters(
                 residual, jacobian
             ),  # clipping them afterwards would distort the step
         )
-        problem.predicted_decrease = step.predicted_decrease
+        fit_state.predicted_decrease = step.predicted_decrease
         # The fit has converged, no step is short enough, or numbers overflow.
         if (
             not np.isfinite(step.predicted_decrease)
-            or step.predicted_decrease < problem.get_tolerance(point.cost)
-            or problem.damping > MAX_DAMPING
+            or step.predicted_decrease < fit_state.get_tolerance(point.cost)
+            or fit_state.damping > MAX_DAMPING
         ):
-            problem.mark_converged()
+            fit_state.mark_converged()
             return None
 
         # Copy the parameters, because the old point is still needed if the trial is rejected.
         theta = point.start.theta.copy()
-        trial_values = theta[problem.free_indices] + step.parameter_step
-        theta[problem.free_indices] = np.clip(trial_values, problem.low, problem.high)
+        trial_values = theta[fit_state.free_indices] + step.parameter_step
+        theta[fit_state.free_indices] = np.clip(trial_values, fit_state.low, fit_state.high)
         return replace(
             point.start, theta=theta, initial_states=point.start.initial_states + step.state_steps
         )
 
-    def _accept_or_reject_trial(self, problem: FitState, point: FitPoint) -> None:
+    def _accept_or_reject_trial(self, fit_state: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
         Derivatives are updated by Broyden's method if the trial was simulated without them.
+
+        Args:
+            fit_state: state of the fit, changed in place.
+            point: the simulated trial point.
         """
-        decrease = problem.point.cost - point.cost
-        is_own_jacobian = problem.has_own_jacobian
-        if point.cost < problem.point.cost:
+        decrease = fit_state.point.cost - point.cost
+        is_own_jacobian = fit_state.has_own_jacobian
+        if point.cost < fit_state.point.cost:
             if self._updates_derivatives:
-                problem.point = replace(point, jacobian=problem.update_jacobian(point))
+                fit_state.point = replace(point, jacobian=fit_state.update_jacobian(point))
                 # A robot's derivatives by initial states come from a linearisation.
                 is_linearised = self.evaluator.has_linearisation
-                problem.has_own_jacobian = is_linearised and not problem.free_indices.size
+                fit_state.has_own_jacobian = is_linearised and not fit_state.free_indices.size
             else:
-                self._move_to_point(problem, point)
-            problem.accept_step(decrease, point.cost, is_own_jacobian)
+                self._move_to_point(fit_state, point)
+            fit_state.accept_step(decrease, point.cost, is_own_jacobian)
         else:
-            problem.reject_step()
+            fit_state.reject_step()
 
 
 def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:
-    """Advance one group of fits by one racing round; runs in this process or in a worker."""
+    """Advance one group of fits by one racing round; runs in this process or in a worker.
+
+    Args:
+        evaluator: the runs.
+        terms: further fields of `TrajectoryFitter`.
+        *call: arguments of `TrajectoryFitter.advance_round`.
+    """
     return TrajectoryFitter(evaluator, *terms).advance_round(*call)
 
 

@@ -259,8 +259,13 @@ class FollowedRuns:
     ) -> FollowedRuns:
         """Fit the process noise of the linearised models of all runs, and return their filter.
 
-        `linear` has the model of each run, linearised at its samples; other arguments are those of
-        `_fit_noise`.
+        Args:
+            evaluator: the R runs to follow.
+            theta: (P,) parameters about which the models are linear.
+            noise: sensor noise of each channel.
+            linear: model of each run, linearised at its samples.
+            force: (E,) standard deviations of the missing forces, from which the noise fit starts.
+            typical: (E,) typical force of each joint, in N or N·m, a scale for the missing forces.
         """
         # A model that diverges between two samples overflows; `has_expected_innovations` is then
         # false.
@@ -677,7 +682,17 @@ def _linearise_run(
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
-    The motion `trajectory` is estimated from the readings alone if it is None.
+    Args:
+        evaluator: the runs.
+        theta: (P,) parameters about which the model is linear.
+        noise: sensor noise of each channel.
+        run: index of the run.
+        trajectory: the motion; None to estimate it from the readings alone.
+        neighbour: model of the same run at other parameters, whose matrices are reused; None if
+            there is none.
+        simulator: robot with other contact or friction settings; None for that of the evaluator.
+        reuses_jacobians: whether derivatives are taken from the neighbour.
+        reuses_loads: whether loads at the joints are taken from the neighbour.
     """
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
@@ -699,6 +714,15 @@ def _compute_prior_deviations(
 
     With a stiff servo, the first velocity decays within a sample, so the readings do not determine
     it.
+
+    Args:
+        evaluator: the runs.
+        linear: linearised model of each run.
+        size: number Z of states, with the hidden ones of effects.
+
+    Returns:
+        Standard deviations in SI units: of positions first, then of velocities; almost zero for
+        hidden states.
     """
     coordinates = evaluator.simulator.system.coordinates
     prior = np.full(size, 1e-9)

@@ -355,7 +355,13 @@ def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:
 
 
 def _complete_deviations(force: Array, runs: LinearRuns) -> Array:
-    """Return the deviations of all columns of G for each run (B, E), including coloured noise."""
+    """Return the deviations (R, B) of the forces of all columns of G, including coloured noise.
+
+    Args:
+        force: (E,) or (R, E) standard deviations of the missing forces.
+        runs: linear models of R runs, whose G has B >= E columns; the further ones drive coloured
+            noise and have deviation one.
+    """
     run_count, columns = len(runs.residuals), runs.forces.shape[3]
     result = np.ones((run_count, columns))
     result[:, : force.shape[-1]] = force

@@ -199,8 +199,9 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
     They are one-sided differences that stay within the bounds. A parameter without a range has no
     derivative.
 
-    Raises:
-        SearchStoppedError: the search has to end.
+    Args:
+        followed: the runs, followed with the present parameters.
+        bounds: lower and upper bound of each of the n parameters, by its index in theta.
     """
     sizes = np.array(
         [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
@@ -217,6 +218,11 @@ def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> f
     """Return the finite difference of a parameter, which stays within the bounds.
 
     It is zero if the parameter has no range.
+
+    Args:
+        followed: the runs, followed with the present parameters.
+        index: index of the parameter in theta.
+        bounds: lower and upper bound of the fit, in the unit of the parameter.
     """
     low, high = bounds
     plausible_low, plausible_high = followed.evaluator.parameters[index].bounds

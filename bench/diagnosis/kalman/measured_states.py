@@ -55,6 +55,14 @@ def _compute_measured_states(
     """Compute the result of `estimate_measured_states` for a run that is not in its cache.
 
     Joints with fewer than three recorded positions are left out.
+
+    Args:
+        evaluator: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        run: index of the run.
+
+    Returns:
+        Position, velocity and acceleration (T, 3) of each joint, by the index of the joint.
     """
     coordinates, rates = evaluator.simulator.system.coordinates, evaluator.simulator.system.rates
     run_data = evaluator.prepared_runs[run]
@@ -165,6 +173,10 @@ def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
     """Return whether joint forces can be computed from the recorded positions.
 
     All joints must be recorded, and have one coordinate each; none is coupled by an equality.
+
+    Args:
+        robot: model of the robot.
+        recording: its recording; the channels of the first run count.
     """
     recorded = recording.runs[0].channels
     singles = all(
@@ -229,7 +241,13 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tup
 
 
 def _compute_mean_input(run: Run, name: str) -> Array:
-    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
+    """Return an input (T,) at each sample: the mean of its values before and after the sample.
+
+    Args:
+        run: the run.
+        name: name of the input. It is held between samples, unless the run interpolates it
+            linearly.
+    """
     values = run.inputs[name]
     if name in run.linear:
         return values
@@ -242,6 +260,11 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
     """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
 
     nu and na are MuJoCo's numbers of actuators and of activation states.
+
+    Args:
+        robot: model of the robot.
+        run: the run, with inputs ``u.NAME`` of the actuators; an actuator without input has control
+            zero.
     """
     model = robot.compiled
     controls = np.zeros((run.times.size, model.nu))

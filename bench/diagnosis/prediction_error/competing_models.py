@@ -145,6 +145,10 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add one effect after another to a set, each time the one with the largest likelihood.
 
     It stops if no effect is worth its penalty, or if the filter lacks no force any more.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set to begin with; it may be empty.
     """
     for _ in range(MAX_STEPS - 1):
         larger = (
@@ -160,6 +164,10 @@ def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[
     """Return the sets with one more effect whose gain in likelihood exceeds its penalty.
 
     The likeliest set is the first.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set to extend by one effect.
     """
     filters = context.filters
     present = current.followed if current.names else filters.base
@@ -204,7 +212,13 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
-    """Return whether a set explains the runs, and another one is far worse."""
+    """Return whether a set explains the runs, and another one is far worse.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the set with the best criterion.
+        other: the set with the next best one.
+    """
     loss = _compute_criterion(context, other) - _compute_criterion(context, best)
     gain = context.filters.compute_gain(best.followed)
     return (
@@ -219,6 +233,10 @@ def _select_nearly_as_likely(
 
     The filter uses a linearised model, so these sets are then fitted by simulation. The likeliest
     is the first; at least `MAX_FIRST_EFFECTS` sets are returned if there are that many.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        larger_sets: sets of the same size, the likeliest first.
     """
     if not larger_sets:
         return ()
@@ -231,7 +249,14 @@ def _select_nearly_as_likely(
 
 
 def _compute_criterion(context: SearchContext, current: FilteredSet) -> float:
-    """Return the penalised log likelihood of a set's last effect, as an information criterion."""
+    """Return the information criterion of a set: penalty of its last effect minus 2 log L.
+
+    Lower is better. Sets are compared that differ in this effect only.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set, with its filter.
+    """
     penalty = context.filters.penalty(current.names[-1])
     return penalty - 2.0 * current.followed.log_likelihood
 
@@ -383,6 +408,13 @@ def _confirm_by_filter(
     """Return a start with a competing model that a filter confirms, else None.
 
     A filter is used only if the competing model is far behind by the regression, which is linear.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+        competing_effect: the effect that replaces one of its effects, with its loss in the
+            regression.
+        start: the competing model, with the coefficients from the regression.
     """
     if competing_effect.loss <= COMPETING_MODEL_MARGIN:
         return start
@@ -407,7 +439,12 @@ def _confirm_by_filter(
 
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
-    """Fit the best models of a size with each effect moved to the other joints of its loop."""
+    """Fit the best models of a size with each effect moved to the other joints of its loop.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        size: number of effects of the models.
+    """
     search, evaluator = context.search, context.evaluator
     starts: dict[frozenset[str], FitStart] = {}
     for model in _list_models_near_the_best(context, size):
@@ -426,6 +463,10 @@ def _refine_near(context: SearchContext, size: int) -> None:
     """Fit the models of a size with nearly the best merit to convergence.
 
     Otherwise, incomplete fits would decide between them.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        size: number of effects of the models.
     """
     search, near_models = context.search, _list_models_near_the_best(context, size)
     if context.evaluator.search_control.is_over() or len(near_models) < 2:
@@ -440,7 +481,12 @@ def _refine_near(context: SearchContext, size: int) -> None:
 
 
 def _list_models_near_the_best(context: SearchContext, size: int) -> list[FittedModel]:
-    """Return the models with `size` effects whose merit is close to the highest."""
+    """Return the models with `size` effects whose merit is close to the highest.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        size: number of effects of the models.
+    """
     of_size = [m for m in context.search.models.values() if len(m.effects) == size]
     highest = max((model.penalised_log_likelihood for model in of_size), default=-np.inf)
     return [

@@ -122,6 +122,10 @@ class EffectProposals:
         """Return an encoder offset of a joint, and less dry friction than the model file specifies.
 
         The derivative by more friction does not show the effect of less friction.
+
+        Args:
+            joint: index of the joint.
+            excluded: names of effects that are not proposed.
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         coefficients = {
@@ -144,6 +148,11 @@ class EffectProposals:
         """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
 
         They are in descending order of their gain in likelihood.
+
+        Args:
+            followed: the runs, followed by the filter of the set that is extended.
+            joint: index of the joint.
+            excluded: names of effects that are not proposed.
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
@@ -197,7 +206,15 @@ class EffectProposals:
         return [name for name in names if name in evaluator.library]
 
     def _compute_likelihood_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:
-        """Return the Gauss-Newton step of an effect alone, cached for the base model."""
+        """Return the Gauss-Newton step of an effect alone, cached for the base model.
+
+        Args:
+            followed: the runs, followed by the filter of the present set.
+            name: name of the effect.
+
+        Returns:
+            Change of all parameters (P,), and the predicted gain in log-likelihood.
+        """
         if followed is self.filters.base and name in self._base_steps:
             return self._base_steps[name]
         step = compute_likelihood_step(

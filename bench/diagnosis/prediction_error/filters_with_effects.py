@@ -131,7 +131,12 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
 
 
 def has_series(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
-    """Return whether some effects are joints in series with others, which have their own states."""
+    """Return whether some effects are joints in series with others, which have their own states.
+
+    Args:
+        evaluator: the runs, with all available effects.
+        names: names of effects.
+    """
     return any(is_series_effect(evaluator.available_effects[name]) for name in names)
 
 
@@ -344,7 +349,12 @@ class ModelFilters:
         return FilteredSet(best, tuple(names))
 
     def _follow_near(self, theta: Array, neighbour: FollowedRuns) -> FollowedRuns:
-        """Follow the runs with other parameters, linearised about a known motion."""
+        """Follow the runs with other parameters, linearised about a known motion.
+
+        Args:
+            theta: (P,) parameters.
+            neighbour: a filter with similar parameters, whose motion is the operating point.
+        """
         is_base = neighbour is self.base
         followed = self._follow_about_base(theta) if is_base else neighbour.with_parameters(theta)
         deviations = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
@@ -402,7 +412,15 @@ class ModelFilters:
         return self._soft_friction[name, sign]
 
     def _search_soft_friction(self, name: str, sign: float) -> FitStart | None:
-        """Search the force of the model that `find_soft_friction` returns."""
+        """Search the force of the model that `find_soft_friction` returns.
+
+        Args:
+            name: name of a friction effect at a joint.
+            sign: 1 for more friction than in the model file, -1 for less.
+
+        Returns:
+            Start of a fit with the likeliest force; None if there are no models to try.
+        """
         joint = name.partition("@")[2]
         joint_indices = {get_joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
         models = make_soft_friction_models(self.base, self.reference, joint_indices[joint], sign)

@@ -143,13 +143,23 @@ def is_long(evaluator: RunEvaluator) -> bool:
 
 
 def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
-    """Return whether a set leaves a negligible share of the base model's missing forces."""
+    """Return whether a set leaves a negligible share of the base model's missing forces.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set, with its filter.
+    """
     share = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
     return not current.followed.has_missing_force or bool((current.followed.force < share).all())
 
 
 def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
-    """Return the bounds of the base parameters and of some effects, by index in theta."""
+    """Return the bounds of the base parameters and of some effects, by index in theta.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        names: names of the effects.
+    """
     evaluator = context.evaluator
     free = [i for i in evaluator.base_indices.tolist() if i not in context.search.fixed_parameters]
     bounds = {i: compute_range_around(evaluator, i) for i in free}
@@ -206,7 +216,13 @@ def _compute_wald_statistics(
 
 
 def _compute_min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
-    """Return the minimum gain of an effect of a set in twice the log-likelihood."""
+    """Return the minimum gain of an effect of a set in twice the log-likelihood.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set, with its filter.
+        name: name of the effect, whose penalty is the least gain.
+    """
     filters = context.filters
     return max(
         filters.penalty(name), MIN_FURTHER_GAIN_SHARE * filters.compute_gain(current.followed)
@@ -302,7 +318,12 @@ def _list_probes(context: SearchContext) -> list[CandidateDirection]:
 
 
 def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
-    """Simulate the runs with the parameters of a filter, from fitted initial states."""
+    """Simulate the runs with the parameters of a filter, from fitted initial states.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set, with its filter.
+    """
     evaluator, search = context.evaluator, context.search
     theta, states = current.followed.theta, context.filters.estimate_first_states(current.followed)
     start = FitStart(current.names, theta, states)

@@ -194,7 +194,12 @@ def _format_message(
 
 
 def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
-    """Return switches of a drive's actuators from the first column that shows when it is off."""
+    """Return switches of a drive's actuators from the first column that shows when it is off.
+
+    Args:
+        recording: the recording, whose further columns may be state words of the drives.
+        drive: the drive, with the samples in which it is inactive.
+    """
     for column in recording.runs[0].extra:
         for zero_is_off in (True, False):
             switches = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
@@ -207,6 +212,10 @@ def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive])
     """Return the first other column that changes only where drives become inactive or active.
 
     The result is empty if there is no such column.
+
+    Args:
+        recording: the recording, with further columns.
+        drives: the drives, with the samples in which they are inactive.
     """
     for column in recording.runs[0].extra:
         changes_near, other_changes = 0, 0
@@ -282,7 +291,12 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
 
 
 def _thin_runs(recording: Recording, every: int) -> list[Run]:
-    """Return every k-th sample of all runs."""
+    """Return all runs with every k-th of their samples.
+
+    Args:
+        recording: the recording.
+        every: the number k.
+    """
     return [run.part(slice(None, None, every)) for run in recording.runs]
 
 
@@ -381,7 +395,12 @@ class _Intervals:
         return zip(self._forces, masks, strict=True)
 
     def _compute_residual_magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
-        """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint."""
+        """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint.
+
+        Args:
+            state: number of the hypothesis, ``OFF`` or ``HELD``.
+            masks: (T,) samples of each run that count.
+        """
         return [
             _compute_magnitude(
                 np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)])
@@ -392,7 +411,14 @@ class _Intervals:
     def _is_at_rest(
         self, run: int, mask: Mask, ends: tuple[int, int], typical_speeds: Sequence[float]
     ) -> bool:
-        """Return whether all joints are at rest in an interval at an end of the run."""
+        """Return whether all joints are at rest in an interval at an end of the run.
+
+        Args:
+            run: index of the run.
+            mask: (T,) samples of the interval.
+            ends: first sample of the interval, and the sample after its last one.
+            typical_speeds: typical speed of each joint of the hypothesis, in its unit per second.
+        """
         velocity = self._forces[run].velocity
         at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
         is_joint_at_rest = [
@@ -411,7 +437,15 @@ def _remove_edges(mask: Mask) -> Mask:
 
 
 def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
-    """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint."""
+    """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint.
+
+    The cost of a sample is the absolute residual in units of the typical residual of the better
+    hypothesis, at most `MAX_SAMPLE_COST`.
+
+    Args:
+        residuals: (S, T) residual forces of each run under the S hypotheses, NaN where unknown.
+        state: number of the hypothesis.
+    """
     hypotheses = [ON, state]
     pooled_residuals = np.concatenate(residuals, axis=1)[hypotheses]
     pooled_residuals = pooled_residuals[:, np.isfinite(pooled_residuals).all(axis=0)]

@@ -251,6 +251,11 @@ def _make_tangent_probes(
 
     The first shows what the effect changes as a whole; the differences of the others from it are
     the derivatives by the coefficients.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect.
+        theta: (P,) parameters of the model, with its coefficients.
     """
     coefficients = theta[evaluator.coefficient_slices[name]]
     probes = [

@@ -138,10 +138,18 @@ class Regression:
         gram: Array | None = None,
         cross: Array | None = None,
     ) -> tuple[float, list[Array]]:
-        """Fit a set of groups.
+        """Fit a set of groups by least squares.
 
         Constrained coefficients that are negative are fixed at zero one by one, the most negative
         first.
+
+        Args:
+            chosen: the groups.
+            gram: (K, K) G of eq. (1), for instance without one run; None for that of all runs.
+            cross: (K,) h of eq. (1); None for that of all runs.
+
+        Returns:
+            The residual sum of squares, and the coefficients of each group.
         """
         gram = self.gram if gram is None else gram
         cross = self.cross if cross is None else cross
@@ -315,6 +323,13 @@ def _normalise_gram(gram: Array, columns: IndexArray) -> tuple[Array, Array]:
     """Return the scaled normal matrix of some columns, and the lengths of these columns.
 
     Its diagonal is one plus the ridge.
+
+    Args:
+        gram: (K, K) G of eq. (1).
+        columns: (k,) indices of the columns.
+
+    Returns:
+        Matrix (k, k), and lengths (k,).
     """
     scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
     normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]

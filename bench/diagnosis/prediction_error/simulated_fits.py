@@ -198,7 +198,12 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
 
 
 def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
-    """Return the model with the higher merit; the first one if they are equal."""
+    """Return the model with the higher merit; the first one if they are equal.
+
+    Args:
+        one: a fitted model.
+        other: another one.
+    """
     return max(one, other, key=lambda model: model.penalised_log_likelihood)
 
 
@@ -221,6 +226,10 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
     become ``drag.linear@*``, which begins at their coefficients. The refitted family is kept if its
     penalised log-likelihood is not lower by more than `INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO`: it
     is one decision instead of one for each place.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        model: the fitted model.
     """
     evaluator = context.evaluator
     # The names of families in the library end in "@*".
@@ -347,6 +356,10 @@ def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
     """Return whether effects are slow to simulate.
 
     This is the case if forces are computed in every step, or have their own states.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        names: names of the effects.
     """
     effects = [context.evaluator.available_effects[name] for name in names]
     return any(

@@ -134,7 +134,12 @@ class Confirmation(Inquiry):
         return self._make_result(verdict, search.base_model, model, tuple(causes), lack_of_fit)
 
     def _cause(self, name: str, gain: float) -> CauseEvidence:
-        """Return the evidence for an effect whose gain is that of filters."""
+        """Return the evidence for an effect whose gain is that of filters.
+
+        Args:
+            name: name of the effect.
+            gain: its gain in twice the log-likelihood of the innovations.
+        """
         evaluator = self._robot.evaluator
         count = len(evaluator.get_coefficient_indices(name))
         p_value = compute_p_value_of_gain(gain, count, len(evaluator.library))

@@ -192,6 +192,11 @@ def _is_contained_in_model(evaluator: RunEvaluator, fit: TrajectoryFit, name: st
     """Return whether the model already has a simpler effect that the effect `name` contains.
 
     The simpler effect may also be in the model as a member of a family (one effect at all places).
+
+    Args:
+        evaluator: the runs, with all available effects.
+        fit: fit of the model.
+        name: name of the candidate effect.
     """
     effects = [evaluator.available_effects[effect_name] for effect_name in fit.effects]
     model_effects = {m.name for effect in effects for m in members_of(effect)}
@@ -203,8 +208,12 @@ def _make_end_stop_probes(
 ) -> Iterator[CandidateDirection]:
     """Yield end stops of several depths and stiffnesses at both ends of the range of a coordinate.
 
-    Each is one candidate that is valid only at its size. `first_group` is the number of the first
-    grid point.
+    Each is one candidate that is valid only at its size.
+
+    Args:
+        evaluator: the runs.
+        name: name of the end-stop effect.
+        first_group: number of the first grid point.
     """
     end_stops = [
         c
@@ -406,7 +415,12 @@ def _compute_directions(
 ) -> Array:
     """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
 
-    For a fixed probe it is the whole change. `probes` are the K candidates.
+    For a fixed probe it is the whole change.
+
+    Args:
+        evaluator: the runs.
+        fit: fit of the model without the candidates.
+        probes: the K candidates.
     """
     added = [(probe.effect, probe.coefficients) for probe in probes]
     # These are the largest arrays of a search, so all operations are in place.

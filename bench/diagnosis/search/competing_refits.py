@@ -73,6 +73,10 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     """Replace each effect by every other effect of the library, and return the best model.
 
     Unlike `swap_effect`, which refits only the most promising candidates, all are fitted.
+
+    Args:
+        search: the search; the fitted models are added to it.
+        model: the model whose effects are replaced.
     """
     size = len(model.effects)
     known_effect_sets = set(search.models)
@@ -192,6 +196,10 @@ def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseMode
     """Estimate the AR(1) noise of each channel from the residual of a model.
 
     Return None if the residual has structure, because it is then not noise.
+
+    Args:
+        search: the search.
+        model: the fitted model.
     """
     if assess_lack_of_fit(search, model).has_structure:
         return None

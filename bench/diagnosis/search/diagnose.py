@@ -258,7 +258,15 @@ class Inquiry:
         causes: tuple[CauseEvidence, ...],
         lack_of_fit: LackOfFitResult,
     ) -> DiagnosisResult:
-        """Bundle a verdict with its models, and with the held-out predictions if there are any."""
+        """Bundle a verdict with its models, and with the held-out predictions if there are any.
+
+        Args:
+            verdict: name of the verdict.
+            base: the base model.
+            model: the extended model; the base model if no cause was found.
+            causes: evidence for the causes, strongest first.
+            lack_of_fit: lack-of-fit result of the extended model.
+        """
         held_out_fits = self._trial.held_out_fits if self._trial is not None else None
         return DiagnosisResult(
             verdict, model, base, causes, lack_of_fit, held_out_fits=held_out_fits
@@ -345,8 +353,15 @@ def _select_preferred_model(
 ) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
     """Replace each effect by the preferred one of its indistinguishable alternatives.
 
-    Return this model if it was fitted, else the given one, with the evidence for its effects.
-    `lack_of_fit` is the lack-of-fit result of the given model.
+    Args:
+        search: the search.
+        validation: held-out predictions; None if no run can be held out.
+        model: the model found.
+        lack_of_fit: lack-of-fit result of this model.
+
+    Returns:
+        The model with the preferred effects if it was fitted, else the given one, and the evidence
+        for its effects.
     """
     alternatives = AlternativeFinder(search, validation, lack_of_fit.has_structure)
     causes = alternatives.collect_evidence(model)

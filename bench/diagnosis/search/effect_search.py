@@ -309,6 +309,10 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
     """Return the models with `size` effects to extend: highest merit, and lowest sum of squares.
 
     Far from the data merit is misleading, because AR(1) noise explains almost any residual there.
+
+    Args:
+        search: the search, with all fitted models.
+        size: number of effects of the models.
     """
     members = select_by_size(search, size)
     if not size or not members:
@@ -351,6 +355,10 @@ def _list_excess_residuals(search: EffectSearch, size: int) -> list[float]:
     """Return the excess residuals of all models with `size` effects.
 
     The excess residual is the RMS residual in units of the noise, minus one.
+
+    Args:
+        search: the search, with all fitted models.
+        size: number of effects of the models.
     """
     return [
         search.compute_excess_residual(m) for m in search.models.values() if len(m.effects) == size

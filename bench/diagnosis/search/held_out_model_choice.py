@@ -152,7 +152,12 @@ class HeldOutValidation:
         return max(fitted_ratio, held_out_ratio) / required_ratio
 
     def _list_smaller_models(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
-        """Return the evaluated models that consist of the model without one of its effects."""
+        """Return the evaluated models that consist of the model without one of its effects.
+
+        Args:
+            search: the search, with all fitted models.
+            model: the fitted model.
+        """
         names = set(model.effects)
         size = len(names) - 1
         submodels = []
@@ -170,6 +175,11 @@ class HeldOutValidation:
         """Return whether the effect by which two models differ improves held-out predictions.
 
         It is also accepted if it explains the fitted runs, and held-out runs hardly show it.
+
+        Args:
+            search: the search, whose models are fitted to the fitted runs.
+            reduced_model: the model without the effect.
+            full_model: the model with the effect.
         """
         before = self.held_out_fits[reduced_model.effects].penalised_log_likelihood
         after = self.held_out_fits[full_model.effects].penalised_log_likelihood

@@ -80,68 +80,104 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     )
 
 
-def _get_command(track: RunData, effect: Effect) -> Array:
+def _get_command(run_data: RunData, effect: Effect) -> Array:
     """Return the input signal (T,) of a run on which an effect acts.
 
     It is the first input if the effect names none, and zero if the run has no such input.
+
+    Args:
+        run_data: the recorded run.
+        effect: effect on an input.
     """
-    signals = track.scenario.inputs
-    zero_signal = np.zeros(track.scenario.times.size)
+    signals = run_data.scenario.inputs
+    zero_signal = np.zeros(run_data.scenario.times.size)
     first_signal = next(iter(signals.values()), zero_signal)
     return signals.get(effect.signal, zero_signal) if effect.signal else first_signal
 
 
-def _get_largest_input(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the largest magnitude of the input of an effect in a run; `evaluator` is not used."""
-    return float(np.abs(_get_command(track, effect)).max())
+def _get_largest_input(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest magnitude of the input of an effect in a run.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: the recorded run.
+        effect: effect on an input.
+    """
+    return float(np.abs(_get_command(run_data, effect)).max())
 
 
-def _compute_max_input_rate(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the largest rate of change of an effect's input in a run, in its unit per second."""
-    changes = np.abs(np.diff(_get_command(track, effect)))
-    return float((changes / np.diff(track.scenario.times)).max(initial=0.0))
+def _compute_max_input_rate(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest rate of change of an effect's input in a run, in its unit per second.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: the recorded run.
+        effect: effect on an input.
+    """
+    changes = np.abs(np.diff(_get_command(run_data, effect)))
+    return float((changes / np.diff(run_data.scenario.times)).max(initial=0.0))
 
 
 def _compute_max_input_acceleration(
     evaluator: RunEvaluator,  # noqa: ARG001
-    track: RunData,
+    run_data: RunData,
     effect: Effect,
 ) -> float:
     """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
 
     Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
     limit that is tried.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: the recorded run.
+        effect: effect on an input.
     """
-    return 4.0 * float(np.ptp(_get_command(track, effect))) / MIN_PROFILE_SECONDS**2
+    return 4.0 * float(np.ptp(_get_command(run_data, effect))) / MIN_PROFILE_SECONDS**2
 
 
 def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
     """Return the channel of the stored quantity, such as a tank's level, that an effect limits.
 
     It is empty if the quantity is not recorded.
+
+    Args:
+        evaluator: the runs.
+        effect: effect that limits a stored quantity.
     """
     name = effect.place or evaluator.simulator.system.levels[0]
     return name if name in evaluator.channels else ""
 
 
-def _compute_max_level(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
-    """Return the maximum of the stored quantity, such as a tank's level, recorded in a run."""
-    levels = track.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
+def _compute_max_level(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:
+    """Return the maximum of the stored quantity, such as a tank's level, recorded in a run.
+
+    Args:
+        evaluator: the runs.
+        run_data: the recorded run.
+        effect: effect that limits the quantity.
+    """
+    levels = run_data.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
     return float(np.nanmax(levels, initial=0.0))
 
 
-def _compute_max_servo_error(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
+def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:
     """Return the largest difference of command and position of a servo in a run.
 
     It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
+
+    Args:
+        evaluator: the runs.
+        run_data: the recorded run.
+        effect: effect on the command of the servo.
     """
     system = evaluator.simulator.system
     place = system.primary if effect.coordinate is None else effect.coordinate
     name = system.coordinates[place]
     if name not in evaluator.channels:
         return 0.0
-    motor_position = system.gear(place) * track.observed[:, evaluator.channels.index(name)]
-    error = _get_command(track, effect) - motor_position
+    motor_position = system.gear(place) * run_data.observed[:, evaluator.channels.index(name)]
+    error = _get_command(run_data, effect) - motor_position
     return float(np.nanmax(np.abs(error), initial=0.0))
 
 
@@ -240,7 +276,7 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
             continue
         clock_start, clock_end = evaluator.time_span
         stamps = np.unique(
-            np.concatenate([track.scenario.times for track in evaluator.prepared_runs])
+            np.concatenate([run_data.scenario.times for run_data in evaluator.prepared_runs])
         )
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
         near_midpoints = midpoints[
@@ -290,6 +326,13 @@ def _shift_frequency_or_time(
     """Yield shifted values of a frequency, a period or an event time; nothing for others.
 
     Frequencies and periods are shifted by parts of a cycle, event times by samples.
+
+    Args:
+        evaluator: the runs, whose duration determines the length of a cycle's part.
+        parameter: the coefficient, with its unit and plausible range.
+        value: the value to shift, in the unit of the coefficient.
+        travel: largest range of the position within one run, in m or rad, for periods over
+            position.
     """
     if is_instant(parameter):
         for samples in EVENT_TIME_SHIFTS_SAMPLES:
@@ -307,6 +350,8 @@ def _shift_frequency_or_time(
 def is_period(parameter: Parameter, travel: float) -> bool:
     """Return whether a coefficient is a period over position (in m or rad), and the position moves.
 
-    `travel` is the largest range of the position within one run.
+    Args:
+        parameter: the coefficient.
+        travel: largest range of the position within one run, in m or rad.
     """
     return parameter.name.endswith(".period") and travel > 0

@@ -73,6 +73,14 @@ class JointHatForce(Force):
         """Return strength times a triangle around the centre.
 
         All batch elements of a call have the same joint, variable and direction.
+
+        Args:
+            c: (7,) coefficients of each batch element: strength, indices of joint and variable,
+                centre, width, index of the direction, and reversal speed.
+            moment: time and joint states of the batch.
+
+        Returns:
+            Forces at the joints, zero at all joints but one.
         """
         strength, joint, variable, centre, width, direction, reversal_speed = c
         active_elements = np.flatnonzero(strength[:, 0])
@@ -143,13 +151,17 @@ def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
     """Return the 98 % quantile of the speed of a joint, from differences of its recorded position.
 
     The quantile is used instead of the maximum, because single differences may be noise.
+
+    Args:
+        evaluator: the runs.
+        channel: index of the channel with the position of the joint.
     """
     rates = [np.zeros(1)]
-    for track in evaluator.prepared_runs:
-        if len(track.observed) > 3:
+    for run_data in evaluator.prepared_runs:
+        if len(run_data.observed) > 3:
             # Use every third sample, because differences of neighbours are mostly noise.
-            step = np.diff(track.scenario.times[::3])
-            rates.append(np.diff(track.observed[::3, channel]) / step)
+            step = np.diff(run_data.scenario.times[::3])
+            rates.append(np.diff(run_data.observed[::3, channel]) / step)
     return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))
 
 
@@ -326,6 +338,11 @@ def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel:
     """Return the relative standard error of the estimated noise of a channel, eq. (2).
 
     Its residual must exceed the noise by a multiple of this error to count as too large.
+
+    Args:
+        models: the models, with the mask of recorded samples.
+        model: model whose residual shows the correlation of the noise.
+        channel: index of the channel.
     """
     # At a correlation of one, the formula diverges, and no channel would exceed its noise.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
@@ -384,6 +401,10 @@ def _iterate_hat_families(
     """Yield each family of hats: label, lowest and highest centre, function that makes a hat.
 
     `size` is the strength of a hat.
+
+    Args:
+        evaluator: the runs.
+        size: strength of a hat, in the unit of the force.
     """
     if JointHatForce.name in evaluator.coefficient_slices:
         for joint in list_joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
@@ -402,7 +423,14 @@ def _iterate_hat_families(
 def _make_joint_hat(
     family: JointHatFamily, size: float, centre: float, width: float
 ) -> tuple[str, Array]:
-    """Return the name of the effect and the coefficients of one hat force at a joint of a robot."""
+    """Return the name of the effect and the coefficients of one hat force at a joint of a robot.
+
+    Args:
+        family: joint, variable and direction of the hat.
+        size: strength of the hat, in the unit of the force.
+        centre: value of the variable (s, or the unit of the joint) at which the force is largest.
+        width: distance from the centre at which the force is zero.
+    """
     other_coefficients = family.joint, family.variable, centre, width, family.direction, family.slow
     return JointHatForce.name, np.array([size, *other_coefficients])
 
@@ -414,6 +442,13 @@ def _make_hat_without_joint(
 
     `size` is the strength of the hat, and `reversal_speed` the speed over which dry friction
     reverses.
+
+    Args:
+        family: variable and direction of the hat.
+        size: strength of the hat.
+        reversal_speed: speed over which dry friction reverses.
+        centre: value of the variable at which the force is largest.
+        width: distance from the centre at which the force is zero.
     """
     return HatForce.name, np.array(
         [size, family.variable, centre, width, family.direction, reversal_speed]
@@ -440,8 +475,8 @@ def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
 def _iterate_hats_over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over time, along each coordinate and against the motion."""
     durations = []
-    for track in evaluator.prepared_runs:
-        times = track.scenario.times
+    for run_data in evaluator.prepared_runs:
+        times = run_data.scenario.times
         durations.append(float(times[-1] - times[0]))
     longest_run = max(durations)
     for axis, name in enumerate(evaluator.simulator.system.coordinates):
@@ -499,11 +534,11 @@ def _compute_high_speed_quantile(evaluator: RunEvaluator) -> float:
             continue
         c = evaluator.channels.index(name)
         rates = [np.zeros(1)]
-        for track in evaluator.prepared_runs:
-            if len(track.observed) > 3:
+        for run_data in evaluator.prepared_runs:
+            if len(run_data.observed) > 3:
                 # Use every third sample, because differences of neighbours are mostly noise.
-                step = np.diff(track.scenario.times[::3])
-                rates.append(np.diff(track.observed[::3, c]) / step)
+                step = np.diff(run_data.scenario.times[::3])
+                rates.append(np.diff(run_data.observed[::3, c]) / step)
         squares.append(np.square(np.concatenate(rates)))
     # Without recorded coordinates there is no speed.
     if not squares:

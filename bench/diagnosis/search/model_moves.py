@@ -121,6 +121,10 @@ class ModelMoves(ScoredModelSet):
 
         They are the simpler laws that the effect contains at the same joint or body, one by one and
         all together, and the most active member of a family (one effect at all joints or bodies).
+
+        Args:
+            model: the fitted model.
+            name: name of the effect to replace.
         """
         contained_laws = self._split_into_contained_laws(model, name)
         yield from ({law: c} for law, c in contained_laws.items())
@@ -136,6 +140,10 @@ class ModelMoves(ScoredModelSet):
 
         The scaling coefficients of the contained laws come first among the coefficients of the
         effect, in the order in which it names the laws.
+
+        Args:
+            model: the fitted model.
+            name: name of the effect.
         """
         effects = self.evaluator.available_effects
         coefficient_slices = self.evaluator.coefficient_slices
@@ -152,6 +160,10 @@ class ModelMoves(ScoredModelSet):
 
         The members are one effect at several joints or bodies. Nothing is yielded for other
         effects, or if the members share their coefficients.
+
+        Args:
+            model: the fitted model.
+            name: name of the family.
         """
         members = getattr(self.evaluator.available_effects[name], "members", ())
         indices = self.evaluator.get_coefficient_indices(name)

@@ -153,8 +153,15 @@ def compute_explained_squares(
 def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
     """Try all subsets of columns, and keep for each group and residual the one that explains most.
 
-    A subset counts only if its constrained coefficients are not negative. Arguments and result are
-    those of `compute_explained_squares`.
+    A subset counts only if its constrained coefficients are not negative.
+
+    Args:
+        gram: (n, k, k) G of each of n groups with k columns.
+        cross: (n, k, S) h of each group and residual.
+        positive: (k,) whether each coefficient must be nonnegative.
+
+    Returns:
+        Explained sums of squares (n, S), and coefficients (n, k) for the first residual.
     """
     number, count, samples = cross.shape
     best = np.zeros((number, samples))

@@ -1,8 +1,7 @@
 """Fitted models together with the scores of all effects that they lack.
 
-Each model is scored once noise_residual the whole library by a linear test
-(`search.score_test`). The score and the size of the residual show whether the model lacks
-something.
+Each model is scored once against the whole library by a linear test (`search.score_test`). The
+score and the size of the residual show whether the model lacks something.
 """
 
 from __future__ import annotations
@@ -260,7 +259,12 @@ class ScoredModelSet(ModelSet):
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
     def _compute_fit_distance(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
-        """Return by how much two fits differ: RMS over all samples, in units of the noise."""
+        """Return by how much two fits differ: RMS over all samples, in units of the noise.
+
+        Args:
+            first: a fit.
+            second: another fit to the same runs.
+        """
         normalised_difference = (first.simulated - second.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(normalised_difference[self.observed_mask]).mean()))
 
@@ -315,8 +319,12 @@ class ScoredModelSet(ModelSet):
     ) -> list[FitStart]:
         """Return starts of fits of each model of the beam with one more effect.
 
-        Models without stored directions are scored first. Arguments are those of
-        `refit_extensions`.
+        Models without stored directions are scored first.
+
+        Args:
+            beam: the models to extend.
+            max_count: maximum number of effects that are tried with each model.
+            fits_all: whether to include candidates that were fitted before.
         """
         starts = []
         models = list(beam)
@@ -489,8 +497,15 @@ def _score_residual(
 ) -> CandidateScores:
     """Return the scores of a residual, with a p-value from surrogate residuals.
 
-    The surrogates are random noise with the spectrum of the residual `noise_residual` (R, T, C);
-    they show which scores such noise reaches without any effect.
+    The surrogates are random noise with the spectrum of a residual; they show which scores such
+    noise reaches without any effect.
+
+    Args:
+        test: score test about the model.
+        residual: (R, T, C) residual that effects may explain.
+        noise_residual: (R, T, C) residual whose spectrum the surrogates have.
+        observed_mask: (R, T, C) whether a sample is recorded.
+        rng: source of the surrogates.
     """
     return compute_calibrated_scores(
         test,

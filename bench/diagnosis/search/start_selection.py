@@ -108,6 +108,10 @@ def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> 
 
     They are the series effects, whose response cannot be linearised; for other systems all scores
     are computed in the same way, and the result is empty.
+
+    Args:
+        evaluator: the runs, with all available effects.
+        scores: scores of the candidates.
     """
     if not evaluator.has_linearisation:
         return frozenset()
@@ -189,6 +193,13 @@ def _predict_jacobian(
 
     They consist of the derivatives of the model and the directions; None if these do not contain
     all coefficients.
+
+    Args:
+        evaluator: the runs.
+        model: the model without the effect.
+        direction_set: directions of all candidates about this model.
+        group: directions of the effect at one grid point.
+        name: name of the effect.
     """
     if not evaluator.has_linearisation:
         return None
@@ -226,8 +237,14 @@ def _list_start_sizes(
 ) -> Iterator[Array]:
     """Yield initial coefficients of an effect, from which its fit may reach different local minima.
 
-    They are the linear estimate (`estimate`), smaller shares of it, and shares of the plausible
-    range. `group` has the directions of the effect at one grid point.
+    They are the linear estimate, smaller shares of it, and shares of the plausible range.
+
+    Args:
+        evaluator: the runs.
+        direction_set: directions of all candidates.
+        group: directions of the effect at one grid point.
+        estimate: linear estimate of the coefficient of each direction of the group.
+        name: name of the effect.
     """
     bounds = compute_coefficient_bounds(evaluator, name)
     first = direction_set.candidates[group.column_indices[0]]

@@ -106,6 +106,10 @@ def _collect_full_fit_starts(
 
     They are the result, models that explain the data nearly as well, models without one of its
     effects, and the best models of a single effect.
+
+    Args:
+        subsampled_search: the finished search on thinned runs.
+        subsampled_model: its result.
     """
     competing_models = list_competing_models(subsampled_search, subsampled_model)
     selected_models = [
@@ -127,6 +131,10 @@ def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> F
 
     Near the noise, return the best model of its size, because thinned runs distinguish models less
     well.
+
+    Args:
+        search: search on all samples, with the fits of the models that the thinned runs select.
+        subsampled_model: result of the search on thinned runs.
     """
     model = search.models[frozenset(subsampled_model.effects)]
     best = search.get_best(len(subsampled_model.effects))
@@ -136,7 +144,12 @@ def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> F
 
 
 def _is_confirmed_by_all_samples(search: EffectSearch, model: FittedModel) -> bool:
-    """Return whether all samples support the model without any further effect."""
+    """Return whether all samples support the model without any further effect.
+
+    Args:
+        search: search on all samples.
+        model: its present model.
+    """
     # Far from the noise, more samples of the same runs show nothing new.
     if search.compute_excess_residual(model) >= FAR_EXCESS:
         return True

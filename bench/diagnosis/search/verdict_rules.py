@@ -214,7 +214,12 @@ def convert_excess_ratio(ratios: Sequence[float]) -> float:
 
 
 def compute_excess_ratio(excess: float, reference_excess: float) -> float:
-    """Return the ratio of two excesses, each raised to at least `NEGLIGIBLE_EXCESS`."""
+    """Return the ratio of two excesses, each raised to at least `NEGLIGIBLE_EXCESS`.
+
+    Args:
+        excess: RMS residual in units of the noise, minus one.
+        reference_excess: the excess of another model, the divisor.
+    """
     # For two models at the noise floor, the ratio is random and may be arbitrarily large.
     return max(excess, NEGLIGIBLE_EXCESS) / max(reference_excess, NEGLIGIBLE_EXCESS)
 

@@ -145,8 +145,8 @@ def _compute_motion_covariates(
         return
     column = evaluator.channels.index(name)
     rows = []
-    for track, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
-        times = track.scenario.times
+    for run_data, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
+        times = run_data.scenario.times
         place = simulated[: times.size, column]
         rate = np.gradient(place, times)
         mean_direction = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))

@@ -235,7 +235,7 @@ def _compute_network_input(
             (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
         )
         grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
-        for r, track in enumerate(evaluator.prepared_runs):
+        for r, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[r])
             relative_times = np.linspace(0.0, 1.0, size)
             for c, name in enumerate(evaluator.channels):
@@ -254,10 +254,10 @@ def _compute_network_input(
                 )
                 image[r, 2 * len(names) + channel_index] = 1.0
             for i, name in enumerate(inputs):
-                signal = np.asarray(track.scenario.inputs.get(name, np.zeros(size)))[:size]
+                signal = np.asarray(run_data.scenario.inputs.get(name, np.zeros(size)))[:size]
                 spread = float(np.abs(signal).max()) or 1.0
                 image[r, 3 * len(names) + i] = np.interp(grid, relative_times, signal / spread)
-            image[r, -1] = np.log(track.duration)
+            image[r, -1] = np.log(run_data.duration)
     return np.nan_to_num(image), rms
 
 

@@ -248,9 +248,9 @@ class RegressionEvidence:
         runs, length, channels = evaluator.observed.shape
         names = [channel.name for channel in evaluator.simulator.inputs]
         states = np.zeros((runs, length, 1 + channels + len(names)))
-        for r, track in enumerate(evaluator.prepared_runs):
+        for r, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[r])
-            times, inputs = track.scenario.times, track.scenario.inputs
+            times, inputs = run_data.scenario.times, run_data.scenario.inputs
             states[r, :size, 0] = times - times[0]
             for i, name in enumerate(names):
                 states[r, :size, 1 + channels + i] = inputs.get(name, np.zeros(size))
@@ -279,9 +279,9 @@ class RegressionEvidence:
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
-        for r, track in enumerate(evaluator.prepared_runs):
+        for r, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[r])
-            step = float(np.median(np.diff(track.scenario.times)))
+            step = float(np.median(np.diff(run_data.scenario.times)))
             window = _round_down_to_odd(
                 min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2)
             )
@@ -360,23 +360,23 @@ class RegressionEvidence:
             run: index of the run.
         """
         evaluator, system = self.evaluator, self.evaluator.simulator.system
-        track = evaluator.prepared_runs[run]
+        run_data = evaluator.prepared_runs[run]
         size, dimensions = int(evaluator.lengths[run]), len(system.coordinates)
         zeros = np.zeros((size, dimensions))
         if system.uniform or dimensions != 1:
             return zeros, zeros
-        times = track.scenario.times
+        times = run_data.scenario.times
         name = system.coordinates[0]
         if name not in evaluator.channels:
             return zeros, zeros
         x = self.base.fit.simulated[run, :size, evaluator.channels.index(name)][:, None]
         v = np.gradient(x[:, 0], times)[:, None]
         values = {c.name: c.value for c in evaluator.kind.constants}
-        values |= {**evaluator.simulator.constant_values, **track.scenario.constants}
+        values |= {**evaluator.simulator.constant_values, **run_data.scenario.constants}
         constants = {key: np.full((size, 1), float(value)) for key, value in values.items()}
         theta = np.tile(self.base.fit.theta[: evaluator.system_parameter_count], (size, 1))
         inputs = {
-            channel.name: np.asarray(track.scenario.inputs.get(channel.name, np.zeros(size)))[
+            channel.name: np.asarray(run_data.scenario.inputs.get(channel.name, np.zeros(size)))[
                 :size, None
             ]
             for channel in evaluator.simulator.inputs
