@@ -218,41 +218,56 @@ def read_extended(path: Path) -> ExtendedSimulator:
         expected = f"an extended simulator with format = {FORMAT_VERSION}"
         raise make_error(path, "", expected, document.get("format"))
     check_known_names(f"key of {path}", document, _ALLOWED_KEYS)
-    name = _name(path, document.get("name"))
+    name = _read_name(path, document.get("name"))
     robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
-    system, engine = (robot.path.stem, None) if robot else _system(path, document)
+    system, engine = (robot.path.stem, None) if robot else _read_system(path, document)
     return ExtendedSimulator(
         name=name,
         system=system,
         engine=engine,
         title=str(document.get("title", "")),
-        parameters=_numbers(path, "parameters", document.get("parameters", {})),
-        effects=_effects(path, document.get("effects", {})),
-        constants=_constants(path, document.get("constants", {})),
-        observe=_observe(path, document.get("observe", [])),
+        parameters=_read_fitted_values(path, "parameters", document.get("parameters", {})),
+        effects=_read_effects(path, document.get("effects", {})),
+        constants=_read_constants(path, document.get("constants", {})),
+        observe=_read_observed_channels(path, document.get("observe", [])),
         robot=robot,
     )
 
 
-def _system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
-    """Return the name of the registered system, and of the engine if the file states one."""
+def _read_system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
+    """Return the name of the registered system, and of the engine if the file states one.
+
+    Args:
+        path: path of the file.
+        document: its content.
+    """
     for key in document:
         if key in robot_reference.ROBOT_KEYS and key != "engine":
             raise InputError(f"{path}: {key} is for a robot; expected model too, found none")
-    engine = _text(path, "engine", document["engine"]) if "engine" in document else None
-    return _text(path, "system", document.get("system")), engine
+    engine = _check_text(path, "engine", document["engine"]) if "engine" in document else None
+    return _check_text(path, "system", document.get("system")), engine
 
 
-def _name(path: Path, value: Any) -> str:
-    """Check the name under which the simulator is registered; it is also used for files."""
-    name = _text(path, "name", value)
+def _read_name(path: Path, value: Any) -> str:
+    """Check the name under which the simulator is registered; it is also used for files.
+
+    Args:
+        path: path of the file.
+        value: value of the entry.
+    """
+    name = _check_text(path, "name", value)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
         raise make_error(path, "name", "letters, digits, '_', '.' and '-'", name)
     return name
 
 
-def _observe(path: Path, value: Any) -> list[str]:
-    """Check the list of observed channels in the file; it must not be empty."""
+def _read_observed_channels(path: Path, value: Any) -> list[str]:
+    """Check the list of observed channels in the file; it must not be empty.
+
+    Args:
+        path: path of the file.
+        value: value of the entry.
+    """
     expected = "a list of channel names"
     observe = check_name_list(path, "observe", value, expected)
     if not observe:
@@ -260,47 +275,85 @@ def _observe(path: Path, value: Any) -> list[str]:
     return list(observe)
 
 
-def _constants(path: Path, value: Any) -> dict[str, float]:
-    """Read the known constants in the file, by name."""
+def _read_constants(path: Path, value: Any) -> dict[str, float]:
+    """Read the known constants in the file, by name.
+
+    Args:
+        path: path of the file.
+        value: value of the entry.
+    """
     table = check_table(path, "constants", value)
-    return {name: _real(path, f"constants.{name}", number) for name, number in table.items()}
+    return {name: _read_real(path, f"constants.{name}", number) for name, number in table.items()}
 
 
-def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
-    """Read the coefficients of all effects in the file, by effect and coefficient."""
+def _read_effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
+    """Read the coefficients of all effects in the file, by effect and coefficient.
+
+    Args:
+        path: path of the file.
+        value: value of the entry.
+    """
     coefficients = {}
     # The order matters: a signal passes the effects one after another.
     for name, numbers in check_table(path, "effects", value).items():
         check_table(path, name, numbers)
-        coefficients[name] = _numbers(path, f"effects.{name}", numbers)
+        coefficients[name] = _read_fitted_values(path, f"effects.{name}", numbers)
     return coefficients
 
 
-def _numbers(path: Path, key: str, value: Any) -> dict[str, FittedValue]:
-    """Read a table of fitted numbers with their units, by name."""
+def _read_fitted_values(path: Path, key: str, value: Any) -> dict[str, FittedValue]:
+    """Read a table of fitted numbers with their units, by name.
+
+    Args:
+        path: path of the file.
+        key: key of the table in the file.
+        value: the table.
+    """
     table = check_table(path, key, value)
-    return {name: _number(path, f"{key}.{name}", number) for name, number in table.items()}
+    return {
+        name: _read_fitted_value(path, f"{key}.{name}", number) for name, number in table.items()
+    }
 
 
-def _number(path: Path, key: str, value: Any) -> FittedValue:
-    """Read a fitted number with its unit, and its interval where the file states one."""
+def _read_fitted_value(path: Path, key: str, value: Any) -> FittedValue:
+    """Read a fitted number with its unit, and its interval where the file states one.
+
+    Args:
+        path: path of the file.
+        key: key of the entry in the file.
+        value: the entry, a table with value and unit.
+    """
     table = check_table(path, key, value, "a table with value and unit")
-    fitted = _real(path, f"{key}.value", table.get("value"))
+    fitted = _read_real(path, f"{key}.value", table.get("value"))
     low, high = (
-        _real(path, f"{key}.{end}", table[end]) if end in table else None for end in ("low", "high")
+        _read_real(path, f"{key}.{end}", table[end]) if end in table else None
+        for end in ("low", "high")
     )
-    return FittedValue(fitted, _text(path, "unit", table.get("unit")), low, high)
+    return FittedValue(fitted, _check_text(path, "unit", table.get("unit")), low, high)
 
 
-def _text(path: Path, key: str, value: Any) -> str:
-    """Check that an entry is a text that is not empty."""
+def _check_text(path: Path, key: str, value: Any) -> str:
+    """Check that an entry is a text that is not empty.
+
+    Args:
+        path: path of the file.
+        key: key of the entry in the file.
+        value: value of the entry.
+    """
     result = check_text(path, key, value, "a text")
     if not result:
         raise make_error(path, key, "a text", value)
     return result
 
 
-def _real(path: Path, key: str, value: Any) -> float:
+def _read_real(path: Path, key: str, value: Any) -> float:
+    """Check that an entry is a finite number.
+
+    Args:
+        path: path of the file.
+        key: key of the entry in the file.
+        value: value of the entry.
+    """
     return check_finite(path, key, value, "a finite number")
 
 
@@ -321,7 +374,7 @@ def make_simulator_class(
     check_known_names(f"parameter of system {extended.system}", extended.parameters, _names(kind))
     fitted = extended.parameters
     base_parameters = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
-    values = _coefficients(extended, kind)
+    values = _list_coefficients(extended, kind)
     # Make one instance, so that wrong settings are refused here; it knows the coefficients' bounds.
     effects, observed = list(extended.effects), list(extended.observe)
     extended_simulator = kind(extended.constants, observed, effects=effects, **_engine(extended))
@@ -402,8 +455,15 @@ def check_not_extended(kind: type[SystemSimulator]) -> None:
         raise InputError(f"simulator {kind.name} is extended already; name the {advice}")
 
 
-def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> list[FittedValue]:
-    """Return all coefficients in the order of the simulator's parameters; zero if not stated."""
+def _list_coefficients(
+    extended: ExtendedSimulator, kind: type[SystemSimulator]
+) -> list[FittedValue]:
+    """Return all coefficients in the order of the simulator's parameters; zero if not stated.
+
+    Args:
+        extended: the extended simulator.
+        kind: simulator class of its system.
+    """
     values = []
     for name, numbers in extended.effects.items():
         effect = library.find_effect(name, kind.system)

@@ -77,7 +77,12 @@ class OwnSimulatorSystem(System):
         return ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Raise an error, because the mass is unknown outside the simulator."""
+        """Raise an error, because the mass is unknown outside the simulator.
+
+        Args:
+            theta: unused.
+            constants: unused.
+        """
         raise _NotDeclaredError("it does not define its mass")
 
     def weight(self, moment: StateSnapshot) -> Array:

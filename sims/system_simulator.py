@@ -409,7 +409,12 @@ def apply_sensor_effects(
 
 
 def _compute_state_times(plan: TimeGrid, steps_per_state: int) -> Array:
-    """Return the times (L, R) since the start of the states that the engine stores, s."""
+    """Return the times (L, R) since the start of the states that the engine stores, s.
+
+    Args:
+        plan: time grid of the batch.
+        steps_per_state: number of steps between two stored states.
+    """
     start = np.zeros((len(plan.ends), 1))
     return np.concatenate([start, plan.ends[:, steps_per_state - 1 :: steps_per_state]], axis=1)
 
@@ -478,6 +483,10 @@ def _is_effect_reference(value: object) -> bool:
 def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
     """Return the coefficients of a fixed effect as a tuple of numbers.
 
+    Args:
+        name: name of the effect.
+        value: a number, or a list of numbers.
+
     Raises:
         InputError: a coefficient is not a finite number.
     """
@@ -492,6 +501,11 @@ def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
 
 def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
     """Check that coefficients have plausible sizes.
+
+    Args:
+        effect: the effect.
+        system: the system on which it acts.
+        values: its coefficients in order.
 
     Raises:
         InputError: A coefficient is too large.

@@ -184,7 +184,12 @@ def _list_plugin_files(options: ComparisonOptions) -> list[str]:
 
 
 def _warn_of_missing_problem(name: str, reason: str) -> None:
-    """Warn the caller of `sweep` that a problem of its suite is left out."""
+    """Warn the caller of `sweep` that a problem of its suite is left out.
+
+    Args:
+        name: name of the problem.
+        reason: why it is left out.
+    """
     warnings.warn(f"{name} is left out: {reason}", stacklevel=5)
 
 
@@ -277,6 +282,10 @@ def _connect_to_cluster(address: str | None) -> Pool | None:
 
 def _report_study(started_study: study.Study, outcome: StudyOutcome) -> ComparisonResult:
     """Write the tables and figures of a study that has been run, and return its results.
+
+    Args:
+        started_study: the study.
+        outcome: how its runs ended.
 
     Raises:
         InputError: the study cannot be run here.

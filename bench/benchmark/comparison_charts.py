@@ -219,7 +219,14 @@ def _make_median_chart(
     keys: Sequence[tuple[str, str]],
     side_by_side: str = SIDE_BY_SIDE,
 ) -> ComparisonChart:
-    """Make panels of median errors against simulations, for pairs of a metric and a range."""
+    """Make panels of median errors against the number of simulations.
+
+    Args:
+        view: the comparison.
+        table: name of the table of the panels.
+        keys: metric and range of targets of each panel.
+        side_by_side: facet whose panels are side by side.
+    """
     statistics, budget = view.statistics, view.experiment.budget
     x_axis = _make_simulations_axis(budget)
     frames, panels = [], []

@@ -143,7 +143,14 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 
 
 def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
-    """Draw the shares of the parameters in each direction, as a grid of numbers."""
+    """Draw the shares of the parameters in each direction, as a grid of numbers.
+
+    Args:
+        axis: axes to draw on.
+        table: one row for each target and direction: column ``direction``, and the unit vector in
+            the columns `names`.
+        names: names of the parameters.
+    """
     # A direction has length 1: its squared components are shares, independent of their signs.
     squares = table.set_index("direction")[names] ** 2
     shares = squares.groupby(level=0).mean().to_numpy().T

@@ -154,6 +154,10 @@ def _format_running_times(results: ComparisonReportData, kind: str) -> str:
     The ERT is the expected number of simulations until the error stays below the reference
     threshold (`reference_level`). The text is empty if none of the best tuners has reached the
     threshold.
+
+    Args:
+        results: the comparison.
+        kind: range of the targets, such as ``in``.
     """
     view, table = results.view, results.tables["ert"]
     statistics, level = view.statistics, view.statistics.reference_level

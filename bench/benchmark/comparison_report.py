@@ -122,7 +122,13 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
 def _render_figures(
     stored: StoredComparison, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> dict[str, FigureFiles]:
-    """Render all figures that exist for the comparison, by name."""
+    """Render all figures that exist for the comparison, by name.
+
+    Args:
+        stored: content of the result folder.
+        labels: axis labels.
+        statistics: statistics of the comparison.
+    """
     return {
         name: render_all_formats(comparison_figures.draw_figure(stored, labels, name, statistics))
         for name in comparison_figures.list_figure_names(stored)
@@ -140,7 +146,12 @@ def _write_figures(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Pa
 
 
 def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:
-    """Return the number of planned runs that are missing."""
+    """Return the number of planned runs that are missing.
+
+    Args:
+        folder: result folder, which contains the plan while runs are missing.
+        stored: its content.
+    """
     plan = read_plan(folder) if (folder / SEGMENTS_FOLDER).exists() else None
     return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
 
@@ -202,7 +213,13 @@ def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
 def _format_median_errors(
     lines: pd.DataFrame, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> list[str]:
-    """Format the median errors of each range, then the errors along directions where known."""
+    """Format the median errors of each range, then the errors along directions where known.
+
+    Args:
+        lines: error curves: one row for each tuner, range, metric and number of simulations.
+        labels: axis labels.
+        statistics: statistics of the comparison.
+    """
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
         texts.append("\n" + _format_error_table(lines, kind, labels, statistics))
@@ -214,7 +231,14 @@ def _format_median_errors(
 def _format_error_table(
     lines: pd.DataFrame, kind: str, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> str:
-    """Format the median errors of one range as a table for the terminal."""
+    """Format the median errors of one range as a table for the terminal.
+
+    Args:
+        lines: error curves: one row for each tuner, range, metric and number of simulations.
+        kind: range of the targets, such as ``in``; ``real`` for a recording.
+        labels: axis labels.
+        statistics: statistics of the comparison.
+    """
     metrics = set(lines["metric"])
     if kind == "real":
         held_out = "heldout_error" in metrics
@@ -245,6 +269,12 @@ def _format_direction_errors(
     """Format errors along stiff and sloppy directions, and held-out errors, of one range.
 
     The text is empty if there are none.
+
+    Args:
+        lines: error curves: one row for each tuner, range, metric and number of simulations.
+        kind: range of the targets; ``real`` for a recording.
+        channel: error channel with unit.
+        statistics: statistics of the comparison.
     """
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
     part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]

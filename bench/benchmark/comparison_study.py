@@ -160,6 +160,10 @@ class Comparison:
     def _check_kept(self, journal: RunJournal, ids: list[str]) -> None:
         """Check every stored row, because damaged rows would falsify the results.
 
+        Args:
+            journal: journal of the stored runs.
+            ids: ids of the planned runs.
+
         Raises:
             InputError: a row is damaged, or belongs to another plan.
         """
@@ -350,7 +354,12 @@ def _make_status_error(file: RunsTable, _row: int, problem: str) -> InputError:
 
 
 def _find_run_end(name: str, status: RunStatus | None) -> RunEnd:
-    """Return how a planned run ended, or that it is missing; its id begins with the tuner label."""
+    """Return how a planned run ended, or that it is missing.
+
+    Args:
+        name: id of the run, which begins with the label of its tuner.
+        status: stored status; None if the run is missing.
+    """
     tuner = name.partition("/")[0]
     if status is None:
         return RunEnd(name, tuner, MISSING_STATUS)

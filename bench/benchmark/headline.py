@@ -160,7 +160,12 @@ def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
 
 
 def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
-    """Return the number of tuners that the best one is tested against."""
+    """Return the number of tuners that the best one is tested against.
+
+    Args:
+        statistics: statistics of the comparison.
+        kind: range of the targets, such as ``in``.
+    """
     part = _select_range(statistics, kind)
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
 

@@ -279,6 +279,11 @@ def check_shots(folder: Path, setups: Sequence[ShotSetup]) -> None:
 def _validate_document(document: dict[str, Any], name: str, columns: Columns) -> None:
     """Validate the models or the rows of a shot.
 
+    Args:
+        document: stored document of the shot.
+        name: its part, ``models`` or ``rows``.
+        columns: declarations of the values.
+
     Raises:
         CellError: a value does not match its declaration.
         KeyError: the part is missing.

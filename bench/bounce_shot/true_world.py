@@ -125,7 +125,13 @@ class _Flight:
         self._touches = False
 
     def gap(self, x: float, _y: float, z: float) -> float:
-        """Return the distance of the ball's surface from the plane, m."""
+        """Return the distance of the ball's surface from the plane, m.
+
+        Args:
+            x: position of the centre along the slope direction, m.
+            _y: unused.
+            z: height of the centre, m.
+        """
         return x * self._normal[0] + z * self._normal[1] - self._ball.radius
 
     def run(self, start: tuple[float, float, float], times: Array) -> Array:

@@ -97,7 +97,13 @@ class TextWriter:
         """Print nothing: all lines have been printed before."""
 
     def print_error(self, kind: ErrorKind, message: str, code: int) -> None:  # noqa: ARG002
-        """Print one line on stderr, except for internal errors, which have a traceback."""
+        """Print one line on stderr, except for internal errors, which have a traceback.
+
+        Args:
+            kind: kind of the error.
+            message: text of the error.
+            code: exit code of the program; unused.
+        """
         _print_warning(kind, message)
 
 
@@ -116,7 +122,13 @@ class JsonWriter:
         print(format_json(answer.document))
 
     def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
-        """Print the error as JSON, and as a line on stderr for logs."""
+        """Print the error as JSON, and as a line on stderr for logs.
+
+        Args:
+            kind: kind of the error.
+            message: text of the error.
+            code: exit code of the program.
+        """
         _print_warning(kind, message)
         print(format_json({"error": {"kind": kind, "message": message, "code": code}}))
 

@@ -112,7 +112,12 @@ class SearchProgress:
         self._estimated_at = self._started
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a stage; see `ProgressListener`."""
+        """Begin a stage; see `ProgressListener`.
+
+        Args:
+            name: name of the stage.
+            total: number of its steps; None if it is unknown.
+        """
         self._name, self._total, self._done = name, total, 0
         self._redraw_if_due()
 
@@ -122,7 +127,12 @@ class SearchProgress:
         self._redraw_if_due()
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Store the best model so far; see `ProgressListener`."""
+        """Store the best model so far; see `ProgressListener`.
+
+        Args:
+            effects: names of the effects of the model.
+            share: share of the discrepancy that they explain, from 0 to 1.
+        """
         # 99.96 % must not be shown as 100 %.
         percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
         self._best = " + ".join(effects), percent

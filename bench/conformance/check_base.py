@@ -53,7 +53,12 @@ def check(condition: bool, expected: str, found: object, location: str) -> None:
 
 
 def is_bitwise_equal(a: Array, b: Array) -> bool:
-    """Return whether two arrays have the same shape and the same bits, NaN included."""
+    """Return whether two arrays have the same shape and the same bits, NaN included.
+
+    Args:
+        a: an array.
+        b: another one.
+    """
     return a.shape == b.shape and a.tobytes() == b.tobytes()
 
 

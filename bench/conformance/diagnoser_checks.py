@@ -194,6 +194,10 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
 def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
     """Run a diagnoser and validate its answer.
 
+    Args:
+        kind: class of the diagnoser.
+        case: the recording to diagnose, and the effects of the library.
+
     Raises:
         CheckError: the result is not a valid answer.
     """

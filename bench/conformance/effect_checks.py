@@ -199,6 +199,10 @@ def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSn
     """Make the state of two batch elements in motion, for direct calls of an effect's hook.
 
     Coordinates and rates are arbitrary, but not zero, and different for each element.
+
+    Args:
+        host: simulator that declares constants and inputs.
+        system: the system on which the effect acts.
     """
     shape = (2, len(system.coordinates))
     theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)

@@ -219,7 +219,12 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
 
 
 def _make_coefficients(effect: type[Effect], share: float) -> Array:
-    """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0."""
+    """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0.
+
+    Args:
+        effect: class of the effect.
+        share: position between the bounds of the plausible ranges, from 0 to 1.
+    """
     limits = np.array([c.plausible[0] for c in effect.coefficients])
     theta: Array = limits[:, 0] + share * (limits[:, 1] - limits[:, 0])
     return theta[None] * (share != 0.0)

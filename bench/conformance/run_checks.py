@@ -176,6 +176,11 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
     """Run the checks one after another, and yield each with its line (empty if it passed).
 
     After two checks that were killed or whose process died, no more checks are run.
+
+    Args:
+        kind: kind of the subject: tuner, simulator, effect or diagnoser.
+        name: registered name of the subject.
+        plugins: paths of the plugin files.
     """
     failed: list[Check] = []
     lost_workers = 0

@@ -89,6 +89,10 @@ def _check_inertia(kind: type[OwnSimulator], value: float | Array) -> None:
 
     D is the number of coordinates. Any other inertia would give accelerations without meaning.
 
+    Args:
+        kind: class of the simulator.
+        value: the inertia that it returns.
+
     Raises:
         CheckError: it is not.
     """

@@ -106,6 +106,16 @@ _NAME = re.compile(r"[a-z][a-z0-9_-]*$")
 
 
 def _check_run_completed(kind: type[Tuner], trace: RunTrace, condition: str) -> None:
+    """Check that a run of the tuner was not ended by an error or a time limit.
+
+    Args:
+        kind: class of the tuner.
+        trace: trace of the run.
+        condition: circumstances of the run in words, the end of the message.
+
+    Raises:
+        CheckError: the run failed.
+    """
     outcome, location = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
     check(
         trace.status in ("done", "converged"),
@@ -227,7 +237,12 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
     # A wrapper around the tuner, because the harness's loop clips what it records.
     class Watched(Tuner):
         def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-            """Run the tuner unchanged, and copy its proposals and recommendations to `asked`."""
+            """Run the tuner unchanged, and copy its proposals and recommendations to `asked`.
+
+            Args:
+                task: number of parameters and budget.
+                rng: random numbers of the tuner.
+            """
             steps = make_trained_tuner(kind, 2).tune(task, rng)
             try:
                 proposal = next(steps)
@@ -391,7 +406,12 @@ class _RandomSearchBaseline(Tuner):
     """Random search, the baseline that every tuner should beat."""
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose uniformly distributed points."""
+        """Propose uniformly distributed points.
+
+        Args:
+            task: number of parameters and budget.
+            rng: random numbers of the tuner.
+        """
         while True:
             yield rng.uniform(size=(1, task.dim))
 

@@ -138,7 +138,12 @@ def explain(
 def _explain_run(
     recording: RecordingSource | Sequence[RecordingSource], options: ExplainOptions
 ) -> Iterator[_ExplainRun]:
-    """Create a diagnosis and its worker pool for a `with` block, and close both at its end."""
+    """Create a diagnosis and its worker pool for a `with` block, and close both at its end.
+
+    Args:
+        recording: source of the recording, or of several logs that are explained together.
+        options: options of the diagnosis.
+    """
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
     with (
         closing(ForkedWorkerPool(options.jobs or 1)) as worker_pool,
@@ -185,7 +190,12 @@ def explain_and_design(
 
 
 def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
-    """Switch off or leave out the samples of a robot in which its drives have no effect."""
+    """Switch off or leave out the samples of a robot in which its drives have no effect.
+
+    Args:
+        recording: the recording.
+        kind: class of the simulator.
+    """
     if not kind.has_model:
         return recording
     # This import is needed for robots only.
@@ -285,6 +295,10 @@ class _ExplainRun:
         """Thin and split the runs, leave out their settling, and add noise where there is none.
 
         The recording is replaced, and each change is noted.
+
+        Args:
+            kind: class of the simulator.
+            options: options of the diagnosis: number of segments, and whether runs stay whole.
         """
         self.recording, thinning_note = thin_recording(self.recording, kind)
         self.recording, settling_note = leave_out_settling(self.recording, kind)
@@ -614,6 +628,10 @@ class _ExplainRun:
         """Test for a wrong unit or sign of a robot's recording, if no effect explains the residual.
 
         For a robot, units are usually tested only if no effect has explained the gap before.
+
+        Args:
+            search: the search, with the fitted base model.
+            finding: result of the diagnosis.
         """
         is_explained = finding.verdict in EXPLAINED_VERDICTS
         if not self._checks_units_late or is_explained or self.search_control.is_over():
@@ -630,7 +648,12 @@ class _ExplainRun:
     def _check_units_imitated_by_causes(
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
-        """Return wrong units and signs that the diagnosed causes imitate."""
+        """Return wrong units and signs that the diagnosed causes imitate.
+
+        Args:
+            search: the search, with the fitted base model.
+            finding: result of the diagnosis.
+        """
         faults = [
             find_imitated_unit(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
             for cause in self.assessor.build_causes(search, finding)
@@ -818,7 +841,12 @@ class _ExplainRun:
     def _widen_ranges(
         self, wider_bounds: Mapping[str, Bounds], declared_bounds: Mapping[str, Bounds]
     ) -> None:
-        """Report the wider ranges of base parameters, and use them for all runs."""
+        """Report the wider ranges of base parameters, and use them for all runs.
+
+        Args:
+            wider_bounds: new lower and upper bound of each widened parameter, by name.
+            declared_bounds: bounds that the system or the model file declares.
+        """
         for evaluator in self._list_run_evaluators()[1:]:
             use_bounds(evaluator, wider_bounds)
         for name, (low, high) in wider_bounds.items():
@@ -1078,6 +1106,12 @@ class _ExplainRun:
         """Record that the file's own step is too coarse; the finer step is in use already.
 
         A URDF specifies no step, so that a finer one corrects nothing in it.
+
+        Args:
+            refinement: the finer step and integrator.
+            gain: gain in penalised log-likelihood over the file's own step.
+            base: fit of the base model with the file's own step.
+            file_evaluators: run evaluators with the file's own step.
         """
         # This import is needed for robots only.
         from sims.robot.integrator_settings import specifies_integrator
@@ -1106,6 +1140,10 @@ class _ExplainRun:
         first choice is preliminary. Models are compared by penalised log-likelihood and residual,
         and a finer step must be clearly better: data that MuJoCo made with the file's own step must
         not be explained by another.
+
+        Args:
+            search: the search with the present step.
+            finding: its result.
         """
         if (
             self.finer is None
@@ -1239,8 +1277,9 @@ class _ExplainRun:
     ) -> ExtendedSimulator:
         """Build the extended simulator: the base simulator with fitted values and found effects.
 
-        `base_values` has the fitted base parameters, `freed_constants` the constants fitted like
-        parameters, and `added_effects` the coefficients of each found effect, all by name.
+        Args:
+            search: the search, with the fitted models.
+            finding: result of the diagnosis, with the model of the found effects.
         """
         evaluator, numbers = (
             self.fitting,

@@ -196,7 +196,12 @@ def _split_into_elements(text: str) -> list[str]:
 
 
 def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
-    """Yield the changes of a block of elements, each with the comments before it."""
+    """Yield the changes of a block of elements, each with the comments before it.
+
+    Args:
+        old: lines of the block in the user's file, one for each element.
+        new: lines of the block in the extended file, with comments before elements.
+    """
     elements = list(_pair_with_comments(new))
     # With equal counts, each new element replaces the old one at its position.
     if len(old) != len(elements):

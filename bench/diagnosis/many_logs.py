@@ -336,7 +336,15 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
 
 
 def _write_results(out: Path, rows: Sequence[LogResult]) -> None:
-    """Write the results so far: the state, with which a later call continues, and the table."""
+    """Write the results so far: the state, with which a later call continues, and the table.
+
+    Args:
+        out: output folder of the batch.
+        rows: results in the order of the logs.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(

@@ -178,7 +178,13 @@ class _CommonCause(NamedTuple):
 def _list_causes(
     rows: Sequence[LogResult], numbers: pd.DataFrame, batch: BatchPageInput
 ) -> list[_CommonCause]:
-    """List the causes over all logs, the most common first."""
+    """List the causes over all logs, the most common first.
+
+    Args:
+        rows: results of the logs.
+        numbers: one row for each coefficient of a cause of a log, with the column ``cause``.
+        batch: the batch, with the path of each recording.
+    """
     counts = Counter(format_cause(cause) for row in rows for cause in row.causes)
     causes = []
     for name, _ in counts.most_common():
@@ -264,7 +270,12 @@ def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
 
 
 def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
-    """Make the panel of the errors on held-out runs, in noise floors; none without errors."""
+    """Make the panel of the errors on held-out runs, in noise floors; none without errors.
+
+    Args:
+        logs: one row for each log, with the columns ``before`` and ``after``.
+        across: horizontal axis with the logs.
+    """
     errors = logs[["before", "after"]]
     log_count = int(errors.map(lambda error: isfinite(error) and error > 0).all(axis=1).sum())
     if not log_count:

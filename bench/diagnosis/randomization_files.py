@@ -231,6 +231,11 @@ def _make_gain_terms(
     """Yield the terms that randomise stiffness and damping of the actuators at each joint.
 
     Isaac Lab has one damping for each joint, so that of actuators and of the joint itself is added.
+
+    Args:
+        by_effect: ranges by effect and by place; those that are used are removed.
+        sentences: comment for each range.
+        robot: model of the robot.
     """
     stiffness = by_effect.pop("actuator.stiffness", {})
     damping = by_effect.pop("actuator.damping", {})
@@ -261,7 +266,12 @@ def _make_gain_terms(
 
 
 def _group_by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return all actuators of each joint at which one of the given actuators acts."""
+    """Return all actuators of each joint at which one of the given actuators acts.
+
+    Args:
+        robot: model of the robot.
+        ranges: anything by the name of an actuator; only the names count.
+    """
     joints = dict.fromkeys(robot.actuator(name).joint for name in ranges)
     return {
         j: [actuator.name for actuator in robot.actuators if actuator.joint == j]
@@ -273,7 +283,15 @@ def _group_by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str
 def _convert_gain_to_joint(
     robot: Any, ranges: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
 ) -> tuple[float, float]:
-    """Return the interval of an actuator's gain, converted to its joint."""
+    """Return the interval of an actuator's gain, multiplied by the square of the gear ratio.
+
+    Args:
+        robot: model of the robot.
+        ranges: ranges by the name of the actuator; without one, the interval is the gain of the
+            file.
+        name: name of the actuator.
+        term: column of MuJoCo's `actuator_biasprm` with the gain: 1 for stiffness, 2 for damping.
+    """
     actuator_id = robot.actuator(name).id
     share = float(robot.compiled.actuator_gear[actuator_id, 0]) ** 2
     if name in ranges:
@@ -288,7 +306,13 @@ def _make_gravity_term(
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
-    """Yield the term that randomises the gravity vector, if its size or direction has a range."""
+    """Yield the term that randomises the gravity vector, if its size or direction has a range.
+
+    Args:
+        by_effect: ranges by effect and by place; those of gravity are removed.
+        sentences: comment for each range.
+        robot: model of the robot.
+    """
     scale = [entry for ranges in by_effect.pop("gravity.scale", {}).values() for entry in ranges]
     tilt = [entry for ranges in by_effect.pop("gravity.tilt", {}).values() for entry in ranges]
     if not scale and not tilt:
@@ -366,6 +390,12 @@ def _sum_ranges(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _format_pair(low: float, high: float) -> str:
+    """Format the ends of a range as a Python tuple.
+
+    Args:
+        low: lower end.
+        high: upper end.
+    """
     return f"({number(low)}, {number(high)})"
 
 
@@ -415,7 +445,13 @@ def _list_fields(entry: RandomizationRange) -> list[str]:
 
 
 def _format_index(entry: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
-    """Format the index of an element, based on the variable of its joint, body or actuator."""
+    """Format the index of an element, based on the variable of its joint, body or actuator.
+
+    Args:
+        entry: the range, with the field of the compiled model.
+        place: variable with the id of the joint, body or actuator; empty if there is none.
+        address: index of the element in the field; its first number is the place.
+    """
     if not place:
         return ", ".join(str(k) for k in address)
     first = f"model.jnt_dofadr[{place}]" if entry.field.startswith("dof_") else place

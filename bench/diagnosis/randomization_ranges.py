@@ -223,6 +223,12 @@ class _Totals:
 
 
 def _get_value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
+    """Return the fitted value of a coefficient; 0 if it was not fitted.
+
+    Args:
+        numbers: fitted coefficients of an effect, by name.
+        coefficient: name of the coefficient.
+    """
     return numbers[coefficient].value if coefficient in numbers else 0.0
 
 

@@ -253,7 +253,13 @@ def get_robot(evaluator: RunEvaluator) -> RobotModel | None:
 
 
 def _find_largest_residual_channel(evaluator: RunEvaluator, before: Array, sigma: Array) -> str:
-    """Return the channel with the largest residual in units of its noise."""
+    """Return the channel with the largest residual in units of its noise.
+
+    Args:
+        evaluator: the runs.
+        before: (R, T, C) channels simulated with the base model.
+        sigma: (C,) standard deviation of the noise of each channel.
+    """
     squares = np.square((evaluator.observed - before) / sigma)
     sizes = []
     for c in range(len(evaluator.channels)):
@@ -279,6 +285,10 @@ def _iterate_variables(
     """Yield the variables of residual profiles, each with name, unit and values (R, T).
 
     They are the time, the position, the speed, and each recorded input.
+
+    Args:
+        evaluator: the runs.
+        simulated: (R, T, C) simulated channels, from which position and speed are taken.
     """
     times = _compute_run_times(evaluator)
     yield "time", "s", times

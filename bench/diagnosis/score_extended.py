@@ -191,7 +191,13 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
 
 
 def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
-    """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
+    """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states.
+
+    Args:
+        evaluator: the runs.
+        extended: extended simulator, with its parameters and coefficients.
+        sigma: (C,) standard deviation of the noise, which weights the channels.
+    """
     no_autocorrelation = np.zeros(len(sigma))
     runs = HeldOutRuns(evaluator, NoiseModel(sigma, no_autocorrelation))
     (prediction,) = runs.fit_initial_states([build_theta(evaluator, extended)])
@@ -199,7 +205,12 @@ def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: 
 
 
 def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
-    """Compute the squared errors (R, T, C); zero where no sample was observed."""
+    """Compute the squared errors (R, T, C); zero where no sample was observed.
+
+    Args:
+        evaluator: the runs.
+        simulated: (R, T, C) simulated channels.
+    """
     observed_mask = np.isfinite(evaluator.observed)
     errors = evaluator.observed - simulated
     squares: Array = np.where(observed_mask, np.square(errors), 0.0)

@@ -276,6 +276,10 @@ class VerdictBuilder:
         This is so if no fitted model with effects has a higher penalised log-likelihood than the
         base model, or none predicts the held-out runs better. In closed loops and at rest,
         derivatives may predict a gain that no fit achieves.
+
+        Args:
+            search: the search, with all fitted models.
+            finding: result of the diagnosis.
         """
         if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
             return False
@@ -393,6 +397,10 @@ class VerdictBuilder:
 
         Return None if the prediction of the base model failed, or if no runs were predicted with
         both models.
+
+        Args:
+            finding: result of the diagnosis, with the held-out predictions.
+            rng: source of the bootstrap samples.
         """
         runs, held_out_fits, names = (
             self.held_out_evaluator,
@@ -425,6 +433,10 @@ class VerdictBuilder:
 
         A score is reduced by the price of each coefficient beyond the first, so that an effect
         precedes more general effects that contain it.
+
+        Args:
+            search: the search, with the scores about the base model.
+            finding: result of the diagnosis, with the held-out predictions.
         """
         scores = search.base_scores
         if scores is None:
@@ -450,7 +462,12 @@ class VerdictBuilder:
         return tuple(sorted(candidates, key=lambda row: -row.score))
 
     def _get_closed_share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
-        """Return the share of the held-out gap that a model closes; None if it is not measured."""
+        """Return the share of the held-out gap that a model closes; None if it is not measured.
+
+        Args:
+            finding: result of the diagnosis, with the held-out predictions.
+            names: names of the effects of the model.
+        """
         runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None

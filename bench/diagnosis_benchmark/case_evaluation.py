@@ -194,6 +194,10 @@ def _diagnose_in_process(
 ) -> dict[str, Any]:
     """Run a trusted diagnoser in this process.
 
+    Args:
+        request: the case and its files, as the process of a diagnoser receives them.
+        trained_arrays: arrays of a learned diagnoser, by name.
+
     Raises:
         RunEndedError: the diagnoser failed.
     """

@@ -516,6 +516,10 @@ def _register_stub(name: str, trusted: bool) -> None:
 def _compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
     """Compute hashes of everything that must not change while the study is incomplete.
 
+    Args:
+        experiment: configuration of the study.
+        plugins: paths of the plugin files.
+
     Returns:
         Hashes by a description for the user.
     """

@@ -68,7 +68,9 @@ class Projection:
 def _compute_camera_axes(azimuth: float, elevation: float) -> Array:
     """Return the unit vectors right, up and forward of a camera, in the rows of a (3, 3) array.
 
-    The angles are in degrees, by the convention of MuJoCo's free camera.
+    Args:
+        azimuth: angle in degrees, by the convention of MuJoCo's free camera.
+        elevation: angle in degrees, by the same convention.
     """
     a, e = np.deg2rad([azimuth, elevation])
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -129,6 +131,10 @@ def _find_end_points(model: Any, data: Any) -> Array:
     """Return the (N, 3) drawn ends of bodies that have neither shapes nor child bodies.
 
     The end is the body's joint mirrored at its centre of mass.
+
+    Args:
+        model: compiled model (`mujoco.MjModel`).
+        data: its state at the pose (`mujoco.MjData`).
     """
     shapeless_bodies = set(range(1, model.nbody)) - {
         *model.geom_bodyid.tolist(),

@@ -70,7 +70,12 @@ def encode_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) ->
 
 
 def _make_chunk(kind: bytes, data: bytes) -> bytes:
-    """Return a chunk of a PNG file with its length and checksum."""
+    """Return a chunk of a PNG file with its length and checksum.
+
+    Args:
+        kind: four letters of the chunk's type, such as ``IDAT``.
+        data: content.
+    """
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 

@@ -164,7 +164,12 @@ def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
 
 
 def _hide_floors(mujoco: Any, model: Any) -> None:
-    """Hide floors, which would fill the image."""
+    """Hide floors, which would fill the image.
+
+    Args:
+        mujoco: the module.
+        model: compiled model, changed in place.
+    """
     floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     for g in range(model.ngeom):
         if int(model.geom_type[g]) in floor_types:

@@ -141,6 +141,10 @@ def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
     """Reduce a signal (T,) to about `_MAX_POINTS_PER_RUN` points: minimum and maximum of each part.
 
     The curve then looks the same, and the file stays small.
+
+    Args:
+        times: (T,) times in seconds.
+        values: (T,) signal, NaN where missing.
     """
     if values.size <= _MAX_POINTS_PER_RUN:
         return times, values
@@ -172,7 +176,12 @@ def _style_panels(axes: Sequence[Axes], placed_runs: Sequence[_PlacedRun]) -> No
 
 
 def _draw_run_names(axis: Axes, placed_runs: Sequence[_PlacedRun]) -> None:
-    """Write the name of each run above the first panel, in the middle of the run."""
+    """Write the name of each run above the first panel, in the middle of the run.
+
+    Args:
+        axis: axes of the first panel.
+        placed_runs: the runs, with their places on the time axis.
+    """
     for part in placed_runs:
         middle = float(part.times[[0, -1]].mean())
         axis.annotate(
@@ -195,7 +204,12 @@ def _draw_title(axis: Axes, recording: Recording, placed_runs: Sequence[_PlacedR
 
 
 def _make_mark_legend(recording: Recording, placed_runs: Sequence[_PlacedRun]) -> list[Line2D]:
-    """Make the legend entries for the marks that are present."""
+    """Make the legend entries for the marks that are present.
+
+    Args:
+        recording: the recording.
+        placed_runs: the runs that are drawn.
+    """
     from matplotlib.lines import Line2D
 
     marks = [Line2D([], [], color=_FITTING, label="for fitting")]

@@ -112,7 +112,12 @@ def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
 
 
 def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
-    """Return the (3,) points where moving bodies are fixed to static ones, without free bodies."""
+    """Return the (3,) points where moving bodies are fixed to static ones, without free bodies.
+
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+    """
     model = robot.compiled
     free_bodies = {
         int(model.jnt_bodyid[joint.id]) for joint in robot.joints if joint.kind == "free"
@@ -528,6 +533,11 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
     """Return the position (3,) in the world that belongs to a channel; None if it has none.
 
     It is that of the joint, or of the body or site on which a sensor is mounted.
+
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+        name: name of the channel, such as ``q.elbow`` or ``s.gyro``.
     """
     import mujoco
 

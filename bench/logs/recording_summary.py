@@ -125,7 +125,12 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
 
 
 def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Yield a line for each constant of the system, and one for the stated initial states."""
+    """Yield a line for each constant of the system, and one for the stated initial states.
+
+    Args:
+        recording: the recording.
+        kind: class of the simulator, which declares the constants.
+    """
     for constant in kind.constants:
         yield _format_constant(recording, constant.name, constant.value, constant.unit)
     run_texts = []
@@ -138,7 +143,14 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
 
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
-    """Describe a constant's value, and list the runs with each value if it differs."""
+    """Describe a constant's value, and list the runs with each value if it differs.
+
+    Args:
+        recording: the recording.
+        name: name of the constant.
+        default: value if the recording states none.
+        unit: unit of the value.
+    """
     common_value = recording.constants.get(name, default)
     runs_by_value: dict[float, list[str]] = {}
     for run in recording.runs:
@@ -221,7 +233,12 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
 
 
 def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
-    """Yield a line for the commands and one for the joint positions missing in the log."""
+    """Yield a line for the commands and one for the joint positions missing in the log.
+
+    Args:
+        recording: the recording, of which the first run counts.
+        robot: model of the robot.
+    """
     run = recording.runs[0]
     missing_commands = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
     if missing_commands:
@@ -237,7 +254,12 @@ def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[s
 
 
 def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:
-    """Yield a line for each signal that leaves its range."""
+    """Yield a line for each signal that leaves its range.
+
+    Args:
+        recording: the recording.
+        robot: model of the robot, with its ranges.
+    """
     model = robot.path.name
     for joint in robot.joints:
         if joint.has_one_coordinate:

@@ -411,7 +411,13 @@ def _make_parameters(
 def _make_coefficients(
     name: str, stated_values: EffectCoefficients, kind: type[Simulator]
 ) -> list[float]:
-    """Return an effect's coefficients in order; coefficients that are not named are zero."""
+    """Return an effect's coefficients in order; coefficients that are not named are zero.
+
+    Args:
+        name: name of the effect.
+        stated_values: one coefficient, several in order, or some by name.
+        kind: class of the simulator.
+    """
     if isinstance(stated_values, Mapping):
         of_system = (
             library.find_effect(name, kind.system).on(kind.system)
@@ -428,7 +434,13 @@ def _make_coefficients(
 
 
 def _repeat_for_places(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
-    """Repeat the coefficients of one place for all places of an effect family."""
+    """Repeat the coefficients of one place for all places of an effect family.
+
+    Args:
+        name: name of the effect; that of a family ends with ``@*``.
+        values: coefficients of one place, or of all places.
+        kind: class of the simulator.
+    """
     if not name.endswith("@*") or not issubclass(kind, SystemSimulator):
         return values
     effect = library.find_effect(name, kind.system)
@@ -462,7 +474,15 @@ def _make_noise_table(
 
 
 def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tuple[float, float]:
-    """Return the interval (low, high) from which an initial state is drawn."""
+    """Return the interval (low, high) from which an initial state is drawn.
+
+    Args:
+        name: name of the initial state.
+        stated_range: a value, or lowest and highest value.
+
+    Raises:
+        InputError: it is neither.
+    """
     limits = (
         (stated_range, stated_range)
         if isinstance(stated_range, int | float)

@@ -352,6 +352,10 @@ def has_both_comparisons(folder: Path) -> bool:
 def _write_comparison_tables(folder: Path, print_line: PrintLine) -> int:
     """Write the tables of the comparisons that exist.
 
+    Args:
+        folder: folder of the study.
+        print_line: prints one line of text.
+
     Returns:
         Number of failed runs.
     """

@@ -436,7 +436,12 @@ def _list_comparison_folders(folder: Path) -> Iterator[Path]:
 
 
 def _format_compare_command(folder: Path, name: str) -> str:
-    """Build the command that repeats a comparison, or a suite's comparisons of some methods."""
+    """Build the command that repeats a comparison, or a suite's comparisons of some methods.
+
+    Args:
+        folder: folder of the comparison, or of a suite's comparisons.
+        name: name of the folder in the archive.
+    """
     configurations = [read_configuration(part) for part in list_study_folders(folder)]
     experiment = configurations[0].experiment
     if not experiment.suite or experiment.diagnosis:

@@ -249,7 +249,12 @@ def _verify_losses(
 
 
 def _convert_to_unit_cube(problem: TuningProblem, frame: pd.DataFrame) -> Array:
-    """Convert parameters to points of the unit cube, clipped because of rounding."""
+    """Convert parameters to points of the unit cube, clipped because of rounding.
+
+    Args:
+        problem: the problem, with the bounds of its parameters.
+        frame: one row for each point, one column for each parameter in physical units.
+    """
     points: Array = np.clip(problem.cube.to_unit_cube(frame.to_numpy(dtype=float)), 0.0, 1.0)
     return points
 
@@ -287,7 +292,13 @@ def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:
 def _verify_tables(
     folder: Path, stored: StoredComparison, print_line: PrintLine
 ) -> list[VerificationFailure]:
-    """Verify that table.csv follows from the rows, and return the failures."""
+    """Verify that table.csv follows from the rows, and return the failures.
+
+    Args:
+        folder: folder of the comparison.
+        stored: its content.
+        print_line: prints one line of text.
+    """
     path = folder / "table.csv"
     if not path.exists():
         print_line("table.csv: not found; write it with simgap plot")

@@ -144,6 +144,10 @@ def estimate_difference(
         """Compute the network's output (..., dim) for inputs of its first and second branch.
 
         Eq. (1): both branches are concatenated, then follow one hidden and one linear layer.
+
+        Args:
+            a: (..., D) input rows of the first branch, the proposed side.
+            b: (..., E) input rows of the second branch, the target side.
         """
         branches = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
         hidden = branch(branches, "joined")

@@ -53,7 +53,12 @@ class BayesianOptimisation(Tuner):
     noise: float | str = "gaussian"
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one point at a time; the first one is the start."""
+        """Propose one point at a time; the first one is the start.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         with _ignore_skopt_warnings():
             optimiser = self.make_optimiser(task.dim, int(rng.integers(2**31)))
         point = task.start

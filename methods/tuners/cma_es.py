@@ -49,7 +49,12 @@ class CMAES(Tuner):
     restarts: bool = True
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one generation per yield."""
+        """Propose one generation per yield.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         if self.evaluate_start:
             yield task.start[None]
         centre = task.start
@@ -78,6 +83,11 @@ class CMAES(Tuner):
         """Make a strategy with its own random generator.
 
         By default pycma seeds and uses NumPy's global generator.
+
+        Args:
+            centre: (dim,) mean of the first generation, in the unit cube.
+            population: points in a generation; None for pycma's own choice.
+            rng: random numbers of the strategy.
         """
         import cma
 
@@ -97,7 +107,12 @@ class CMAES(Tuner):
 
     @staticmethod
     def _get_clipped_mean(strategy: Any, dim: int) -> Array:
-        """Return the distribution's mean, clipped to the cube."""
+        """Return the distribution's mean, clipped to the cube.
+
+        Args:
+            strategy: strategy of pycma.
+            dim: number of parameters of the simulation.
+        """
         mean: Array = np.clip(strategy.result.xfavorite[:dim], 0.0, 1.0)
         return mean
 

@@ -93,7 +93,12 @@ class DirectRegressor(PairTuner):
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Propose one estimate from the target, and stop after its simulation."""
+        """Propose one estimate from the target, and stop after its simulation.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: unused; the method is deterministic.
+        """
         network = self.get_trained_network().select_for(task)
         target = network.features(task.observed[None], task.lengths, task.scene)[0]
         # The proposed input is zero, so the difference is the parameters themselves.

@@ -67,7 +67,12 @@ class EntropySearch(Tuner):
     refit: int = 3
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Run the published search, or the refined one."""
+        """Run the published search, or the refined one.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         return (
             self._tune_as_published(task, rng) if self.published else self._tune_refined(task, rng)
         )
@@ -78,6 +83,10 @@ class EntropySearch(Tuner):
         After each simulation the error is modelled by a Gaussian process. The estimate is the grid
         point that most often has the smallest error in draws of the process; the next simulation is
         at the point with the largest entropy term (1).
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
         """
         grid = np.linspace(0.0, 1.0, self.grid)[:, None]
         if task.dim > 1:
@@ -111,6 +120,10 @@ class EntropySearch(Tuner):
 
         The first points are quasi-random; then each simulation is at the candidate with the largest
         entropy term (1), where it is most uncertain whether the error has its minimum.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
         """
         design = generate_quasi_random_points(self.initial, rng.uniform(size=task.dim))
         points = np.empty((0, task.dim))

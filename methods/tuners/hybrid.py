@@ -66,7 +66,12 @@ class TuneNetLeastSquares(TuneNet):
     near: float = 0.1
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Take network steps, then fit by least squares from there, then from new starts."""
+        """Take network steps, then fit by least squares from there, then from new starts.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         finish = LeastSquares(reproduced=_ROUNDING_LOSS)
         run = EvaluationHistory(task, _ROUNDING_LOSS)
         loss_tolerance = run.enough / _ROUNDING_LOSS * finish.reproduced
@@ -93,6 +98,10 @@ class TuneNetLeastSquares(TuneNet):
 
         A step pays if the loss falls below `pays` times the lowest one before; after
         `patience` steps in a row that do not pay, the network is given up.
+
+        Args:
+            run: record of all simulations of the run, extended in place.
+            task: start and observations of the target.
 
         Returns:
             True if the last step paid, so that least squares can trust the point reached.
@@ -126,6 +135,10 @@ class TuneNetLeastSquares(TuneNet):
         Simulations nearby are used for the Jacobian, since they cost nothing more (1): it has
         secants to these points, and finite differences, which are simulated, in the remaining
         directions.
+
+        Args:
+            run: record of all simulations of the run, extended in place.
+            finish: options of the least-squares fit, with the limits of its differences.
         """
         finite = np.isfinite(run.losses)
         best = int(np.nanargmin(np.where(finite, run.losses, np.nan)))

@@ -104,7 +104,12 @@ class LeastSquares(Tuner):
     ahead: bool = False
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Fit from the start, then from other points until the target is reproduced."""
+        """Fit from the start, then from other points until the target is reproduced.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         run = EvaluationHistory(task, self.reproduced)
         yield from self.fit_from_point(run, task.start)
         while not run.finished:
@@ -149,6 +154,13 @@ class LeastSquares(Tuner):
         """Compute one-sided differences, inward at the upper bound.
 
         If a simulation fails, the difference is taken on the other side.
+
+        Args:
+            run: record of all simulations of the run, extended in place.
+            point: (dim,) point of the unit cube.
+            residual: (samples,) residual at the point.
+            longest: longest step, a share of the cube, limited by `difference` and
+                `smallest_difference`.
         """
         h = min(max(longest, self.smallest_difference), self.difference)
         steps = np.where(point + h > 1.0, -h, h)

@@ -39,7 +39,12 @@ class NelderMead(Tuner):
     step_tolerance: float = 0.0
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Pass nlopt's points to the harness one by one."""
+        """Pass nlopt's points to the harness one by one.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: unused; the method is deterministic.
+        """
         return from_callback(lambda loss: self._minimise(task, loss))
 
     def _minimise(self, task: Task, loss: Callable[[Array], float]) -> str:

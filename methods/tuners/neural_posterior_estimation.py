@@ -190,7 +190,12 @@ class NeuralPosteriorEstimation(Tuner):
         return flow
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose the mean of the posterior, then samples of it."""
+        """Propose the mean of the posterior, then samples of it.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         if self._read is None:
             raise RuntimeError("npe has not been trained; call fit or restore first")
         row = self._read(task.observed[None], task.lengths, task.scene)

@@ -21,7 +21,12 @@ class RandomSearch(Tuner):
     known_failures = {"check_beats_random_search": "it is random search"}  # noqa: RUF012
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one random point at a time, without end."""
+        """Propose one random point at a time, without end.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
+        """
         yield task.start[None]
         while True:
             yield rng.uniform(size=(1, task.dim))

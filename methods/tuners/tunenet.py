@@ -158,7 +158,12 @@ class TuneNetPublished(PairTuner):
         return 800, 2
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Run Algorithm 1; guesses are limited to non-negative values only, as published."""
+        """Run Algorithm 1; guesses are limited to non-negative values only, as published.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: unused; the method is deterministic.
+        """
         estimate = self.get_trained_network().select_for(task).make_estimator(task)
         guess = task.start
         while True:

@@ -79,6 +79,10 @@ class TuRBO(Tuner):
         """Propose initial points, then one Thompson sample at a time.
 
         When the trust region has collapsed, start again from new initial points.
+
+        Args:
+            task: start, observations, number of parameters and budget of the run.
+            rng: random numbers of the run.
         """
         first: Array | None = task.start
         while True:

@@ -79,7 +79,12 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Check and convert the arguments by their annotations, then call the function."""
+        """Check and convert the arguments by their annotations, then call the function.
+
+        Args:
+            *args: arguments without a name.
+            **kwargs: arguments with a name.
+        """
         bound = bind_checked(function.__name__, signature, get_hints(function), args, kwargs)
         return function(*bound.args, **bound.kwargs)
 
@@ -146,6 +151,13 @@ def _bind_arguments(
     kwargs: Mapping[str, object],
 ) -> inspect.BoundArguments:
     """Return the arguments of a call by name, with errors that a user understands.
+
+    Args:
+        function_name: name of the function in messages.
+        signature: its signature.
+        hints: annotation of each argument.
+        args: arguments without a name.
+        kwargs: arguments with a name.
 
     Raises:
         InputError: An argument is unknown or missing, or there are too many.

@@ -183,6 +183,10 @@ def write_new_files(contents: Mapping[Path, Content]) -> None:
 def _rename_if_free(partial: Path, path: Path) -> None:
     """Give a complete file its final name, unless a file with this name exists.
 
+    Args:
+        partial: temporary path of the complete file.
+        path: its final path.
+
     Raises:
         FileExistsError: another process has created the file in the meantime.
     """
@@ -229,7 +233,12 @@ def get_first_line(error: BaseException) -> str:
 
 
 def _make_temporary_path(path: Path, keep_ending: bool = False) -> Path:
-    """Return the temporary name next to a file, under which it is written before it is renamed."""
+    """Return the temporary name next to a file, under which it is written before it is renamed.
+
+    Args:
+        path: final path of the file.
+        keep_ending: whether the temporary name has the same suffix, on which some writers depend.
+    """
     # The name contains the process id, so that two processes do not write to the same file.
     if keep_ending:
         return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")

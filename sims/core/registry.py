@@ -219,7 +219,13 @@ class Registry(Generic[T]):
         )
 
     def _may_replace(self, name: str, part: type[T], path: Path | None) -> bool:
-        """Return whether the registered class is an earlier version of this class."""
+        """Return whether the registered class is an earlier version of this class.
+
+        Args:
+            name: registered name.
+            part: the new class.
+            path: its plugin file; None for a class from Python.
+        """
         old = self._added.get(name)
         # Only classes from Python: files of the same name in two folders give equal qualified
         # names.

@@ -306,7 +306,14 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
 
 
 def _check_table(source: Source, key_path: str, value: Any, declared: Any) -> dict[str, Any]:
-    """Check a table with arbitrary names whose entries are all of one type."""
+    """Check a table with arbitrary names whose entries are all of one type.
+
+    Args:
+        source: beginning of error messages: path of the file, or a name.
+        key_path: path of the entry in the file, such as ``noise``.
+        value: value of the entry.
+        declared: annotation of the values in the table.
+    """
     result = {}
     for key, item in check_table(source, key_path, value).items():
         result[key] = check_annotation(source, f"{key_path}.{key}", item, declared)

@@ -99,7 +99,12 @@ def _compute_signed_square(v: Array) -> Array:
 
 
 def _compute_air_velocity(c: Array, moment: StateSnapshot) -> Array:
-    """Return the velocity (L, D) of the air along the system's coordinates."""
+    """Return the velocity (L, D) of the air along the system's coordinates.
+
+    Args:
+        c: (3, L, 1) coefficients of the effect: drag, wind along x, and wind along y.
+        moment: state of the batch.
+    """
     # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
     # the axis
     mass = moment.system.mass(moment.theta, moment.constants)

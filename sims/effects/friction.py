@@ -262,7 +262,12 @@ class DirectionalViscousFriction(Force):
 
 
 def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
-    """Return the smaller of two opposing forces (L, 1); zero where they do not oppose."""
+    """Return the smaller of two opposing forces (L, 1); zero where they do not oppose.
+
+    Args:
+        drive: (L, 1) force of the drive.
+        external_load: (L, 1) other forces on the joint.
+    """
     low, high = np.minimum(drive, external_load), np.maximum(drive, external_load)
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 

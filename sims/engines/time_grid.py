@@ -271,7 +271,12 @@ def get_command_times(scenario: Scenario) -> Array:
 
 
 def get_history_times(scenario: Scenario, name: str) -> Array:
-    """Return the times (K,) of an input's known history before the run, s."""
+    """Return the times (K,) of an input's known history before the run, s.
+
+    Args:
+        scenario: scenario of the run.
+        name: name of the input.
+    """
     if name not in scenario.before:
         return np.empty(0)
     history_times: Array = scenario.before[name][0] + scenario.offset

@@ -174,7 +174,12 @@ def _read_source(path: Path, key: str, table: Mapping[str, Any], default: str = 
 
 
 def _read_sampling_rate(path: Path, time: Mapping[str, Any]) -> float:
-    """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps."""
+    """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps.
+
+    Args:
+        path: path of the description.
+        time: its table ``[time]``.
+    """
     if "rate" not in time:
         return 0.0
     for unused_key in ("column", "unit"):

@@ -358,7 +358,13 @@ class RecordingTable:
         return list(runs.values())
 
     def _check_seconds(self, t: Array, first: int, last: int) -> None:
-        """Check that the stamps of a run can be seconds, and not milliseconds."""
+        """Check that the stamps of a run can be seconds, and not milliseconds.
+
+        Args:
+            t: (N,) time stamps of all rows of the table.
+            first: index of the first row of the run.
+            last: index of its last row.
+        """
         latest = max(-t[first], t[last])
         if latest > MAX_TIMESTAMP_SECONDS:
             years = f"{latest:.4g}, which would be {latest / _SECONDS_PER_YEAR:.2g} years"

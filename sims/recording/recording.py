@@ -390,6 +390,12 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
 def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
     """Convert a column to SI units.
 
+    Args:
+        table: path of the table, for messages.
+        part: rows of one run.
+        name: name of the column.
+        scale: conversion from the unit of the column to SI units.
+
     Raises:
         InputError: A value is too large for that.
     """

@@ -170,7 +170,12 @@ def model_in(
 
 
 def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the robot parameters that the description leaves free."""
+    """Return the names of the robot parameters that the description leaves free.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+    """
     free_names = meta.get("free", [])
     if not isinstance(free_names, list) or not all(isinstance(name, str) for name in free_names):
         raise make_error(path, "free", 'names, as ["damping@*"]', free_names)
@@ -352,7 +357,13 @@ def _read_wrapped_channels(
 def _read_drive_switches(
     path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 ) -> tuple[DriveSwitch, ...]:
-    """Read and check the columns that say when drives are on."""
+    """Read and check the columns that say when drives are on.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+        declared: channels and inputs that the system declares.
+    """
     switches = read_switches(path, meta)
     names = [signal.name for signal in (*declared.channels, *declared.inputs)]
     actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
@@ -383,7 +394,12 @@ def _check_known_names(
 
 
 def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
-    """Return the name of the system that a description states."""
+    """Return the name of the system that a description states.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+    """
     system = meta.get("system")
     if not isinstance(system, str):
         raise make_error(path, "", 'system = "NAME"', system)
@@ -402,7 +418,16 @@ def _get_system(declared: DeclaredSignals) -> object:
 
 
 def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
-    """Refuse inputs whose effect depends on quantities that a recording does not contain."""
+    """Refuse inputs whose effect depends on quantities that a recording does not contain.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+        declared: channels and inputs that the system declares.
+
+    Raises:
+        InputError: the description has such an input.
+    """
     reasons: Mapping[str, str] = getattr(_get_system(declared), "refused_inputs", {})
     input_tables = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
     for name in (name for name in reasons if name in input_tables):
@@ -410,7 +435,16 @@ def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignal
 
 
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
-    """Refuse poses of floating bodies among the channels, and explain where to state them."""
+    """Refuse poses of floating bodies among the channels, and explain where to state them.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+        declared: channels and inputs that the system declares.
+
+    Raises:
+        InputError: a pose is among the channels.
+    """
     units = get_floating_state_units(declared)
     channel_tables = dotted(check_table(path, "channels", meta.get("channels", {})), units)
     for name in (name for name in units if name in channel_tables):
@@ -502,7 +536,13 @@ def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Co
 
 
 def _read_interpolation(path: Path, name: str, column: _Column) -> bool:
-    """Return whether an input is interpolated linearly between samples."""
+    """Return whether an input is interpolated linearly between samples.
+
+    Args:
+        path: path of the description, for messages.
+        name: name of the input.
+        column: table of the input in the description.
+    """
     hold_mode = column.table.get("hold", "zero")
     if hold_mode not in HOLD_MODES:
         raise make_error(
@@ -533,7 +573,13 @@ def _read_noises(
 
 
 def _read_noise(path: Path, name: str, value: Any) -> float:
-    """Check the stated standard deviation of a channel's noise, in the unit of the column."""
+    """Check the stated standard deviation of a channel's noise, in the unit of the column.
+
+    Args:
+        path: path of the description, for messages.
+        name: name of the channel.
+        value: value of the entry ``noise``.
+    """
     key = f"channels.{name}.noise"
     noise = check_finite(path, key, value)
     if noise <= 0:
@@ -544,7 +590,13 @@ def _read_noise(path: Path, name: str, value: Any) -> float:
 def _read_extra_columns(
     path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 ) -> dict[str, Mapping[str, Any]]:
-    """Return the tables of the columns that belong to no channel or input."""
+    """Return the tables of the columns that belong to no channel or input.
+
+    Args:
+        path: path of the description, for messages.
+        meta: content of the description.
+        declared: channels and inputs that the system declares.
+    """
     # A forgotten channel must not be accepted as an unused column.
     used_names = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     tables: dict[str, Mapping[str, Any]] = {}
@@ -566,7 +618,13 @@ def _read_extra_columns(
 def _read_pose_columns(
     path: Path, extra: Mapping[str, str], declared: DeclaredSignals
 ) -> dict[str, UnitScale]:
-    """Return the conversion to SI units of the columns with initial poses of floating bodies."""
+    """Return the conversion to SI units of the columns with initial poses of floating bodies.
+
+    Args:
+        path: path of the description, for messages.
+        extra: unit of each extra column.
+        declared: signals that the system declares.
+    """
     pose_scales = {}
     for name, unit in get_floating_state_units(declared).items():
         if name in extra:
@@ -578,7 +636,14 @@ def _read_pose_columns(
 
 
 def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
-    """Check the table of one run: its constants, its initial state, and whether it is held out."""
+    """Check the table of one run: its constants, its initial state, and whether it is held out.
+
+    Args:
+        path: path of the description, for messages.
+        name: name of the run.
+        value: its table.
+        declared: constants and states that the system declares.
+    """
     location = f"runs.{name}"
     table = check_table(path, location, value)
     constant_names = [c.name for c in declared.constants]

@@ -145,7 +145,12 @@ def build_frame_description(
 
 
 def _list_signal_columns(name: str, table: Any) -> list[str]:
-    """Return the columns of a signal; entries of a wrong type are refused elsewhere."""
+    """Return the columns of a signal; entries of a wrong type are refused elsewhere.
+
+    Args:
+        name: name of the signal, which is the default column.
+        table: entry of the signal in the description.
+    """
     column = table.get("column") if isinstance(table, dict) else None
     columns = column if isinstance(column, list) else [column]
     return [column for column in columns if isinstance(column, str)] or [name]
@@ -167,7 +172,13 @@ def _list_names(signals: Iterable[Any]) -> list[str]:
 
 
 def _make_unassigned_column_error(path: Path, name: str, declared: DeclaredSignals) -> InputError:
-    """Make the error for a column that is neither channel nor input."""
+    """Make the error for a column that is neither channel nor input.
+
+    Args:
+        path: name of the data frame in messages.
+        name: name of the column.
+        declared: channels and inputs that the system declares.
+    """
     channels, inputs = _list_names(declared.channels), _list_names(declared.inputs)
     declared_names = f"channels {', '.join(channels)}"
     declared_names += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
@@ -235,7 +246,12 @@ class _FrameTable(RecordingTable):
         return self.split_into_runs(self._run_names(frame, len(columns["t"])), columns)
 
     def _run_names(self, frame: Any, count: int) -> list[str]:
-        """Return the name of the run of each row."""
+        """Return the name of the run of each row.
+
+        Args:
+            frame: the data frame.
+            count: number of its rows.
+        """
         if "run" not in frame.columns:
             return ["1"] * count
         cells = frame["run"]

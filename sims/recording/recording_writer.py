@@ -110,7 +110,12 @@ def _list_signals(
 
 
 def _format_cells(values: Array, digits: int) -> list[str]:
-    """Format a column of the table; a missing sample (NaN) becomes an empty cell."""
+    """Format a column of the table; a missing sample (NaN) becomes an empty cell.
+
+    Args:
+        values: (T,) numbers of the column, NaN where missing.
+        digits: significant digits of each cell.
+    """
     # repr gives the shortest text that is read back as the same number; a missing sample is an
     # empty cell.
     shortest = repr if digits >= _LOSSLESS_DIGITS else f"{{:.{digits}g}}".format

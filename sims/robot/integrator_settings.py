@@ -101,7 +101,12 @@ def format_option(name: str, number: float) -> float | str:
 
 
 def parse_option(name: str, value: float | str) -> float:
-    """Return the number of an option in a compiled model; the reverse of `format_option`."""
+    """Return the number of an option in a compiled model; the reverse of `format_option`.
+
+    Args:
+        name: name of the option.
+        value: its number, or its word in a model file.
+    """
     return OPTION_WORDS[name][value] if isinstance(value, str) else value
 
 

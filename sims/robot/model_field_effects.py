@@ -128,7 +128,12 @@ def _make_body_finder(name: str) -> Find:
 
 
 def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
-    """Return the three fields of a body's centre of mass."""
+    """Return the three fields of a body's centre of mass.
+
+    Args:
+        robot: the robot.
+        place: name of the body.
+    """
     number = robot.body(place).id
     return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
 
@@ -142,7 +147,12 @@ def _make_servo_gain_finder(term: int) -> Find:
     """
 
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
-        """Return the bias field with the servo's gain, and the gain field if it is the same."""
+        """Return the bias field with the servo's gain, and the gain field if it is the same.
+
+        Args:
+            robot: the robot.
+            place: name of the actuator.
+        """
         number = robot.actuator(place).id
         servo_fields = [ModelField("actuator_biasprm", (number, term), -1)]
         if gain_pulls(robot, number, term):
@@ -152,8 +162,13 @@ def _make_servo_gain_finder(term: int) -> Find:
     return find
 
 
-def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
-    """Return both ends of an actuator's force range, which one positive limit determines."""
+def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
+    """Return both ends of an actuator's force range, which one positive limit determines.
+
+    Args:
+        robot: the robot.
+        place: name of the actuator.
+    """
     number = robot.actuator(place).id
     range_fields = [
         ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)
@@ -460,7 +475,7 @@ _FIELDS: Mapping[str, Find] = {
     "inertia.armature": _make_dof_finder("dof_armature"),
     "spring.linear": _make_joint_finder("jnt_stiffness"),
     "spring.cubic": _make_joint_finder("jnt_stiffnesspoly", 1),
-    "actuator.limit": _force_range,
+    "actuator.limit": _find_force_range_fields,
     "actuator.stiffness": _make_servo_gain_finder(1),
     "actuator.damping": _make_servo_gain_finder(2),
     "mass.scale": _make_body_finder("body_mass"),

@@ -202,6 +202,10 @@ def _write_inertials(spec: Any, model: Any) -> None:
 def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int]]:
     """Make geoms that cannot collide visual, and reduce the meshes of the others to convex hulls.
 
+    Args:
+        spec: the model as an `MjSpec`, changed in place.
+        model: the model, compiled from it.
+
     Returns:
         The hulls by the names of their meshes, and the numbers of all geoms by their names.
     """

@@ -434,7 +434,12 @@ def _get_limit(values: Any, is_limited: bool) -> tuple[float, float] | None:
 
 
 def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
-    """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts)."""
+    """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts).
+
+    Args:
+        model: compiled model.
+        i: number of the actuator.
+    """
     import mujoco
 
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]

@@ -157,7 +157,12 @@ def _check_friction_form(source: Source, value: Any) -> FrictionForm:
 
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
-    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver."""
+    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver.
+
+    Args:
+        source: beginning of error messages.
+        value: the table.
+    """
     from sims.robot.integrator_settings import OPTION_EFFECTS, OPTION_WORDS
 
     settings = check_table(source, "numerics", value)

@@ -204,7 +204,13 @@ class RobotSimulator(SystemSimulator):
     def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """Simulate observations, see `SystemSimulator`."""
+        """Simulate observations, see `SystemSimulator`.
+
+        Args:
+            theta: (L, P) parameters of L batch elements.
+            scenarios: scenario of each element.
+            initial: initial states by name, (L,) each.
+        """
         acting = self._make_active_effects(theta)
         runs = group_scenarios(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
@@ -616,7 +622,13 @@ class RobotSimulator(SystemSimulator):
         )
 
     def _get_batch(self, derived: bool, count: int, added: AddedElements = ()) -> MujocoBatch:
-        """Return the batch for this time step and integrator, from the robot's cache."""
+        """Return the batch for this time step and integrator, from the robot's cache.
+
+        Args:
+            derived: whether effects change constants that MuJoCo derives.
+            count: number of batch elements.
+            added: elements that effects add to the model.
+        """
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = engine.numerics.to_model_options()

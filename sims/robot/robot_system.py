@@ -221,7 +221,12 @@ class RobotSystem(System):
             return False
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Raise an error: only the engine computes the pose-dependent inertia matrix."""
+        """Raise an error: only the engine computes the pose-dependent inertia matrix.
+
+        Args:
+            theta: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
     def weight(self, moment: StateSnapshot) -> Array:
@@ -231,7 +236,14 @@ class RobotSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Raise an error: the engine reads the channels itself."""
+        """Raise an error: the engine reads the channels itself.
+
+        Args:
+            x: unused.
+            v: unused.
+            a: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
 

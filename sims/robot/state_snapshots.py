@@ -25,7 +25,12 @@ class SingleJointSystem(System):
     sensed = ()
 
     def mass(self, theta: Array, constants: Any) -> Array:
-        """Raise an error: the inertia is not known for one joint alone."""
+        """Raise an error: the inertia is not known for one joint alone.
+
+        Args:
+            theta: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
     def weight(self, moment: StateSnapshot) -> Array:

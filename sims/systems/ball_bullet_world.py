@@ -96,7 +96,12 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
 
 
 def _create_ground_and_ball(client: int, constants: Mapping[str, float]) -> tuple[int, int]:
-    """Create level ground and a ball in an empty Bullet world; return both body ids."""
+    """Create level ground and a ball in an empty Bullet world; return both body ids.
+
+    Args:
+        client: id of Bullet's world.
+        constants: gravity (m/s²), radius (m) and mass (kg).
+    """
     p = bullet_world.import_pybullet()
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)

@@ -113,7 +113,12 @@ class ShotSystem(System):
         return tilted if effect.name in _LEVEL_ONLY else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Return one, because force is counted per unit mass."""
+        """Return one, because force is counted per unit mass.
+
+        Args:
+            theta: (L, P) parameters; only their number L counts.
+            constants: unused.
+        """
         return np.ones((len(theta), 1))
 
     def weight(self, moment: StateSnapshot) -> Array:
@@ -134,7 +139,14 @@ class ShotSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Return the position of the centre in the world frame by channel."""
+        """Return the position of the centre in the world frame by channel.
+
+        Args:
+            x: (L, T, 3) displacement from the release in the frame of the incline, m.
+            v: unused.
+            a: unused.
+            constants: radius, drop height (m) and incline angle (rad) by name.
+        """
         cos = np.cos(constants["incline_angle"])
         sin = np.sin(constants["incline_angle"])
         tangential = x[:, :, 0]

@@ -132,6 +132,11 @@ class TwoLinkArm(OwnSimulator):
         """Build the arm again in an empty world.
 
         Bullet cannot move a centre of mass, and building takes 0.3 ms.
+
+        Args:
+            theta: parameters by name: masses, centres of mass, damping and friction of both links.
+            constants: constants by name: gravity, length of the first link, and inertias.
+            initial: angles and rates of both joints by name, rad and rad/s.
         """
         if "_world" not in self.__dict__:
             self._world = BulletWorld()
@@ -140,7 +145,7 @@ class TwoLinkArm(OwnSimulator):
         p.setGravity(0.0, 0.0, -constants["gravity"])
         # All rounds, whatever the residual: what friction holds must stand still.
         p.setPhysicsEngineParameter(numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0)
-        self._arm = self._built(theta, constants)
+        self._arm = self._build_arm(theta, constants)
         for joint in (0, 1):
             inertia = constants[f"inertia{joint + 1}"]
             damping = theta[f"damping{joint + 1}"]
@@ -158,8 +163,13 @@ class TwoLinkArm(OwnSimulator):
         self._q = [initial["q1"], initial["q2"]]
         self._v = [initial["qd1"], initial["qd2"]]
 
-    def _built(self, theta: Mapping[str, float], constants: Mapping[str, float]) -> int:
-        """Build the two links in the empty world and return the id of the body."""
+    def _build_arm(self, theta: Mapping[str, float], constants: Mapping[str, float]) -> int:
+        """Build the two links in the empty world and return the id of the body.
+
+        Args:
+            theta: masses (kg) and distances of the centres of mass (m) by name.
+            constants: length of the first link (m).
+        """
         p = self._world
         arm: int = p.createMultiBody(
             linkMasses=[theta["mass1"], theta["mass2"]],
@@ -182,16 +192,21 @@ class TwoLinkArm(OwnSimulator):
         return arm
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
-        """One step of Heun's method, or several short ones where dry friction changes sides."""
+        """Make one step of Heun's method, or several short ones where dry friction changes sides.
+
+        Args:
+            inputs: torques ``u1`` and ``u2``, N·m.
+            seconds: length of the step, s.
+        """
         torques = (inputs["u1"], inputs["u2"])
         state_before = (self._q, self._v)
         # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
-        if self._heun(torques, seconds):
+        if self._step_heun(torques, seconds):
             self._q, self._v = state_before
             for _ in range(_FRICTION_SUBSTEPS):
-                self._heun(torques, seconds / _FRICTION_SUBSTEPS)
+                self._step_heun(torques, seconds / _FRICTION_SUBSTEPS)
 
-    def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
+    def _step_heun(self, torques: tuple[float, float], seconds: float) -> bool:
         """Make one step of Heun's method from two steps of Bullet, v to v1 and v1 to v2.
 
         The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
@@ -209,7 +224,9 @@ class TwoLinkArm(OwnSimulator):
         v2 = self._advance(torques)
         self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]  # (2)
         self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]  # (3)
-        return any(_turns(v[i], v1[i], v2[i]) for i in (0, 1) if self._friction[i] > 0)
+        return any(
+            _has_stopped_or_turned(v[i], v1[i], v2[i]) for i in (0, 1) if self._friction[i] > 0
+        )
 
     def observe(self) -> Mapping[str, float]:
         """Angles and rates."""
@@ -252,8 +269,14 @@ class TwoLinkArm(OwnSimulator):
         return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]
 
 
-def _turns(rate_before: float, middle: float, rate_after: float) -> bool:
-    """True if a joint that moved has come to rest or turned round, from its rates in rad/s."""
+def _has_stopped_or_turned(rate_before: float, middle: float, rate_after: float) -> bool:
+    """Return whether a joint that moved has come to rest or turned round.
+
+    Args:
+        rate_before: rate at the beginning of the step, rad/s.
+        middle: rate in its middle.
+        rate_after: rate at its end.
+    """
     if abs(rate_before) <= _REST_SPEED:
         return False
     return min(middle * rate_before, rate_after * rate_before) < _REST_SPEED * abs(rate_before)

@@ -190,7 +190,12 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
 
 
 def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:
-    """Return the largest difference over the colours (height, width)."""
+    """Return the largest difference over the colours (height, width).
+
+    Args:
+        picture: picture with the ball.
+        background: picture without it.
+    """
     # Unsigned integers would wrap around.
     signed = picture.astype(np.int16)
     differences = np.abs(signed - background)

@@ -295,7 +295,12 @@ class BallScene:
         return np.where(is_ground[..., None], ground, sky).astype(np.float32)
 
     def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
-        """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
+        """Darken the ground in the ball's shadow; the sun's disc softens its edge.
+
+        Args:
+            picture: (height, width, 3) linear colours, changed in place.
+            position: (3,) centre of the ball in the world, m.
+        """
         light = self.appearance.light
         slant = 1 / light[2]
         travel = position[2] / light[2]

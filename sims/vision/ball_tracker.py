@@ -406,7 +406,15 @@ def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
 
 
 def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -> tuple[int, int]:
-    """Return the first frame and the end (exclusive) of the longest part without a cut."""
+    """Return the first frame and the end (exclusive) of the longest part without a cut.
+
+    Args:
+        survey: result of the first pass over the frames.
+        notes: remarks for the user, extended in place.
+
+    Raises:
+        InputError: the part has too few frames.
+    """
     shots = survey.list_shots()
     first, end = max(shots, key=lambda shot: shot[1] - shot[0])
     if len(shots) > 1:

@@ -256,7 +256,12 @@ class VideoFile:
 
 
 def _apply_rotation(frame: Any, degrees: float) -> RgbImage:
-    """Rotate the picture as a viewer does: telephones store how they were held."""
+    """Rotate the picture as a viewer does: telephones store how they were held.
+
+    Args:
+        frame: frame of PyAV.
+        degrees: rotation that the file states.
+    """
     picture: RgbImage = frame.to_ndarray()
     turns = round(degrees / 90) % 4
     return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture

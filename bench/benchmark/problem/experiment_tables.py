@@ -232,7 +232,12 @@ def compute_hash(tables: Mapping[str, Any], *contents: bytes) -> str:
 
 
 def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the model file and the recording, if they come with the project or the problem."""
+    """Yield the model file and the recording, if they come with the project or the problem.
+
+    Args:
+        path: path of the problem's file.
+        tables: its content.
+    """
     model = str(tables.get("model", ""))
     if model.startswith(_OWN_PACKAGE):
         yield Path(str(resources.files("bench").joinpath(model.removeprefix(_OWN_PACKAGE))))

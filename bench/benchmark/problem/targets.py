@@ -197,7 +197,12 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
 
 
 def _round_to_resolution(observed: Array, problem: TargetProblem) -> Array:
-    """Round samples (T, C) to the resolution of the channels that have one."""
+    """Round samples (T, C) to the resolution of the channels that have one.
+
+    Args:
+        observed: (T, C) samples in the units of the channels.
+        problem: the problem, with the resolution of its sensors.
+    """
     steps = [problem.experiment.resolution.get(c.name, 0.0) for c in problem.channels]
     rounded = observed.copy()
     for column, step in enumerate(steps):

@@ -286,7 +286,12 @@ def _read_class_source(kind: type) -> str:
 
 
 def _read_package_contents(kind: type, path: Path) -> Any:
-    """Return the contents of an installed plugin's package, or of the file with the class."""
+    """Return the contents of an installed plugin's package, or of the file with the class.
+
+    Args:
+        kind: class of the plugin.
+        path: file with this class.
+    """
     top = sys.modules.get(_get_top_level_package(kind))
     if _get_top_level_package(kind) in _list_plugin_packages() and (
         folders := getattr(top, "__path__", None)

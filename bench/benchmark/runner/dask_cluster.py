@@ -282,7 +282,12 @@ class ClusterPool:
 
 
 def _write_if_absent(path: Path, content: bytes) -> None:
-    """Write a file atomically if it does not exist."""
+    """Write a file atomically if it does not exist.
+
+    Args:
+        path: path of the file.
+        content: its bytes.
+    """
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)

@@ -371,6 +371,10 @@ def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -
     """Compute the Fisher-information spectrum of each target.
 
     Only the parent process can do this, because it needs the true parameters if there are any.
+
+    Args:
+        results: the comparison; the spectra are added to it.
+        progress: makes a progress bar from a title and the number of steps.
     """
     problem, targets = (
         results.problem,

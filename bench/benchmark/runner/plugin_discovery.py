@@ -152,6 +152,10 @@ def _list_extended_names(paths: Iterable[str]) -> set[str]:
 def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> None:
     """Raise an error if a file with a simulator or effect in use also has a tuner in use.
 
+    Args:
+        plugins: plugins in use.
+        experiment: the experiment, with its tuners.
+
     Raises:
         InputError: there is such a file.
     """
@@ -166,6 +170,10 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
     """Make the error for a tuner whose code has been loaded into this process.
 
     Such a tuner could read the true parameters, so its results would prove nothing.
+
+    Args:
+        label: label of the tuner.
+        file: file with its code.
     """
     return InputError(
         f"tuner {label}: the code of {file} runs in this process, which has the true "
@@ -326,7 +334,19 @@ def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
 
 
 def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str, Any]]:
-    """Return the answer of an isolated process that has loaded the given plugin."""
+    """Return the answer of an isolated process that has loaded the given plugin.
+
+    Args:
+        question: what to load: ``file`` is the path of a plugin file, empty for an installed
+            plugin.
+        label: name of the plugin in error messages.
+
+    Returns:
+        Descriptions of the tuners or diagnosers of the plugin.
+
+    Raises:
+        InputError: the file does not exist, or the plugin cannot be loaded.
+    """
     file = question["file"]
     if file and not Path(file).is_file():
         raise InputError(f"plugin {file}: no such file")

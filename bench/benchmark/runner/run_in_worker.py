@@ -130,13 +130,13 @@ def close_problem() -> None:
 
 
 def execute_run(
-    experiment: Experiment, order: RunRequest, requests: list[Array] | None = None
+    experiment: Experiment, request: RunRequest, requests: list[Array] | None = None
 ) -> RunOutcome:
     """Execute one run; failures of the tuner or the simulator are a status of its trace.
 
     Args:
         experiment: configuration of the experiment.
-        order: request of the run.
+        request: request of the run.
         requests: points that an isolated tuner requested before its process was killed; None for a
             run that is repeated here if that happens.
 
@@ -144,11 +144,11 @@ def execute_run(
         HiddenSimulationError: more points were simulated than the tuner requested from the harness.
         RunEndedError: the tuner's process was killed externally several times.
     """
-    if order.tuned is not None and requests is None:
+    if request.tuned is not None and requests is None:
         earlier_requests: list[Array] = []
-        return retry_if_killed(lambda: execute_run(experiment, order, earlier_requests))
+        return retry_if_killed(lambda: execute_run(experiment, request, earlier_requests))
     problem = get_problem(experiment)
-    target = order.target
+    target = request.target
     evaluator = ProposalEvaluator(problem, target.fitting)
     task = Task(
         dim=problem.cube.dim,
@@ -156,7 +156,7 @@ def execute_run(
         observed=target.fitting.observed,
         scale=problem.scale,
         training=problem.cube.training,
-        budget=order.budget,
+        budget=request.budget,
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
         scene=problem.describe_scenarios(target.fitting.scenarios),
     )
@@ -164,13 +164,13 @@ def execute_run(
     simulated = problem.simulated
     started = perf_counter()
     written, import_seconds = NOTHING_WRITTEN, 0.0
-    if order.tuned is None:
-        rng = make_rng(*_list_stream_names(experiment, order))
+    if request.tuned is None:
+        rng = make_rng(*_list_stream_names(experiment, request))
         with limited_memory(experiment.memory):
-            trace = drive_tuner(_build_tuner(order), task, evaluator, rng, experiment.timeout)
+            trace = drive_tuner(_build_tuner(request), task, evaluator, rng, experiment.timeout)
     else:
         repeated = _ReplayCheckedEvaluator(evaluator, [] if requests is None else requests)
-        trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
+        trace, written, import_seconds = _run_isolated(experiment, request, task, repeated)
     seconds = perf_counter() - started
     hidden_simulations = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises an error has counted simulations without a result.
@@ -219,37 +219,42 @@ class _ReplayCheckedEvaluator:
         return self._evaluate(points)
 
 
-def _list_stream_names(experiment: Experiment, order: RunRequest) -> tuple[str | int, ...]:
-    """Return the names that determine the random stream of the run."""
-    return experiment.name, order.entry.tuner, order.target.name, order.seed
+def _list_stream_names(experiment: Experiment, request: RunRequest) -> tuple[str | int, ...]:
+    """Return the names that determine the random stream of the run.
+
+    Args:
+        experiment: configuration of the experiment.
+        request: the run.
+    """
+    return experiment.name, request.entry.tuner, request.target.name, request.seed
 
 
-def _build_tuner(order: RunRequest) -> Tuner:
+def _build_tuner(request: RunRequest) -> Tuner:
     """Build a tuner that works in this process, with its weights if it has been trained."""
-    if order.weights is None:
-        return build_tuner(order.entry)
-    return load_trained_tuner(order.entry, order.weights)
+    if request.weights is None:
+        return build_tuner(request.entry)
+    return load_trained_tuner(request.entry, request.weights)
 
 
 def _run_isolated(
-    experiment: Experiment, order: RunRequest, task: Task, evaluate: Evaluate
+    experiment: Experiment, request: RunRequest, task: Task, evaluate: Evaluate
 ) -> tuple[RunTrace, Written, float]:
     """Execute a run whose tuner has an isolated process.
 
     Args:
         experiment: the experiment.
-        order: request of the run.
+        request: request of the run.
         task: task of the target.
         evaluate: function that simulates points and computes their losses.
 
     Returns:
         The trace, the files that the tuner wrote, and the seconds of its imports.
     """
-    assert order.tuned is not None
-    state = None if order.weights is None else read_weights(order.weights)
-    names = _list_stream_names(experiment, order)
+    assert request.tuned is not None
+    state = None if request.weights is None else read_weights(request.weights)
+    names = _list_stream_names(experiment, request)
     tuner_context = start_isolated_tuner(
-        order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
+        request.tuned, request.seed, experiment.isolation, request.hidden, experiment.memory, state
     )
     try:
         with tuner_context as tuner:

@@ -260,6 +260,13 @@ def _run_ask_tell_loop(
 ) -> tuple[str, str]:
     """Simulate the tuner's proposals until the budget or the time limit is reached.
 
+    Args:
+        steps: the running tuner, which yields points and receives their evaluations.
+        task: number of parameters and budget of the run.
+        evaluate: simulates points of the unit cube, and returns observations and losses.
+        record: record of the run, extended in place.
+        deadline: time limit on the clock `perf_counter`, in seconds.
+
     Returns:
         Status and reason.
 

@@ -436,7 +436,14 @@ def _train_in_process(
     stream: NDArray[np.uint32],
     callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
-    """Train a trusted tuner in this process, and return its weights."""
+    """Train a trusted tuner in this process, and return its weights.
+
+    Args:
+        request: tuner and seed of the training.
+        simulator: training simulator that counts its simulations.
+        stream: words of the seed of the random stream.
+        callback: receives the progress; None for no progress.
+    """
     tuner = build_tuner(request.entry)
     tuner.watch = callback
     tuner.fit(simulator, np.random.default_rng(stream), simulator.budget)
@@ -465,6 +472,10 @@ def _train_isolated(
 def _check_weights(request: TrainingRequest, path: Path) -> None:
     """Raise an error if the tuner does not accept the weights.
 
+    Args:
+        request: tuner of the training.
+        path: file of the weights.
+
     Raises:
         WeightsError: the tuner does not accept the weights.
     """
@@ -486,7 +497,12 @@ def _make_weights_error(path: Path, entry: TunerEntry, reason: object) -> Weight
 
 
 def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
-    """Write a file atomically, because several processes may train the same tuner."""
+    """Write a file atomically, because several processes may train the same tuner.
+
+    Args:
+        path: path of the NumPy archive.
+        arrays: arrays by name.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replacement(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)

@@ -23,12 +23,22 @@ from sims.core.simulator import Parameter
 
 
 def add_trust_column(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """Add the column `trusted`, True if the tuners ran without isolation."""
+    """Add the column `trusted`, True if the tuners ran without isolation.
+
+    Args:
+        frame: any table of the comparison.
+        experiment: configuration of the experiment.
+    """
     return frame.assign(trusted=experiment.trusted)
 
 
 def add_salt_column(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """Add the column `salt`: ``secret`` if the salt is committed by a hash, else ``public``."""
+    """Add the column `salt`: ``secret`` if the salt is committed by a hash, else ``public``.
+
+    Args:
+        frame: any table of the comparison.
+        experiment: configuration of the experiment.
+    """
     return frame.assign(salt="secret" if experiment.salt_sha256 else "public")
 
 
@@ -69,6 +79,10 @@ def _build_break_even_rows(experiment: str, statistics: ComparisonStatistics) ->
     """Build the table of break-even targets for all priced thresholds and ranges.
 
     It says from how many targets on the training of a learned tuner costs less than a search.
+
+    Args:
+        experiment: name of the experiment.
+        statistics: statistics of the comparison, with the costs of the tuners.
     """
     parts = [
         build_break_even_table(experiment, kind, level, by_tuner)
@@ -85,6 +99,10 @@ def _build_fastest_tuner_table(experiment: str, statistics: ComparisonStatistics
 
     A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
     in seconds, and the tuner that needs the least time between them.
+
+    Args:
+        experiment: name of the experiment.
+        statistics: statistics of the comparison, with the costs of the tuners.
     """
     lines = [
         (experiment, kind, level, *line)

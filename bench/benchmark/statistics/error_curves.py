@@ -465,7 +465,12 @@ def find_coinciding_curves(
 
 
 def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) -> int:
-    """Return the largest number of simulations up to which two curves look the same; 0 for none."""
+    """Return the largest number of simulations up to which two curves look the same; 0 for none.
+
+    Args:
+        first: errors, by number of simulations.
+        second: errors of another tuner, by number of simulations.
+    """
     points = first.index.intersection(second.index)
     a, b = first[points].to_numpy(), second[points].to_numpy()
     is_equal = np.logical_and.accumulate(

@@ -244,7 +244,17 @@ def to_numpy_mask(values: pa.Array) -> Mask:
 def _raise_for_bad_row(
     column: ColumnSpec, is_bad: Mask, describe_row: Callable[[int], str], expected: str = ""
 ) -> None:
-    """Raise an error for the first bad row."""
+    """Raise an error for the first bad row.
+
+    Args:
+        column: declaration of the column.
+        is_bad: whether the cell of each row violates it.
+        describe_row: returns the cell of a row as text.
+        expected: expected value in words; empty for that of the declaration.
+
+    Raises:
+        CellError: a cell violates the declaration.
+    """
     if is_bad.any():
         row = int(is_bad.argmax())
         raise CellError(row, column.name, expected or column.expected_text, describe_row(row))

@@ -141,7 +141,12 @@ def create_folder(
 
 
 def _write_private_file(path: Path, secret: str) -> None:
-    """Write a file that only its owner can read."""
+    """Write a file that only its owner can read.
+
+    Args:
+        path: path of the file.
+        secret: its content.
+    """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
         file.write(secret)

@@ -88,12 +88,24 @@ _MAX_EXACT_INTEGER = 2.0**53
 def _declare_size_column(
     name: str, empty: EmptyCellRule = EmptyCellRule.NEVER, **options: Any
 ) -> ColumnSpec:
-    """Declare a column of non-negative numbers."""
+    """Declare a column of non-negative numbers.
+
+    Args:
+        name: name of the column.
+        empty: where its cells are empty.
+        **options: further fields of `ColumnSpec`.
+    """
     return ColumnSpec(name, float, low=0.0, empty=empty, **options)
 
 
 def _declare_count_column(name: str, low: int = 0, **options: Any) -> ColumnSpec:
-    """Declare a column of whole numbers that are not negative."""
+    """Declare a column of whole numbers.
+
+    Args:
+        name: name of the column.
+        low: smallest allowed number.
+        **options: further fields of `ColumnSpec`.
+    """
     return ColumnSpec(name, int, low=low, high=_MAX_EXACT_INTEGER, **options)
 
 

@@ -150,7 +150,13 @@ def _run_study(
 
 
 def _report_missing(study: Study, outcome: StudyOutcome, resume: str) -> int:
-    """Print what is missing and how to continue; return the exit code."""
+    """Print what is missing and how to continue; return the exit code.
+
+    Args:
+        study: the unfinished study.
+        outcome: why it ended, and number of finished parts.
+        resume: command that continues it.
+    """
     reason = "interrupted" if outcome.interrupted else outcome.stopped or "stopped"
     unit, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
     for line in (

@@ -27,7 +27,12 @@ def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_completion(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Execute `simgap completion`: print the completion script of the named shell."""
+    """Execute `simgap completion`: print the completion script of the named shell.
+
+    Args:
+        options: parsed command line.
+        print_line: prints one line of text.
+    """
     from bench.cli.main import build_parser
 
     script = build_completion_script(build_parser(), options.shell)

@@ -66,6 +66,10 @@ def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
     """Compare two folders of one kind.
 
+    Args:
+        a: folder of the first comparison or explanation.
+        b: folder of the second one.
+
     Raises:
         InputError: They are of two kinds, or one is neither.
     """

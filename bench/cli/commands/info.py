@@ -16,7 +16,12 @@ def add_info_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_info(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:  # noqa: ARG001
-    """Execute `simgap info`: print what a bug report should say about this machine."""
+    """Execute `simgap info`: print what a bug report should say about this machine.
+
+    Args:
+        options: parsed command line; unused.
+        print_line: prints one line of text.
+    """
     information = collect_info()
     for line in _format_info(information):
         print_line(line)

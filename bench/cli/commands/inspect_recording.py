@@ -211,6 +211,10 @@ def _print_identifiability(
 
     The numbers are those that the user named with ``--free``, then the coefficients of the possible
     causes. The same is returned as JSON documents.
+
+    Args:
+        options: parsed command line.
+        print_line: prints one line of text.
     """
     from bench.diagnosis.identifiability import format_identifiability
     from bench.diagnosis.recording_check import check_identifiability

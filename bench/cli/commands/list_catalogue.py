@@ -72,7 +72,12 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 
 
 def _run_schema(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Execute `simgap schema`: print the JSON schema of a document that simgap writes."""
+    """Execute `simgap schema`: print the JSON schema of a document that simgap writes.
+
+    Args:
+        options: parsed command line.
+        print_line: prints one line of text.
+    """
     from bench.schemas import load_schema
 
     schema = load_schema(options.name)

@@ -99,7 +99,13 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 def _report_again(
     folder: Path, references: Sequence[ReferenceResult], print_line: PrintLine
 ) -> CommandResult:
-    """Report again a study, or the studies of a sweep or of a file with several studies."""
+    """Report again a study, or the studies of a sweep or of a file with several studies.
+
+    Args:
+        folder: folder of the study, sweep or file of studies.
+        references: reference results that are drawn behind the figures.
+        print_line: prints one line of text.
+    """
     from bench.cli.output import summarise_study
     from bench.studies.study import list_study_folders, open_study, report_jointly
 

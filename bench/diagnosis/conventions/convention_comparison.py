@@ -409,7 +409,12 @@ class ConventionComparison:
     def _filter_runs(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
     ) -> FollowedRuns:
-        """Filter the runs for fitting with the parameters of the model file (Kalman filter)."""
+        """Filter the runs for fitting with the parameters of the model file (Kalman filter).
+
+        Args:
+            recording: the recording, transformed by a hypothesis.
+            max_linearisations: maximum number of linearisations about the smoothed motion.
+        """
         evaluator = self.subject.evaluator(recording)
         followed = FollowedRuns.follow(
             evaluator,
@@ -497,7 +502,12 @@ class ConventionComparison:
 
 
 def _cut_to_common_samples(first: Recording, second: Recording) -> tuple[Recording, Recording]:
-    """Cut the runs of two versions of a recording to the samples that both have."""
+    """Cut the runs of two versions of a recording to the samples that both have.
+
+    Args:
+        first: a recording.
+        second: the same runs, whose ends may be cut differently.
+    """
     pairs = list(zip(first.runs, second.runs, strict=True))
     counts = [min(a.times.size, b.times.size) for a, b in pairs]
 
@@ -531,7 +541,12 @@ def _compute_log_scale_correction(
 
 
 def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> NoiseModel:
-    """Return the noise floor of the channels as noise without autocorrelation."""
+    """Return the noise floor of the channels as noise without autocorrelation.
+
+    Args:
+        evaluator: the runs for fitting.
+        recording: the recording, which may state the noise.
+    """
     sigma = compute_noise_floor(evaluator, recording).sigma
     return NoiseModel(sigma, np.zeros(len(sigma)))
 

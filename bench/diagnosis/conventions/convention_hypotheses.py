@@ -322,6 +322,10 @@ def _generate_zero_offsets(
     offset is a free angle in rad: several are tried, and the best one is refined later. If the
     hinge has a servo, the offset of the position alone is estimated as the mean difference of
     command and position.
+
+    Args:
+        joint: the joint and its recorded signals.
+        recording: the recording, of whose training runs the mean difference is taken.
     """
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
@@ -411,7 +415,15 @@ def _generate_joint_orders(
 
 
 def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
-    """Return the order of positions that follows the commands best, by linear assignment."""
+    """Return the order of positions that follows the commands best, by linear assignment.
+
+    Args:
+        joints: joints with a recorded position and a command each.
+        recording: the recording; its training runs are compared.
+
+    Returns:
+        For the index of each command, the index of the joint whose position follows it.
+    """
     count = len(joints)
     costs = np.zeros((count, count))
     for run in recording.training():
@@ -564,7 +576,12 @@ def _iterate_logs(description: Path) -> Iterator[LogFile]:
 
 
 def _compute_correlation(u: Array, y: Array) -> float:
-    """Return the correlation of two columns; 0 if they are equal, or one does not change."""
+    """Return the correlation of two columns; 0 if they are equal, or one does not change.
+
+    Args:
+        u: (T,) first column, NaN where missing.
+        y: (T,) second column.
+    """
     if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
         return 0.0
     is_recorded = np.isfinite(u) & np.isfinite(y)

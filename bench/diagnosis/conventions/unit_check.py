@@ -432,6 +432,12 @@ def find_imitated_unit(
 
 
 def _get_unit_gain(signal: Signal, unit: str) -> float:
+    """Return the factor from the values of a signal to SI units, if the values have this unit.
+
+    Args:
+        signal: the recorded signal.
+        unit: name of the unit.
+    """
     if unit == signal.specified_unit:
         return signal.gain
     return signal.scale * UNITS[signal.si][unit]
@@ -489,7 +495,12 @@ def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) 
 
 
 def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[str] | None:
-    """Return the joints and actuators of a robot to check; None for other systems: check all."""
+    """Return the joints and actuators of a robot to check; None for other systems: check all.
+
+    Args:
+        evaluator: the runs.
+        shares: (C,) share of each channel in the squares of the residual.
+    """
     if not evaluator.kind.has_model:
         return None
     worst = np.argsort(-shares)[:CHECKED_CHANNELS].tolist()
@@ -559,7 +570,12 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
 def _generate_reversed_joints(
     signals: Sequence[Signal], suspects: frozenset[str] | None
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses of joints with reversed direction: all their channels change sign."""
+    """Yield hypotheses of joints with reversed direction: all their channels change sign.
+
+    Args:
+        signals: recorded channels and inputs.
+        suspects: names of the joints to check; None for all.
+    """
     joints: dict[str, list[Signal]] = {}
     for signal in signals:
         quantity, _, joint = signal.name.partition(".")

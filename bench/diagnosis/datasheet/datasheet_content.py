@@ -346,6 +346,13 @@ def _may_be_zero(number: FittedValue) -> bool:
 def _make_limit_from_interval(
     number: FittedValue, file_value: ModelFileValue | None
 ) -> DetectionLimit:
+    """Return the detection limit of a fitted number: the larger end of its 95 % interval.
+
+    Args:
+        number: the number, with its interval.
+        file_value: its value in the model file, by which the limit is scaled; None if the file has
+            none.
+    """
     low, high = number.low or 0.0, number.high or 0.0
     size = max(abs(low), abs(high))
     return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))

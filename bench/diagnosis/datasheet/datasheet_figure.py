@@ -155,7 +155,15 @@ def draw_sheet(content: SheetContent) -> Figure:
 
 
 def _draw_heading(figure: Figure, content: SheetContent) -> float:
-    """Draw name, title and verdict; return the height of the space below, as a share."""
+    """Draw name, title and verdict; return the height of the space below, as a share.
+
+    Args:
+        figure: the page.
+        content: content of the sheet.
+
+    Returns:
+        Upper end of the free space, as a share of the page height.
+    """
     figure.text(_MARGIN, 0.965, sanitise(content.name, 60), fontsize=17, weight="bold", va="top")
     title = content.recording.title or content.recording.path.stem
     text = f"Data sheet from {sanitise(title, 90)}. {format_sentence(content.verdict.meaning)}"

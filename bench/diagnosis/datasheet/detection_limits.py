@@ -332,6 +332,12 @@ class _DetectionLimitCalculator:
         return DetectionLimits(self.free, self.covariance, detection_limits, prediction_half_widths)
 
     def _get_coefficient_name(self, effect: str, coefficient_index: int) -> str:
+        """Return the name of a coefficient of an effect.
+
+        Args:
+            effect: name of the effect.
+            coefficient_index: index of the coefficient within the effect.
+        """
         return (
             self.evaluator.available_effects[effect]
             .on(self.evaluator.simulator.system)[coefficient_index]
@@ -381,6 +387,11 @@ class _DetectionLimitCalculator:
         """Return whether a simpler effect that this effect contains has an equivalent coefficient.
 
         The simpler effect may be in the model or not.
+
+        Args:
+            name: name of the effect.
+            k: index of the probe of its coefficient.
+            best: index of the probe with the best shape, by effect and coefficient index.
         """
         simpler_effects = set(self.evaluator.available_effects[name].contains)
         other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]

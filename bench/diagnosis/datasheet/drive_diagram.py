@@ -54,7 +54,12 @@ class _StaticJoint(System):
     sensed = ()
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Raise an error, because the joint does not move."""
+        """Raise an error, because the joint does not move.
+
+        Args:
+            theta: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
     def weight(self, moment: StateSnapshot) -> Array:
@@ -70,7 +75,14 @@ class _StaticJoint(System):
         return moment.inputs["load"]
 
     def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Raise an error, because the joint has no channels."""
+        """Raise an error, because the joint has no channels.
+
+        Args:
+            x: unused.
+            v: unused.
+            a: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
 
@@ -221,7 +233,12 @@ class _Joint:
         return holding_force
 
     def pull(self, drive: Array, load: Array) -> Array:
-        """Compute the sum (N,) of the other forces on the joint at rest, such as a bias."""
+        """Compute the sum (N,) of the other forces on the joint at rest, such as a bias.
+
+        Args:
+            drive: (N,) forces of the drive, in N or N·m.
+            load: (N,) loads that it works against.
+        """
         moment = self._make_rest_state(drive, load)
         forces = [np.zeros(len(drive))]
         for law, c in self.laws:
@@ -243,5 +260,10 @@ class _Joint:
 
 
 def _expand_coefficients(c: Array, drive: Array) -> Array:
-    """Expand coefficients (K, 1, 1) to (K, N, 1), one for each force."""
+    """Expand coefficients (K, 1, 1) to (K, N, 1), one for each force.
+
+    Args:
+        c: (K, 1, 1) coefficients of a law.
+        drive: (N,) forces of the drive, of which only the number counts.
+    """
     return np.broadcast_to(c, (len(c), len(drive), 1))

@@ -108,7 +108,12 @@ def describe_log_for_model(
 
 
 def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
-    """Return whether the inputs that switch the motor are on all the time."""
+    """Return whether the inputs that switch the motor are on all the time.
+
+    Args:
+        run: the recorded run.
+        model: the MJCF model; inputs that it does not have are switches.
+    """
     switches = [values for name, values in run.inputs.items() if name not in model.signals]
     return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)
 
@@ -221,7 +226,12 @@ def _build_robot_files(sheet: SheetContent) -> MjcfFiles:
 
 
 def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
-    """Build a class, a model and a log description for each group of runs with equal constants."""
+    """Build a class, a model and a log description for each group of runs with equal constants.
+
+    Args:
+        sheet: content of the data sheet.
+        folder: folder of the sheet, to which the log descriptions refer.
+    """
     from sims.robot.parsing.read_model_file import read_robot
 
     classes: list[_DefaultClass] = []

@@ -168,7 +168,12 @@ def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
     """
 
     def noise(name: str, values: Array) -> Array:
-        """Draw white noise for a channel from a random stream of its own."""
+        """Draw white noise for a channel from a random stream of its own.
+
+        Args:
+            name: name of the channel.
+            values: (T,) recorded values, of which only the shape counts.
+        """
         return sizes[name] * make_rng("least noise", run.log, run.name, name).normal(
             size=values.shape
         )

@@ -52,13 +52,23 @@ class SilentListener:
     """A `ProgressListener` that ignores all events."""
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Ignore the event."""
+        """Ignore the event.
+
+        Args:
+            name: unused.
+            total: unused.
+        """
 
     def advance(self, count: int = 1) -> None:
         """Ignore the event."""
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Ignore the event."""
+        """Ignore the event.
+
+        Args:
+            effects: unused.
+            share: unused.
+        """
 
     def completed(self, share: float) -> None:
         """Ignore the event."""

@@ -136,6 +136,12 @@ def _multiply_interval(interval: Interval | None, factor: float) -> Interval:
 
 
 def _divide_interval(interval: Interval | None, divisor: float) -> Interval:
+    """Return an interval divided by a number; unlimited if the number is zero.
+
+    Args:
+        interval: lower and upper end; None for no limit.
+        divisor: the number, such as a gear ratio; a negative one swaps the ends.
+    """
     return _multiply_interval(interval, 1.0 / divisor) if divisor else UNLIMITED
 
 
@@ -239,7 +245,12 @@ class RigModel:
         return states
 
     def _clip_to_joint_range(self, name: str, value: float) -> float:
-        """Clip a state to the range of its joint."""
+        """Clip a state to the range of its joint.
+
+        Args:
+            name: name of the state, such as ``q.elbow``.
+            value: value in rad or m.
+        """
         return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
 
     # -- plans
@@ -346,7 +357,12 @@ class RigModel:
         )
 
     def _limit_command(self, name: str, values: Array) -> Array:
-        """Clip a command to the limits of its actuator and its joint."""
+        """Clip a command to the limits of its actuator and its joint.
+
+        Args:
+            name: name of the input.
+            values: (T,) command in the unit of the input.
+        """
         return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
     def _describe_plan(

@@ -168,7 +168,14 @@ def _find_first_within_limits(
 def _explain_no_run(
     evaluator: RunEvaluator, model_effects: str, competing_effects: str, is_limited: bool
 ) -> str:
-    """Write what to do if no such run would discriminate, or none within the limits of a robot."""
+    """Write what to do if no such run would discriminate, or none within the limits of a robot.
+
+    Args:
+        evaluator: the present runs, whose channels are recorded.
+        model_effects: effects of the model in words.
+        competing_effects: effects of the competing model in words.
+        is_limited: whether only the limits of the model file exclude such a run.
+    """
     channels = [channel.name for channel in evaluator.kind.channels]
     unrecorded = ", ".join(name for name in channels if name not in evaluator.channels)
     advice = "measure one of the causes directly"
@@ -221,7 +228,12 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
 
 
 def _clip(values: Any, limits: Interval | None) -> Any:
-    """Clip a number or an array to an interval."""
+    """Clip a number or an array to an interval.
+
+    Args:
+        values: number or array.
+        limits: lower and upper end; None for no limit.
+    """
     return values if limits is None else np.clip(values, *limits)
 
 

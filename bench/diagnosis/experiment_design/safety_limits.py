@@ -215,5 +215,12 @@ def _widen_by_stop(stated_range: Interval, recorded_range: Interval, is_position
 
 
 def _widen_range(low: float, high: float, scale: float) -> tuple[float, float]:
+    """Return a range with the allowed margin at both ends.
+
+    Args:
+        low: lower end of the recorded range.
+        high: upper end of the recorded range.
+        scale: minimum size of the range from which the margin is computed.
+    """
     margin = TRAVEL_FACTOR * max(high - low, scale)
     return low - margin, high + margin

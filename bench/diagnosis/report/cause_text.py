@@ -82,7 +82,12 @@ def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
 
 
 def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
-    """Format effects of one name at several places, or several effects at one place."""
+    """Format effects of one name at several places, or several effects at one place.
+
+    Args:
+        group: names of the effects with their places, such as ``drag.linear@elbow``.
+        conjunction: ``and`` or ``or`` between nouns, and between places.
+    """
     if len(group) == 1:
         return format_effect(group[0])
     bases = list(dict.fromkeys(split_effect_name(name)[0] for name in group))
@@ -214,7 +219,12 @@ def _format_displaced_mass_centre(place_text: str, values: Sequence[FittedValue]
 
 
 def _format_joint_zero(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say how far the zero of a joint, for command and reading, is from that of the model file."""
+    """Say how far the zero of a joint, for command and reading, is from that of the model file.
+
+    Args:
+        place_text: the joint in words, such as ``of joint elbow``.
+        values: fitted values of the effect; the first is the offset, in rad or m.
+    """
     size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
     return (
         f"the zero {place_text}, for commands and readings, is {size} from that of the model file"

@@ -306,6 +306,12 @@ def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
 
 
 def _format_interval(spread: ParameterConsistency, error: float) -> str:
+    """Format the joint estimate of a parameter with a 95 % interval.
+
+    Args:
+        spread: estimate of the parameter, with its unit.
+        error: standard error, in the same unit.
+    """
     half_width = Z95 * error
     text = format_estimate(spread.value, spread.value - half_width, spread.value + half_width)
     return append_unit(text, spread.unit)

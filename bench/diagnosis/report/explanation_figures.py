@@ -308,7 +308,12 @@ def _format_p_value(p_value: float) -> str:
 
 
 def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
-    """Format the notes below the figure: numbers of runs and samples, meaning of p-values."""
+    """Format the notes below the figure: numbers of runs and samples, meaning of p-values.
+
+    Args:
+        report: content of the report.
+        candidates: candidates that the figure shows.
+    """
     counts = f"Fitted: {_format_split_size(report.fitting)}"
     if report.held_out is not None and report.cross_validated:
         counts += "; each run left out in turn"
@@ -535,7 +540,15 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
 def _draw_signal(
     signal_axis: Axes, residual_axis: Axes, report: DiagnosisReportData, view: RunView, c: int
 ) -> None:
-    """Draw the measured and simulated signal of a channel, and the residual below it."""
+    """Draw the measured and simulated signal of a channel, and the residual below it.
+
+    Args:
+        signal_axis: axes of the signal.
+        residual_axis: axes of the residual, below it.
+        report: content of the report.
+        view: the run to show.
+        c: index of the channel.
+    """
     channel, split = report.channels[c], view.data_split
     times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.

@@ -137,7 +137,12 @@ def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
 
 
 def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
-    """Return the description of an effect; for a cause, the one in the verdict."""
+    """Return the description of an effect; for a cause, the one in the verdict.
+
+    Args:
+        report: content of the report.
+        name: name of the effect, with its place if it has one.
+    """
     for cause in report.verdict.causes:
         if cause.effect == name:
             return format_sentence(strip_place(sanitise(cause.says, 400)))
@@ -442,7 +447,12 @@ def _make_printed_figure(
 
 
 def _describe_figure(report: DiagnosisReportData, name: str) -> str:
-    """Return the alternative text of a figure."""
+    """Return the alternative text of a figure.
+
+    Args:
+        report: content of the report.
+        name: name of the figure: ``robot``, ``overview``, ``where``, or that of the candidates.
+    """
     if name == "robot":
         mark_texts = [
             f"{mark.kind} {sanitise(mark.name, 30)} ({sanitise(mark.says, 60)})"

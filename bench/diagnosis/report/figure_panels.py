@@ -204,7 +204,12 @@ def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
 
 
 def _compute_log_ticks(low: float, high: float) -> list[float]:
-    """Return round ticks of a logarithmic axis; per decade 1, 2, 5 or fewer."""
+    """Return round ticks of a logarithmic axis; per decade 1, 2, 5 or fewer.
+
+    Args:
+        low: lower end of the axis, positive.
+        high: upper end of the axis.
+    """
     # With more decades, each has fewer numbers, so that labels do not overlap.
     steps: tuple[int, ...] = (1,)
     if high / low < 200:
@@ -340,7 +345,12 @@ def select_worst_run(report: DiagnosisReportData) -> RunView:
 
 
 def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
-    """Format the name of the run, and why `select_worst_run` has selected it."""
+    """Format the name of the run, and why `select_worst_run` has selected it.
+
+    Args:
+        report: content of the report, whose verdict gives the reason.
+        view: the selected run.
+    """
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
     return f"Run {shorten_label(view.data_split.names[view.row])}, the {kind} {reason}"

@@ -268,7 +268,15 @@ def _make_cell(row: _Row | None) -> MatrixCell | None:
 def _build_family_table(
     rows: Sequence[_Row], columns: Sequence[str]
 ) -> list[tuple[str, list[tuple[str, bool]]]]:
-    """Build the table of causes without a place: families of effects by identifiability."""
+    """Build the table of causes without a place: families of effects by identifiability.
+
+    Args:
+        rows: causes without a place.
+        columns: status of the causes in each column.
+
+    Returns:
+        Each family with the names of its effects in each column, and whether they are bold.
+    """
     families: dict[str, dict[str, list[str]]] = {}
     for row in rows:
         by_status = families.setdefault(row.effect.partition(".")[0], {})
@@ -301,7 +309,12 @@ def _format_half_interval(number: ParameterIdentifiability) -> str:
 
 
 def _format_table_row(number: ParameterIdentifiability, status: str) -> IdentifiabilityRow:
-    """Format the identifiability of a parameter or cause as a table row."""
+    """Format the identifiability of a parameter or cause as a table row.
+
+    Args:
+        number: identifiability of the coefficient, with its interval and correlations.
+        status: whether it can be identified, one of `_STATUSES`.
+    """
     mixed = joined([f"{name} ({correlation:.2f})" for name, correlation in number.mixed])
     span = f"{format_number(number.low)} to {format_number(number.high)}"
     return IdentifiabilityRow(

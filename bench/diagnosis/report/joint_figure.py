@@ -157,7 +157,12 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
 
 
 def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[JointRow]:
-    """Select the rows with the largest residuals, in their original order."""
+    """Select the rows with the largest residuals, in their original order.
+
+    Args:
+        report: content of the report.
+        view: the run to show.
+    """
     rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
@@ -168,7 +173,14 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
 
 
 def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:
-    """Return the RMS residual of a channel in this run in noise units; 0 without samples."""
+    """Return the RMS residual of a channel in this run in noise units; 0 without samples.
+
+    Args:
+        report: content of the report.
+        view: the run to show.
+        c: index of the channel.
+        model: ``before`` for the base model, ``after`` for the extended one.
+    """
     residual = _compute_scaled_residual(report, view, c, model)
     finite = residual[np.isfinite(residual)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
@@ -177,7 +189,14 @@ def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, mo
 def _compute_scaled_residual(
     report: DiagnosisReportData, view: RunView, c: int, model: str
 ) -> Array:
-    """Return the residual (T,) of a channel in units of its noise."""
+    """Return the residual (T,) of a channel in units of its noise.
+
+    Args:
+        report: content of the report.
+        view: the run to show.
+        c: index of the channel.
+        model: ``before`` for the base model, ``after`` for the extended one.
+    """
     count = len(view.data_split.times[view.row])
     simulated = getattr(view.data_split, model)
     residual: Array = (view.data_split.observed - simulated)[view.row, :count, c] / report.channels[
@@ -241,7 +260,12 @@ def _draw_motion(
 
 
 def _format_row_name(row: JointRow, is_named: bool) -> str:
-    """Format the name of a joint or sensor in short lines."""
+    """Format the name of a joint or sensor in short lines.
+
+    Args:
+        row: the joint or sensor.
+        is_named: whether the verdict names it; it is then marked.
+    """
     name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE_LENGTH)
     return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
 

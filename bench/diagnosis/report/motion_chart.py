@@ -129,7 +129,15 @@ def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
 
 
 def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
-    """Return the number of parts of a long run: the extremes of two or three signals are kept."""
+    """Return the number of parts into which a long run is divided for the chart.
+
+    In each part the minimum and maximum of each signal are kept.
+
+    Args:
+        report: content of the report; with an extended model there are three signals instead of
+            two.
+        max_rows: maximum number of samples of a run in the chart.
+    """
     return max(1, max_rows // (6 if has_extended_model(report) else 4))
 
 

@@ -413,6 +413,12 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
 
 
 def _format_error(report: DiagnosisReportData, value: float | None) -> str:
+    """Format an error of the held-out prediction with its unit.
+
+    Args:
+        report: content of the report, which determines the unit.
+        value: the error; None if it was not computed.
+    """
     return append_unit(format_number(value), get_held_out_unit(report))
 
 

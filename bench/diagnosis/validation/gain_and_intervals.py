@@ -158,6 +158,10 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
 
     It is the inverse of the curvature of the whitened sum of squares, from which the initial states
     of each run are eliminated: eq. (2) of the module docstring.
+
+    Args:
+        models: the models, with the runs to which they are fitted.
+        model: the fitted model.
     """
     fisher_blocks = compute_fisher_blocks(models, model)
     parameter_curvature = fisher_blocks.parameters.sum(axis=0)
@@ -366,6 +370,14 @@ def _sum_squared_errors(
 
     Each row (n, 3) has the sum of squares of the base model, that of the extended model, and the
     number of samples.
+
+    Args:
+        evaluator: the predicted runs.
+        before: (R, T, C) prediction of the base model.
+        after: (R, T, C) prediction of the extended model.
+        channels: indices of the channels that count.
+        resamples_segments: whether the rows are segments of runs, because there are too few runs to
+            resample.
     """
     part_sums = []
     for run, part in _list_resampled_parts(evaluator, resamples_segments):

@@ -452,6 +452,10 @@ class CrossValidation:
         An effect is not shown if switching it off changes the simulated samples by less than
         `MIN_SUPPORTED_CHANGE`, in units of the noise. Its coefficients are then arbitrary and would
         spoil the prediction.
+
+        Args:
+            evaluator: the fitted runs.
+            fits: fits of all models to these runs.
         """
         thetas = [fit.theta.copy() for fit in fits]
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]

@@ -135,6 +135,11 @@ def _compute_motion_covariates(
 
     They are the amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1),
     and the mean position.
+
+    Args:
+        evaluator: the runs.
+        model: model that simulates them.
+        number: name of the parameter, ``NAME@JOINT`` for that of a joint.
     """
     system = evaluator.simulator.system
     if not system.coordinates:
@@ -326,6 +331,12 @@ def _find_trend_covariate(
 
     It is the one with a significant linear trend and the smallest scatter about the line. Return
     None if no trend is significant.
+
+    Args:
+        evaluator: the runs.
+        model: the fitted model.
+        grouping: the groups of runs, such as logs.
+        consistency: estimates of the parameter from each group.
     """
     if grouping.by not in ("run", "log"):
         if consistency.trend is None or consistency.trend.p_value >= SIGNIFICANCE_LEVEL:
@@ -375,7 +386,12 @@ def _find_trend_covariate(
 def _compute_residual_mean_square(
     group_estimates: Sequence[GroupEstimate], covariate_values: Array
 ) -> float:
-    """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation)."""
+    """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation).
+
+    Args:
+        group_estimates: estimates of G groups with their standard errors.
+        covariate_values: (G,) mean of the covariate in each group.
+    """
     values = np.array([part.value for part in group_estimates])
     weights = np.array([part.error for part in group_estimates]) ** -2.0
     residual = values - np.polyval(
@@ -423,6 +439,10 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
 
     They are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the
     run are eliminated: eq. (1) of the module docstring.
+
+    Args:
+        models: the models, with the runs.
+        model: the fitted model.
     """
     evaluator, fit = models.evaluator, model.fit
     q = fit.free_indices.size
@@ -558,7 +578,12 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
 
 
 def _compute_student_p_value(size: float, freedom: int) -> float:
-    """Return the two-sided p-value of Student's t."""
+    """Return the two-sided p-value of Student's t distribution.
+
+    Args:
+        size: absolute value of the statistic t.
+        freedom: degrees of freedom.
+    """
     # Importing scipy.special takes 0.1 s, and this is the only place of most diagnoses to need it.
     from scipy.special import stdtr
 

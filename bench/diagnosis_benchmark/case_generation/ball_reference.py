@@ -237,7 +237,12 @@ def _integrate_flight(
     middle = 0.5 * (start + end)
 
     def rate(t: float, y: Array) -> tuple[float, ...]:
-        """Return the time derivatives of position and velocity; a resting ball does not sink."""
+        """Return the time derivatives of position and velocity; a resting ball does not sink.
+
+        Args:
+            t: time, s.
+            y: position (m) and velocity (m/s).
+        """
         ax, ay, az = air.compute_acceleration(t, y.tolist(), middle)
         return (y[3], y[4], y[5], ax, ay, max(az, 0.0) if resting else az)
 

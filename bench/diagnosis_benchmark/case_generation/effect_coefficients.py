@@ -533,6 +533,11 @@ def _draw_onsets(motion: BaseMotion, duration: float, rng: np.random.Generator) 
 
     The strength is found from the runs for fitting, but the recording has held-out runs too. A
     begin for every possible run serves both.
+
+    Args:
+        motion: scales of the motion without hidden causes.
+        duration: duration of the gust, s.
+        rng: random numbers of the case.
     """
     return [float(rng.uniform(0.1, 0.9) * (motion.seconds - duration)) for _ in range(MAX_RUNS)]
 
@@ -561,6 +566,10 @@ def _get_unit_force(motion: BaseMotion) -> float:
 def _draw_gust(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a temporary force of 0.1 to 0.3 s in each run, in either direction.
 
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
+
     Returns:
         Function from the strength to force, duration (s), and the begin in each run (s).
     """
@@ -573,6 +582,10 @@ def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> Coeff
     """Draw damping that grows in proportion to time, up to a value at the end of the run.
 
     At strength 1 this value is 0.1 N m s/rad for a pendulum and 5 N s/m for a slider.
+
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
     """
     max_growth = (0.1 if motion.system == "pendulum" else 5.0) / motion.seconds
     return lambda s: (max_growth * s,)
@@ -598,6 +611,10 @@ def _draw_soft_stop(motion: BaseMotion, rng: np.random.Generator) -> Coefficient
 def _draw_updraft(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a region of rising air that the balls pass; at strength 1 it accelerates by 10 m/s^2.
 
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
+
     Returns:
         Function from the strength to acceleration (m/s^2), centre and half width of the region (m).
         The centre lies between the 10 % and 90 % quantiles of x over all runs.
@@ -612,6 +629,10 @@ def _draw_ball_gust(motion: BaseMotion, rng: np.random.Generator) -> Coefficient
     """Draw a gust of 0.1 to 0.4 s in each run; at strength 1 it accelerates the ball by 20 m/s^2.
 
     Its direction is drawn in the vertical plane along x.
+
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
 
     Returns:
         Function from the strength to acceleration along x, upward acceleration (m/s^2), duration
@@ -628,13 +649,26 @@ def _draw_ball_gust(motion: BaseMotion, rng: np.random.Generator) -> Coefficient
 
 
 def _draw_changing_restitution(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
-    """Draw restitution that changes linearly with time: at strength 1 by all its value in a run."""
+    """Draw restitution that changes linearly with time: at strength 1 by all its value in a run.
+
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
+    """
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * s / motion.seconds,)
 
 
 def _draw_drag_layer(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
-    """Draw a height above most bounces and below most drops, from which drag acts."""
+    """Draw a height above most bounces and below most drops, from which drag acts.
+
+    Args:
+        motion: scales of the motion without hidden causes.
+        rng: random numbers of the case.
+
+    Returns:
+        Function from the strength to the drag coefficient and the height (m) above which drag acts.
+    """
     height = float(min(s.initial["z"] for s in motion.scenarios) * rng.uniform(0.55, 0.8))
     return lambda s: (2.0 * s, height)
 

@@ -237,11 +237,23 @@ class FlexibleReferenceLoad(ReferenceLoad):
         self.frequency, self.ratio = frequency, ratio
 
     def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
-        """Return the initial state of the load, with the static deflection of the spring."""
+        """Return the initial state of the load, with the static deflection of the spring.
+
+        Args:
+            x: initial position of the drive side, rad or m.
+            v: its initial velocity.
+        """
         return x + self.weight(x) / self.whole / self.frequency**2, v
 
     def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
-        """Compute the acceleration of the load by spring and damper; see `ReferenceLoad`."""
+        """Compute the acceleration of the load by spring and damper; see `ReferenceLoad`.
+
+        Args:
+            x: position of the drive side, rad or m.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
         return self.frequency**2 * (x - y) + 2 * self.ratio * self.frequency * (v - w)
 
 
@@ -261,7 +273,12 @@ class BacklashReferenceLoad(ReferenceLoad):
         self.gap = gap
 
     def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
-        """Return the initial state of the load, centred in the gap."""
+        """Return the initial state of the load, centred in the gap.
+
+        Args:
+            x: initial position of the drive side, rad or m.
+            v: its initial velocity.
+        """
         return x, v
 
     def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
@@ -301,7 +318,12 @@ class DahlReferenceFriction:
         self.limit, self.deflection = limit, deflection
 
     def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
-        """Return the initial state, without strain."""
+        """Return the initial state, without strain.
+
+        Args:
+            x: unused.
+            v: unused.
+        """
         return 0.0, 0.0
 
     def force(self, x: float, v: float, _: float, strain: float) -> float:
@@ -388,7 +410,12 @@ UNMODELLED_CAUSES = ("patch", "gust", "ageing", "latch")
 
 
 def compute_transmitted_force(drive: float, against: float) -> float:
-    """Return the smaller force that gears transmit; zero if both forces have the same direction."""
+    """Return the smaller force that gears transmit; zero if both forces have the same direction.
+
+    Args:
+        drive: force of the drive side, N or N·m.
+        against: force of the load side.
+    """
     return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
 
 
@@ -520,6 +547,10 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
 
         Dry friction is `dry_friction`, with the fixed sign `direction` of the motion, so that the
         right-hand side is smooth.
+
+        Args:
+            t: time, s.
+            y: position, velocity and hidden states.
         """
         dry_friction = direction * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
         return [
@@ -569,7 +600,12 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
         return [0.0, 0.0, *joint.compute_hidden_rates(*y)]
 
     def excess(t: float, y: Array) -> float:
-        """Return by how much the force exceeds the friction limit; zero is the break-away event."""
+        """Return by how much the force exceeds the friction limit; zero is the break-away event.
+
+        Args:
+            t: time, s.
+            y: position, velocity and hidden states.
+        """
         # Slightly above the limit: at the limit, the coordinate would still count as held.
         return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, *y[:2]) * (
             1 + 1e-9
@@ -587,6 +623,11 @@ def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
 
     Within an input interval only time-dependent forces and limits change while the coordinate
     rests.
+
+    Args:
+        joint: equation of motion in the present input interval.
+        start: time from which the coordinate rests, s.
+        x: position at which it rests, rad or m.
     """
     end = joint.segment.end
     if not joint.restless:

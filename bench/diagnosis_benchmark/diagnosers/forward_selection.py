@@ -210,7 +210,12 @@ class ForwardBIC(_ForwardSelection):
         return False
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
-        """Return None: BIC gives no p-value."""
+        """Return None: BIC gives no p-value.
+
+        Args:
+            first: unused.
+            samples: unused.
+        """
         return None
 
     def _make_answer(
@@ -251,7 +256,12 @@ class ForwardChi2(_ForwardSelection):
     near = CHI_SQUARED_TOLERANCE
 
     def compute_criterion(self, model: RefittedModel, samples: int) -> float:
-        """Return the sum of squares."""
+        """Return the sum of squares.
+
+        Args:
+            model: the fitted model.
+            samples: unused.
+        """
         return model.squares
 
     def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
@@ -259,7 +269,12 @@ class ForwardChi2(_ForwardSelection):
         return self._compute_p_value(model, samples) > FALSE_ALARM_RATE
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
-        """Compute the chi-squared p-value of the base model."""
+        """Compute the chi-squared p-value of the base model.
+
+        Args:
+            first: the fitted base model.
+            samples: number of samples.
+        """
         return self._compute_p_value(first, samples)
 
     @staticmethod

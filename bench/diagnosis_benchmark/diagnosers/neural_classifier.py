@@ -194,6 +194,10 @@ def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple
 
     The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
     uniformly. Coefficients that must be positive, such as a period, are always drawn log-uniformly.
+
+    Args:
+        training_task: simulator, library and random numbers of the training.
+        name: name of the effect.
     """
     rng = training_task.rng
     values = []

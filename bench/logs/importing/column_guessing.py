@@ -295,7 +295,12 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
 
 
 def _is_within_limits(extremes: Array, limits: tuple[float, float]) -> bool:
-    """Return whether a lowest and a highest position lie within a joint's widened range."""
+    """Return whether a lowest and a highest position lie within a joint's widened range.
+
+    Args:
+        extremes: (2,) lowest and highest position.
+        limits: range of the joint, in the same unit.
+    """
     slack = MAX_RANGE_EXCESS * (limits[1] - limits[0])
     return bool(limits[0] - slack <= extremes[0] and extremes[1] <= limits[1] + slack)
 

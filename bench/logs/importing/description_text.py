@@ -112,7 +112,13 @@ class DescriptionWriter:
         return [f"file = {toml_text(file)}"]
 
     def _format_signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
-        """Return the lines of a channel or an input."""
+        """Return the lines of a channel or an input.
+
+        Args:
+            kind: table of the signal, ``channels`` or ``inputs``.
+            name: name of the signal, such as ``q.elbow``.
+            signal: its column, unit and scale.
+        """
         column = signal.column
         lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
         lines += self._format_file_lines(column.file)
@@ -129,7 +135,12 @@ class DescriptionWriter:
         return [*lines, ""]
 
     def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
-        """Estimate the gains of a servo that the model file lacks, and note their origin."""
+        """Estimate the gains of a servo that the model file lacks, and note their origin.
+
+        Args:
+            name: name of the new servo.
+            joint: joint that it drives.
+        """
         signals = self._signals
         inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
         servo = estimate_added_servo(name, joint, inertia, self._collect_servo_samples(name, joint))
@@ -155,6 +166,10 @@ class DescriptionWriter:
         """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
 
         A command holds until the next one.
+
+        Args:
+            name: name of the servo.
+            joint: joint that it drives.
         """
         command, position = (
             self._signals.inputs[f"u.{name}"],

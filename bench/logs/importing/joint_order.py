@@ -305,6 +305,10 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
 
     Their values (T,) are included only if the order of the columns is a guess, to test other
     orders.
+
+    Args:
+        logs: the logs.
+        signals: signals and their columns.
     """
     joints = [
         joint
@@ -337,6 +341,11 @@ def _follow_commands(
 
     Commands are exchanged if their order is a guess, otherwise positions.
 
+    Args:
+        signals: signals and their columns, exchanged in place.
+        servos: joints with a servo and their signals.
+        are_commands_guessed: whether the order of the commands is a guess.
+
     Returns:
         For each joint, the joint at whose index its column is; empty if nothing is exchanged.
     """
@@ -359,6 +368,12 @@ def _prefer_model(
     logs: RunLogs, signals: SignalAssignment, servos: _ServoSignals, result: ImportResult
 ) -> dict[str, str]:
     """Exchange unnamed columns if the model then explains the motion far better.
+
+    Args:
+        logs: the logs.
+        signals: signals and their columns, exchanged in place.
+        servos: joints with a servo and their signals.
+        result: result of the import, to which a message is added.
 
     Returns:
         For each joint, the joint at whose index its column is; empty if the order is not changed.

@@ -95,7 +95,13 @@ def _preserves_motion(recording: Recording, stride: int) -> bool:
 
 
 def _compute_interpolation_error(times: Array, values: Array, stride: int) -> float:
-    """Return the RMS error of a cubic spline through every k-th sample at the other samples."""
+    """Return the RMS error of a cubic spline through every k-th sample at the other samples.
+
+    Args:
+        times: (T,) times in seconds.
+        values: (T,) signal, NaN where missing.
+        stride: the number k.
+    """
     # Import SciPy here, since only fast recordings need it.
     from scipy.interpolate import CubicSpline
 

@@ -158,7 +158,13 @@ def _compute_transfer_functions(
 def _select_present_samples(
     times: Array, command: Array, position: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the samples that are not missing, at most the first `MAX_SAMPLES`."""
+    """Return the samples that are not missing, at most the first `MAX_SAMPLES`.
+
+    Args:
+        times: (T,) times in seconds.
+        command: (T,) command, in rad or m; NaN where missing.
+        position: (T,) position, in rad or m; NaN where missing.
+    """
     is_recorded = np.isfinite(position) & np.isfinite(command)
     return (
         times[is_recorded][:MAX_SAMPLES],

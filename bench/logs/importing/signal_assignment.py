@@ -565,7 +565,12 @@ class ColumnAssigner:
             self._add_signal(self._signals.inputs, name, column, signal)
 
     def _resembles_position(self, column: LogColumn, joint: Joint) -> bool:
-        """Return whether a command is close to the position, and so a desired position."""
+        """Return whether a command is close to the position, and so a desired position.
+
+        Args:
+            column: column of the command.
+            joint: joint that it may drive.
+        """
         position = self._signals.get_position(joint.name)
         if position is None:
             return False

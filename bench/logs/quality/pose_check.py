@@ -301,6 +301,10 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
     """Find servos whose joint moves against the command, or by a factor that a wrong unit explains.
 
     Exchanged joints are found as well.
+
+    Args:
+        recording: recording of a robot.
+        robot: model of the robot.
     """
     servo_signals = [
         (f"u.{a.name}", f"q.{a.joint}")

@@ -108,7 +108,12 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
 def _find_saturated_commands(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[QualityFinding]:
-    """Find commands of a robot that are often at or beyond the range of their actuator."""
+    """Find commands of a robot that are often at or beyond the range of their actuator.
+
+    Args:
+        recording: the recording.
+        kind: class of the simulator; only robots specify ranges.
+    """
     if not kind.has_model:
         return
     robot: Any = kind
@@ -213,7 +218,12 @@ def _is_resting_value(values: Array, end: float) -> bool:
 
 
 def _find_moving_windows(values: Array, min_motion: float) -> Array:
-    """Return for each window of a run whether the signal moves in it."""
+    """Return for each window of a run whether the signal moves in it.
+
+    Args:
+        values: (T,) signal of the run, NaN where missing.
+        min_motion: smallest range within a window that counts as motion, in the unit of the signal.
+    """
     count = values.size // WINDOW_SAMPLES
     if not count:
         return np.array([bool(np.nanmax(values) - np.nanmin(values) > min_motion)])

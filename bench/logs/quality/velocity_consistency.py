@@ -266,7 +266,12 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
 
 
 def _recommend_correction(log_ratio: float, rate: str) -> str:
-    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
+    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm.
+
+    Args:
+        log_ratio: natural logarithm of the ratio of velocity and derivative.
+        rate: name of the velocity.
+    """
     for factor, unit in _UNIT_BY_RATIO.items():
         if abs(log_ratio - np.log(factor)) < 0.1:
             return f"one of the two is in {unit}: correct its unit"

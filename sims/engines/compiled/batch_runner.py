@@ -128,7 +128,12 @@ def _to_column(values: Array, count: int) -> Array:
 
 
 def _stack_inputs(values: list[Array], steps: int) -> Array:
-    """Return the inputs (U, L or 1, S), with one row if all elements share it."""
+    """Return the inputs (U, L or 1, S), with one row if all elements share it.
+
+    Args:
+        values: U inputs (L, S); those that all elements share have stride zero.
+        steps: number S of steps.
+    """
     if not values:
         return np.zeros((0, 1, steps))
     if all(value.strides[0] == 0 for value in values):

@@ -206,7 +206,12 @@ def is_too_nonlinear(block: Block, i: int) -> bool:
 
 
 def has_no_pending_event(block: Block, i: int) -> bool:
-    """Return whether the element has no pending event and not too many events in its step."""
+    """Return whether the element has no pending event and not too many events in its step.
+
+    Args:
+        block: buffers of the elements that are integrated together.
+        i: slot of the element.
+    """
     n = block.n
     return bool(n[PENDING_EVENT, i] == NO_EVENT and n[EVENT_COUNT, i] < MAX_EVENTS_PER_STEP)
 

@@ -465,7 +465,12 @@ def _is_traceable(
 
 
 def _print_once(subject: str, reason: Exception) -> None:
-    """Write one line to the standard error output, once per process."""
+    """Write one line to the standard error output, once per process.
+
+    Args:
+        subject: system or effect, as the beginning of the line.
+        reason: why it cannot be compiled.
+    """
     text = str(reason) or type(reason).__name__
     sys.stderr.write(f"simgap: {subject} cannot be compiled, and NumPy evaluates it: {text}\n")
 

@@ -99,7 +99,13 @@ def list_called_functions(function: FunctionType) -> list[FunctionType]:
 def _compile_functions(
     numba: Any, entry: FunctionType, constants: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Return the names that a function uses, with the functions that it calls compiled."""
+    """Return the names that a function uses, with the functions that it calls compiled.
+
+    Args:
+        numba: the module.
+        entry: function whose callees are compiled.
+        constants: further global names and their numbers.
+    """
     functions = list_called_functions(entry)
     space: dict[str, Any] = {}
     for function in (*functions, entry):

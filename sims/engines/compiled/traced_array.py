@@ -372,7 +372,12 @@ def _check_index(index: Any) -> None:
 
 
 def _to_nodes(graph: ExpressionGraph, value: Any) -> Any:
-    """Return the nodes of a traced array, or numbers as constant nodes."""
+    """Return the nodes of a traced array, or numbers as constant nodes.
+
+    Args:
+        graph: graph to which constant nodes are added.
+        value: traced array, or numbers.
+    """
     return value.nodes if isinstance(value, TracedArray) else make_constant_nodes(graph, value)
 
 
@@ -381,6 +386,11 @@ def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -
 
     Some functions are first expressed by others, such as square by a product and > by <, so
     that the interpreter needs fewer operations.
+
+    Args:
+        graph: graph to which nodes are added.
+        name: name of the NumPy function.
+        args: its arguments, traced arrays or numbers.
 
     Raises:
         NotTraceableError: arithmetic with booleans alone, or an operation that is not known.
@@ -419,7 +429,12 @@ def _simplify_power(graph: ExpressionGraph, base: Any, exponent: float) -> Trace
 
 
 def _unwrap_arguments(graph: ExpressionGraph, args: Any) -> list[Any]:
-    """Return arguments with traced arrays, and numbers next to them in lists, as nodes."""
+    """Return arguments with traced arrays, and numbers next to them in lists, as nodes.
+
+    Args:
+        graph: graph to which constant nodes are added.
+        args: arguments of a NumPy function.
+    """
 
     def bare(arg: Any) -> Any:
         """Return the nodes of one argument; an argument without traced arrays is unchanged."""
@@ -433,7 +448,12 @@ def _unwrap_arguments(graph: ExpressionGraph, args: Any) -> list[Any]:
 
 
 def _wrap_result(graph: ExpressionGraph, result: Any) -> Any:
-    """Return arrays of nodes, also several in a list or tuple, as traced arrays."""
+    """Return arrays of nodes, also several in a list or tuple, as traced arrays.
+
+    Args:
+        graph: graph that contains the nodes.
+        result: array of nodes, or a list or tuple of arrays.
+    """
     if isinstance(result, list | tuple):
         return type(result)(_wrap_result(graph, part) for part in result)
     return TracedArray(graph, to_node_array(result))
@@ -452,7 +472,13 @@ def _trace_where(condition: Any, *values: Any) -> TracedArray:
 
 
 def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
-    """Trace numpy.clip as a maximum and a minimum; a limit may be None."""
+    """Trace numpy.clip as a maximum and a minimum; a limit may be None.
+
+    Args:
+        x: values to clip.
+        low: lower limit; None for no limit.
+        high: upper limit; None for no limit.
+    """
     graph = _find_graph(x, low, high)
     result = x
     if low is not None:
@@ -481,7 +507,17 @@ def _trace_norm(
     axis: Any = None,
     keepdims: bool = False,
 ) -> TracedArray:
-    """Trace numpy.linalg.norm as the root of the sum of squares (Euclidean or Frobenius norm)."""
+    """Trace numpy.linalg.norm as the root of the sum of squares (Euclidean or Frobenius norm).
+
+    Args:
+        x: traced array.
+        ord: order of the norm; only the default is traced.
+        axis: axis or axes of the sum; None for all.
+        keepdims: whether the summed axes stay with length one.
+
+    Raises:
+        NotTraceableError: another order is requested.
+    """
     if ord is not None:
         raise NotTraceableError("numpy.linalg.norm with the argument ord is not traced")
     squares = _apply_elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)

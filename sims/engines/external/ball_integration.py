@@ -105,7 +105,12 @@ class BallBody(Protocol):
         ...
 
     def set_state(self, x: Vector, w: Vector) -> None:
-        """Set the position and the engine's velocity."""
+        """Set the position and the engine's velocity.
+
+        Args:
+            x: position, m.
+            w: velocity at the time half a step before, m/s.
+        """
         ...
 
     def advance(self, force: Vector) -> BallState:
@@ -468,6 +473,11 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
 
         The force program includes gravity, so that it is subtracted. All values are per
         unit mass.
+
+        Args:
+            t: time since the start, s.
+            x: position, m.
+            v: velocity, m/s.
         """
         if not forces.acts:
             return 0.0, 0.0, 0.0

@@ -184,7 +184,12 @@ class _BulletMover:
         bullet_world.import_pybullet().setTimeStep(step, self._client)
 
     def set_state(self, x: Vector, w: Vector) -> None:
-        """Set position and velocity; the ball is upright and does not spin."""
+        """Set position and velocity; the ball is upright and does not spin.
+
+        Args:
+            x: position, m.
+            w: velocity at the time half a step before, m/s.
+        """
         bullet_world.import_pybullet().resetBasePositionAndOrientation(
             self._body, x, _NO_ROTATION, self._client
         )

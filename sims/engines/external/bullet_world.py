@@ -175,7 +175,12 @@ class BulletJoint:
         return True
 
     def set_state(self, x: float, w: float) -> None:
-        """Set the joint's position and velocity."""
+        """Set the joint's position and velocity.
+
+        Args:
+            x: position, rad or m.
+            w: velocity at the time half a step before.
+        """
         import_pybullet().resetJointState(self._body, 0, x, w, self._client)
 
     def advance(self, force: float) -> tuple[float, float]:

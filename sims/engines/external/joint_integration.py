@@ -79,7 +79,12 @@ class JointBody(Protocol):
         ...
 
     def set_state(self, x: float, w: float) -> None:
-        """Set the position and the engine's velocity."""
+        """Set the position and the engine's velocity.
+
+        Args:
+            x: position, rad or m.
+            w: velocity at the time half a step before.
+        """
         ...
 
     def compute_gravity_force(self, x: float) -> float:
@@ -163,6 +168,11 @@ class LinearisedForces:
 
         The half steps of the velocity at both ends of a step then find the force at other
         velocities without evaluating it again.
+
+        Args:
+            t: time since the start, s.
+            x: position, rad or m.
+            v: velocity, rad/s or m/s.
         """
         # The second velocity is farther from zero, where forces may be discontinuous.
         velocity_step = math.copysign(VELOCITY_STEP, v)
@@ -426,7 +436,12 @@ def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) 
 
 
 def _compute_weights(element: ElementWork, x: Array) -> Array:
-    """Return the force of gravity (n,) at positions (n,)."""
+    """Return the force of gravity (n,) at positions (n,).
+
+    Args:
+        element: the batch element, with its system and parameters.
+        x: (n,) positions, rad or m.
+    """
     zeros = np.zeros((x.size, 1))
     moment = element.make_snapshot(zeros, x[:, None], zeros, {})
     weights: Array = element.system.weight(moment)[:, 0]

@@ -121,7 +121,12 @@ class MujocoJoint:
         return self._load(self._model, inertia, self._constants)
 
     def set_state(self, x: float, w: float) -> None:
-        """Set the joint's position and velocity."""
+        """Set the joint's position and velocity.
+
+        Args:
+            x: position, rad or m.
+            w: velocity at the time half a step before.
+        """
         self._x[0] = x
         self._w[0] = w
 
@@ -190,7 +195,12 @@ class MujocoMover:
         self._inverse_step = 1.0 / step
 
     def set_state(self, x: Vector, w: Vector) -> None:
-        """Set position and velocity."""
+        """Set position and velocity.
+
+        Args:
+            x: position, m.
+            w: velocity at the time half a step before, m/s.
+        """
         self._x[:] = x
         self._w[:] = w
 

@@ -184,7 +184,12 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
 
 @lru_cache(maxsize=8)
 def _read_topic(stamp: FileVersion, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
-    """Read a topic of a bag; cached by file version."""
+    """Read a topic of a bag; cached by file version.
+
+    Args:
+        stamp: version of the bag, whose path names the topic.
+        columns_to_read: columns that hold text, and are read too.
+    """
     bag = ros_bags.split_bag_path(stamp.path)
     assert bag is not None  # the caller checked the path
     columns = ros_bags.read_topic(*bag, columns_to_read)

@@ -129,7 +129,15 @@ def find_layout(path: Path) -> Layout:
 
 
 def _detect_encoding(path: Path, head: bytes) -> str:
-    """Return the encoding of a text: UTF-8, UTF-16 with a byte order mark, or Windows-1252."""
+    """Return the encoding of a text: UTF-8, UTF-16 with a byte order mark, or Windows-1252.
+
+    Args:
+        path: path of the file, for messages.
+        head: first bytes of the file.
+
+    Raises:
+        InputError: the file holds binary data.
+    """
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     if b"\0" in head:
@@ -182,7 +190,12 @@ def _normalise_row(row: Sequence[str], width: int) -> list[str]:
 
 
 def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
-    """Return the positions of the columns in which at least half of the cells are numbers."""
+    """Return the positions of the columns in which at least half of the cells are numbers.
+
+    Args:
+        rows: cells of the first lines of the file.
+        width: number of cells in a data row.
+    """
     full_rows = [row for row in rows if len(row) == width]
     # The second half of the inspected rows is data, whatever precedes it.
     body = full_rows[len(full_rows) // 2 :]
@@ -261,7 +274,12 @@ def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
 
 
 def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
-    """Return the column numbers that pandas writes for unnamed columns; otherwise nothing."""
+    """Return the column numbers that pandas writes for unnamed columns; otherwise nothing.
+
+    Args:
+        rows: cells of the first lines, by the number of the line.
+        first: line of the first row with cells.
+    """
     cells = tuple(cell.strip() for cell in rows[first])
     numbers = cells[1:] if cells and not cells[0] else cells
     counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
@@ -357,6 +375,10 @@ def _make_unique_names(layout: Layout) -> list[str]:
 def _read_cells(path: Path, layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+
     Raises:
         InputError: rows have different numbers of cells, or the text cannot be decoded.
     """
@@ -421,7 +443,12 @@ def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputErro
 
 
 def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
-    """Make the error for the first row with a wrong number of cells; None if all rows are even."""
+    """Make the error for the first row with a wrong number of cells; None if all rows are even.
+
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+    """
     line = layout.first
     try:
         for line, last, row in _iterate_rows(path, layout):
@@ -452,7 +479,12 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
 
 
 def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
-    """Iterate over the data rows with their first and last lines; skip comments and blank lines."""
+    """Iterate over the data rows with their first and last lines; skip comments and blank lines.
+
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+    """
     with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
             for line, text in enumerate(file, start=1):
@@ -471,7 +503,12 @@ def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[s
 
 
 def _find_last_line(path: Path, layout: Layout) -> int:
-    """Return the line of the last data row."""
+    """Return the line of the last data row.
+
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+    """
     last = 0
     for line, *_ in _iterate_rows(path, layout):
         last = line
@@ -479,7 +516,13 @@ def _find_last_line(path: Path, layout: Layout) -> int:
 
 
 def _find_line(path: Path, layout: Layout, record: int) -> int:
-    """Return the line of a data row, counted from 1 as in an editor."""
+    """Return the line of a data row, counted from 1 as in an editor.
+
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+        record: number of the data row, counted from 0 without comments and blank lines.
+    """
     for number, (line, *_) in enumerate(_iterate_rows(path, layout)):
         if number == record:
             return line
@@ -579,6 +622,11 @@ class _CellKind:
 
         Points before groups of three digits are removed if some cell has both marks.
 
+        Args:
+            path: path of the file, for messages.
+            layout: layout of the table.
+            name: name of the column.
+
         Raises:
             InputError: points without commas leave the meaning of a cell open.
         """
@@ -601,7 +649,16 @@ class _CellKind:
         return texts.str.replace(",", ".", n=1, regex=False)
 
     def _convert_dates(self, path: Path, layout: Layout, name: str) -> Array | None:
-        """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970."""
+        """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970.
+
+        Args:
+            path: path of the file, for messages.
+            layout: layout of the table.
+            name: name of the column.
+
+        Raises:
+            InputError: a cell is not a time.
+        """
         import pandas
 
         empty = (self.series == "").to_numpy(dtype=bool)
@@ -619,7 +676,16 @@ class _CellKind:
         return np.where(stamps.isna().to_numpy(), np.nan, nanoseconds * 1e-9)
 
     def _convert_lists(self, path: Path, layout: Layout, name: str) -> Array:
-        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k)."""
+        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k).
+
+        Args:
+            path: path of the file, for messages.
+            layout: layout of the table.
+            name: name of the column.
+
+        Raises:
+            InputError: a cell is not a list, or has another length than the first one.
+        """
         rows: list[list[float]] = []
         for number, text in enumerate(self.texts):
             match = NUMBERS.fullmatch(text)
@@ -637,7 +703,16 @@ class _CellKind:
     def _make_cell_error(
         self, path: Path, layout: Layout, name: str, record: int, expected: str, note: str = ""
     ) -> InputError:
-        """Make the error for a cell that does not fit its column."""
+        """Make the error for a cell that does not fit its column.
+
+        Args:
+            path: path of the file.
+            layout: layout of the table.
+            name: name of the column.
+            record: number of the data row, counted from 0.
+            expected: expected content in words.
+            note: addition at the end of the message.
+        """
         line = _find_line(path, layout, record)
         cell_text = format_value(self.cells[record])
         return InputError(

@@ -79,7 +79,12 @@ class _TensorUnpickler(pickle._Unpickler):
     """
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what stands for a class or function in the program."""
+        """Return the substitute for a class or function that the pickle program names.
+
+        Args:
+            module: module of the class.
+            name: name of the class.
+        """
         if module == "torch" and name.endswith("Storage"):
             return name
         return _KNOWN_NAMES.get(f"{module}.{name}", _UnknownObject)

@@ -407,6 +407,10 @@ def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
     Positions, velocities and loads are random numbers of different sizes, with a fixed seed, so
     that the answer is the same in each process.
 
+    Args:
+        tracing: traced state of the robot.
+        forces: effects, evaluated by NumPy.
+
     Raises:
         NotTraceableError: the results differ.
     """

@@ -221,7 +221,12 @@ def is_in_drive(effect: Effect) -> bool:
 
 
 def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) -> Array:
-    """Compute the forces (L, D) that effects in drives add to the drives."""
+    """Compute the forces (L, D) that effects in drives add to the drives.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        snapshot: state of the batch.
+    """
     return compute_effect_forces(
         [(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], snapshot
     )

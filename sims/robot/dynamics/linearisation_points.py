@@ -587,5 +587,10 @@ def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, Index
 
 
 def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:
-    """Repeat the coefficients of model-field effects for all elements of a batch."""
+    """Repeat the coefficients of model-field effects for all elements of a batch.
+
+    Args:
+        acting: effects with coefficients (K, 1, 1).
+        count: number of elements.
+    """
     return tuple((e, np.repeat(c, count, axis=1)) for e, c in select_model_field_effects(acting))

@@ -146,7 +146,12 @@ class MidpointPredictor:
     def _compute_transmission_loads(
         self, has_new_command: Mask, first: bool
     ) -> tuple[Array, Array]:
-        """Return the transmission loads (2, L, D) at the beginning and at the middle of a step."""
+        """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
+
+        Args:
+            has_new_command: (L,) whether the command changes at the beginning of the step.
+            first: whether it is the first step.
+        """
         end_loads = self._copy_forces()
         start_loads, previous_loads = end_loads, self._last
         to_evaluate = self._loaded & has_new_command if self._forces_are_at_end else self._loaded

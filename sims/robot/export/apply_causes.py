@@ -185,7 +185,12 @@ def apply_causes(
 
 
 def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
-    """Return the note about an effect that the file contains; None if there is none."""
+    """Return the note about an effect that the file contains; None if there is none.
+
+    Args:
+        robot: model of the robot.
+        cause: the effect with its coefficients.
+    """
     if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
         return _SOFT_FRICTION_NOTE
     return _NOTES.get(cause.effect)
@@ -257,7 +262,12 @@ def _write_cause(
 
 
 def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
-    """Return whether a frame element changes the attributes that a geometry effect changes."""
+    """Return whether a frame element changes the attributes that a geometry effect changes.
+
+    Args:
+        robot: model of the robot.
+        cause: the geometry effect with its place.
+    """
     elements = robot.spec.joints if cause.effect.startswith("joint.") else robot.spec.bodies
     return any(element.name == cause.place and element.frame is not None for element in elements)
 
@@ -289,7 +299,12 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
 
 
 def _keep_masses(spec: Any, target_values: Fields) -> None:
-    """Change compiler settings so that MuJoCo uses inertials as specified."""
+    """Change compiler settings so that MuJoCo uses inertials as specified.
+
+    Args:
+        spec: the model as an `MjSpec`, changed in place.
+        target_values: target fields of the compiled model.
+    """
     import mujoco
 
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:

@@ -425,7 +425,12 @@ class _Actuator:
         return float(low), float(high)
 
     def limit(self, low: float, high: float) -> None:
-        """Set the limits of the control; infinite limits are ignored."""
+        """Set the limits of the control; infinite limits are ignored.
+
+        Args:
+            low: lower limit, in the unit of the control.
+            high: upper limit.
+        """
         if np.isfinite(low) and np.isfinite(high):
             self.fields["actuator_ctrllimited"][0, self.control] = True
             self.fields["actuator_ctrlrange"][0, self.control] = (low, high)
@@ -606,6 +611,11 @@ def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unst
     """Write an option of the model file, such as the time step in seconds.
 
     An option that is a word in the file has MuJoCo's number of the word.
+
+    Args:
+        fields: fields of the model, changed in place.
+        robot: unused; all writers have the same arguments.
+        cause: the cause, whose coefficient is the value.
     """
     (number,) = cause.coefficients
     fields[f"opt.{OPTION_EFFECTS[cause.effect]}"][0] = number

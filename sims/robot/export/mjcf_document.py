@@ -116,6 +116,10 @@ class XmlText:
         """Add an element to the tree at its start tag (called by the parser).
 
         Until its end tag is parsed, `inside` and `end` are the end of the start tag.
+
+        Args:
+            name: name of the element.
+            attributes: its attributes.
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._end_of(tag.begin)
@@ -201,7 +205,12 @@ class XmlText:
         return b"".join([*comments, *element_parts, *following_elements])
 
     def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
-        """Return the text of the elements inserted before all children."""
+        """Return the text of the elements inserted before all children.
+
+        Args:
+            tag: the element with its new children.
+            indent: indentation of the element.
+        """
         child_indent = (
             self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
         )

@@ -96,7 +96,12 @@ class MjcfWriter:
             tag.new |= values
 
     def _write_option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
-        """Write global options, such as gravity, into the last option element or a new one."""
+        """Write global options, such as gravity, into the last option element or a new one.
+
+        Args:
+            statement: values of the options.
+            comments: comments to write before the element.
+        """
         options, values = self.document.find_elements("option"), format_attributes(statement.values)
         if options:
             _add_comments(options[-1], comments)
@@ -153,6 +158,10 @@ class MjcfWriter:
 
         The attribute springdamper would override stiffness and damping, so it is set to
         zero with them.
+
+        Args:
+            tag: element of the joint in the document.
+            statement: values to write.
         """
         values = format_attributes(statement.values)
         hinge = tag.get_attribute("type") in (None, "hinge")
@@ -197,7 +206,12 @@ class MjcfWriter:
 
 
 def _is_needed(name: str, values: tuple[float, ...]) -> bool:
-    """Return whether ``general`` must specify an attribute that a shortcut implies."""
+    """Return whether ``general`` must specify an attribute that a shortcut implies.
+
+    Args:
+        name: name of the attribute.
+        values: its values.
+    """
     if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
         return True
     return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)
@@ -249,7 +263,12 @@ def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
 
 
 def _format_values(name: str, values: tuple[float, ...]) -> str:
-    """Format the numbers of an attribute for MJCF: word, true or false, integer or list."""
+    """Format the numbers of an attribute for MJCF: word, true or false, integer or list.
+
+    Args:
+        name: name of the attribute.
+        values: its numbers, as in the compiled model.
+    """
     if name in ENUM_ATTRIBUTES or name == "interp":
         return get_enum_word(name, values[0])
     if name in FLAG_ATTRIBUTES:

@@ -103,7 +103,12 @@ def _fields_differ(first: Any, second: Any, tolerance: float) -> bool:
 
 
 def _format_difference(first: Any, second: Any) -> str:
-    """Format the largest difference of two fields as "value and value", or both shapes."""
+    """Format the largest difference of two fields as "value and value", or both shapes.
+
+    Args:
+        first: array or number of one model.
+        second: the same field of the other model.
+    """
     first, second = np.asarray(first), np.asarray(second)
     if first.shape != second.shape:
         return f"{first.shape} and {second.shape}"

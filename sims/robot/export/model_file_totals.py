@@ -36,7 +36,13 @@ It takes the model fields, the robot and the place.
 
 
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
-    """Return the component of gravity along the direction that the file specifies."""
+    """Return the component of gravity along the direction that the file specifies.
+
+    Args:
+        f: fields of the model with the effects.
+        robot: the robot, whose file specifies the direction.
+        place: unused.
+    """
     gravity_in_file = robot.compiled.opt.gravity
     return [
         float(f["opt.gravity"][0] @ gravity_in_file / max(np.linalg.norm(gravity_in_file), 1e-300))
@@ -44,7 +50,13 @@ def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[
 
 
 def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
-    """Return the upper force limit of an actuator in a list of one; infinite if none."""
+    """Return the upper force limit of an actuator in a list of one; infinite if none.
+
+    Args:
+        f: fields of the model with the effects.
+        robot: the robot.
+        place: name of the actuator.
+    """
     number = robot.actuator(place).id
     is_limited = f["actuator_forcelimited"][0, number]
     return [f["actuator_forcerange"][0, number, 1]] if is_limited else [np.inf]
@@ -57,7 +69,13 @@ def _make_solref_reader(index: int) -> Read:
     """
 
     def read(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
-        """Return the number of the contact in a list of one."""
+        """Return the number of the contact in a list of one.
+
+        Args:
+            f: fields of the model with the effects.
+            robot: the robot.
+            place: name of the contact.
+        """
         values = f["pair_solref"][0, find_pair(robot, place)]
         return [values[index] if values[0] > 0 else np.inf]
 

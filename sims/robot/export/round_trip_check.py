@@ -71,7 +71,12 @@ def check_written_files(
 
 
 def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
-    """Compile a written MJCF, and check that it equals the intended model."""
+    """Compile a written MJCF, and check that it equals the intended model.
+
+    Args:
+        written_files: the written files, with the intended model.
+        path: path of the MJCF.
+    """
     import mujoco
 
     with capture_mujoco_warnings():
@@ -146,6 +151,11 @@ def _compare_models(reloaded_model: Any, target_model: Any, name: str) -> None:
 
 def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that two models move alike in a short test simulation from the same pose.
+
+    Args:
+        reloaded_model: model compiled from the written file.
+        target_model: intended model.
+        name: name of the file in messages.
 
     Raises:
         RuntimeError: the positions differ by more than `MOTION_TOLERANCE`.

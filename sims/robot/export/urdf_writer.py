@@ -276,7 +276,12 @@ _NO_JOINT = "the file has no joint of this name"
 
 
 def _read_origin(tag: XmlElement, attribute: str) -> Array:
-    """Return the position ``xyz`` or the angles ``rpy`` of an element's origin."""
+    """Return the position ``xyz`` or the angles ``rpy`` of an element's origin.
+
+    Args:
+        tag: element with an origin.
+        attribute: ``xyz`` (m) or ``rpy`` (rad).
+    """
     origin = _find_child(tag, "origin")
     return _parse_vector(origin.get_attribute(attribute) if origin else None)
 

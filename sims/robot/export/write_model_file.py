@@ -154,6 +154,10 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
     The length of the tendon is q + c q_first, with the coefficient c and the preceding joint
     q_first.
 
+    Args:
+        document: the MJCF, changed in place.
+        applied: model with the causes, which include the couplings.
+
     Raises:
         NotEditableError: the text lacks a joint or an actuator of the compiled model.
     """

@@ -175,8 +175,12 @@ class CompileRepairs:
     def _set_default_mass(self, spec: Any, name: str) -> bool:
         """Give a moving body the default mass and the least moments, where it has less.
 
-        Returns whether the body was changed. `has_children` is whether other bodies are attached
-        to it.
+        Args:
+            spec: the model as an `MjSpec`, changed in place.
+            name: name of the body.
+
+        Returns:
+            Whether the body was changed.
         """
         for body in [body for body in spec.bodies if body.name == name]:
             mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)

@@ -153,7 +153,15 @@ def _parse_size(text: str) -> float:
 
 
 def _read_attached_model(files: ModelFileReader, element: Element) -> None:
-    """Read an attached model, which MuJoCo opens itself."""
+    """Read an attached model, which MuJoCo opens itself.
+
+    Args:
+        files: reader of the files of the model.
+        element: element that attaches the model; its path becomes absolute.
+
+    Raises:
+        InputError: the model is missing, or includes itself.
+    """
     name = element.get("file") or ""
     path = files.path.parent / name.replace("\\", "/")
     if not is_existing_file(path):

@@ -188,7 +188,12 @@ def _parse_repaired_file(files: ModelFileReader, root: Element) -> Any:
 
 
 def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
-    """Map the bodies that MuJoCo fused into others to the bodies that contain them."""
+    """Map the bodies that MuJoCo fused into others to the bodies that contain them.
+
+    Args:
+        parents: parent of each body of the file that may be fused, by name.
+        compiled: names of the bodies of the compiled model.
+    """
     aliases = {}
     for name in parents:
         containing_body = name

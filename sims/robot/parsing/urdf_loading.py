@@ -87,7 +87,12 @@ def repair_inertials(
 
 
 def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
-    """Raise principal moments that are not positive; return a text about the change."""
+    """Raise principal moments that are not positive; return a text about the change.
+
+    Args:
+        tensor: element with the inertia tensor, changed in place.
+        entries: the six entries of the tensor, kg m².
+    """
     moments, axes = compile_repairs.compute_principal_moments(entries)
     if moments[0] >= compile_repairs.NEGLIGIBLE_MOMENT:
         return ""
@@ -262,6 +267,10 @@ def _remove_unread_elements(root: Element) -> list[str]:
 def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
     """Return the links by name.
 
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF.
+
     Raises:
         InputError: a link has no name, or two links have the same name.
     """
@@ -379,7 +388,12 @@ def _get_compiler_element(root: Element) -> Element:
 
 
 def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
-    """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF."""
+    """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF.
+
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF.
+    """
     import mujoco
 
     for child in find_children(root, "mujoco"):

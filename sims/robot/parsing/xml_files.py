@@ -156,7 +156,12 @@ class _LineTrackingTreeBuilder:
         return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
-        """Add an element to the tree at its start tag, and store its file and line for messages."""
+        """Add an element to the tree at its start tag, and store its file and line for messages.
+
+        Args:
+            name: name of the element.
+            attributes: its attributes.
+        """
         element = Element(name, attributes)
         self.files.places[element] = self.here
         if self.open:

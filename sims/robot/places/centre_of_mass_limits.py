@@ -60,6 +60,11 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
 
     They are its origin, its specified centre of mass, the corners of its geoms, and the origins of
     its child bodies.
+
+    Args:
+        model: compiled model.
+        data: its state at the reference pose.
+        number: number of the body.
     """
     import mujoco
 
@@ -96,6 +101,10 @@ def _estimate_link_length(model: Any, number: int) -> float:
     """Return the assumed length, in metres, of a link without a specified shape.
 
     It is the distance of the link from its parent, or else the longest such distance in the robot.
+
+    Args:
+        model: compiled model.
+        number: number of the body.
     """
     distances = np.linalg.norm(model.body_pos[1:], axis=1)
     return float(distances[number - 1]) or float(distances.max(initial=0.0)) or UNKNOWN_LENGTH

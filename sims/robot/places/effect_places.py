@@ -211,7 +211,12 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
 
 
 def _has_quantity(effect_place: EffectPlace, c: Coefficient) -> bool:
-    """Return whether the model file specifies the quantity of a coefficient."""
+    """Return whether the model file specifies the quantity of a coefficient.
+
+    Args:
+        effect_place: place of the effect, with the values of the model file.
+        c: coefficient of the effect.
+    """
     file_armature = effect_place.stated.get("inertia.armature", 0.0)
     return c.of == "rotor" and file_armature > c.plausible[0][0] * effect_place.inertia
 
@@ -354,6 +359,11 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
 
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
     value, the coefficient is a difference from it, limited so that the total is not negative.
+
+    Args:
+        effect: class of the effect.
+        c: its coefficient, as declared in the library.
+        effect_place: the place, with the values of the model file.
     """
     system_kind = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
     unit, (low, high) = c.units[system_kind], c.plausible[system_kind]
