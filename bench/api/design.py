@@ -27,6 +27,8 @@ MAX_LENGTH_FACTOR = 5.0
 """Maximum ratio of a run's duration to the requested one, if that settles a question."""
 MAX_REPEATS = 8
 """Maximum number of repetitions of a run that is recommended."""
+MAX_LOG_GAIN = 50.0
+"""Largest logarithm of a gain that is printed as a factor."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class NextRecording:
         lines = [f"record next, {design.times[-1]:.3g} s: {design.says}; begin near {initial_text}"]
         if design.by == "T":
             return [*lines, *_format_discrimination(design)]
-        factor = math.exp(min(design.gain, 50.0))
+        factor = math.exp(min(design.gain, MAX_LOG_GAIN))
         benefit = (
             f"it shrinks the joint confidence region of all parameters by a factor of {factor:.3g}"
         )

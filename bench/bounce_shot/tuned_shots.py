@@ -37,6 +37,8 @@ EXPLAIN_METHOD = "explain"
 EXPLAIN_SUFFIX = " + explain"
 """Suffix of the label of a tuner that tunes the simulator extended by explain."""
 EffectCoefficients = Mapping[str, Sequence[float]]
+DEFAULT_GRAVITY = 9.81
+"""Gravity of a recording that does not state it, m/s²."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,7 @@ def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
         for name, numbers in explanation.extended.effects.items()
     }
     acting_effects = select_transferable_effects(
-        all_effects, explanation.extended.constants.get("gravity", 9.81)
+        all_effects, explanation.extended.constants.get("gravity", DEFAULT_GRAVITY)
     )
     reason = f"{explanation.verdict}: {', '.join(all_effects) or 'nothing'}"
     restitution = explanation.extended.parameters["restitution"].value

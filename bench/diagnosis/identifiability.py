@@ -33,7 +33,12 @@ from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_sta
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.validation.gain_and_intervals import (
+    MIN_EIGENVALUE,
+    PSEUDOINVERSE_CUTOFF,
+    UNIDENTIFIED_VARIANCE,
+    Z95,
+)
 from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import format_unit
 from sims.core.simulator import Array
@@ -50,10 +55,6 @@ for it to be detectable.
 """
 CONFOUNDING_CORRELATION = 0.95
 """Minimum correlation of two parameters that are reported as confounded."""
-MIN_EIGENVALUE = 1e-12
-"""Smallest eigenvalue of D'D with unit columns at which its direction is identifiable."""
-UNIDENTIFIED_VARIANCE = 1e12
-"""Variance along directions that are not identifiable, in units of those with unit columns."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
 
@@ -170,7 +171,7 @@ class _IdentifiabilityAssessment:
         covariance = np.full((scale.size, scale.size), np.inf)
         unit_columns = columns[:, is_sensitive] / scale[is_sensitive]
         correlation_inverse = np.linalg.pinv(
-            unit_columns.T @ unit_columns, rcond=1e-13, hermitian=True
+            unit_columns.T @ unit_columns, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True
         )
         values, vectors = np.linalg.eigh(unit_columns.T @ unit_columns)
         unidentified = vectors[:, values < MIN_EIGENVALUE]

@@ -43,6 +43,11 @@ _VERDICT_WITH_NUMERICS: dict[VerdictName, VerdictName] = {
     "unknown": "partial",
 }
 """Verdict on the whole if numerical settings are wrong, by the verdict on the remaining causes."""
+MAX_P_VALUE_GAIN = 1400.0
+"""Largest gain for which a p-value is computed.
+
+Beyond it, exp(-gain / 2) becomes zero by underflow.
+"""
 
 
 class Reusable(Generic[Item]):
@@ -180,10 +185,9 @@ def add_numerics_causes(verdict: Verdict, causes: Sequence[Cause]) -> Verdict:
 def _compute_p_value(gain: float) -> float:
     """Return the p-value of a gain in twice the log-likelihood by at most two chosen numbers.
 
-    It is exp(-gain / 2) by Wilks' theorem; the gain is limited to 1400 so that the p-value does not
-    become zero by underflow.
+    It is exp(-gain / 2) by Wilks' theorem; the gain is limited to `MAX_P_VALUE_GAIN`.
     """
-    return float(np.exp(-0.5 * min(gain, 1400.0)))
+    return float(np.exp(-0.5 * min(gain, MAX_P_VALUE_GAIN)))
 
 
 def list_option_causes(finding: OptionFinding) -> list[Cause]:

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
 from bench.benchmark.statistics.error_curves import RunCurves, select_checkpoints
 from bench.core.random_streams import make_rng
 from sims.core.simulator import Array
@@ -172,7 +173,8 @@ def compute_percentile_interval(values: Array) -> tuple[float, float]:
     # Order statistics are used without interpolation, because values may be infinite.
     ordered = np.sort(values)
     n = len(ordered)
-    return float(ordered[int(0.025 * (n - 1))]), float(ordered[int(np.ceil(0.975 * (n - 1)))])
+    lower, upper = (share * (n - 1) for share in INTERVAL_QUANTILES)
+    return float(ordered[int(lower)]), float(ordered[int(np.ceil(upper))])
 
 
 ERT_COLUMNS = [

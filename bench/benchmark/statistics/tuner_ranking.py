@@ -38,6 +38,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.paired_tests import (
     MIN_ERROR,
@@ -363,7 +364,9 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     observed = compute_kendall_tau(*ranks.mean(axis=1))
     resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
     resampled_taus = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
-    low, high = np.nanquantile(resampled_taus, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
+    low, high = (np.nan, np.nan)
+    if count > 1:
+        low, high = np.nanquantile(resampled_taus, INTERVAL_QUANTILES)
     # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
     low, high = min(low, observed), max(high, observed)
     p = _compute_permutation_p_value(ranks[1] - ranks[0], rng)

@@ -50,6 +50,10 @@ MAX_NAMED = 4
 """Maximum number of signals that a sentence names."""
 QUANTITIES = ("q", "qd", "tau")
 """Prefixes of the channels of a joint: position, velocity, torque."""
+SAME_UNIT_TOLERANCE = 1e-6
+"""Relative difference of two factors up to which they are the same unit."""
+INTEGER_TOLERANCE = 1e-6
+"""Distance of a recorded value from an integer up to which it may be a count of encoder ticks."""
 
 
 @dataclass(frozen=True)
@@ -445,7 +449,7 @@ def _generate_units(
     text = join_first_names(names, MAX_NAMED)
     for unit, gain in UNITS.get(first.si, {}).items():
         scale = first.scale * gain / first.gain
-        if not math.isclose(scale, 1.0, rel_tol=1e-6):
+        if not math.isclose(scale, 1.0, rel_tol=SAME_UNIT_TOLERANCE):
             unit_words, stated_words = (
                 UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit)
             )
@@ -472,7 +476,7 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
         for signal in signals:
             numbers = recorded[signal.name] / signal.gain
             numbers = numbers[np.isfinite(numbers)]
-            if not np.allclose(numbers, np.rint(numbers), rtol=0.0, atol=1e-6):
+            if not np.allclose(numbers, np.rint(numbers), rtol=0.0, atol=INTEGER_TOLERANCE):
                 return False
     return True
 

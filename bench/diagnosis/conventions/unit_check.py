@@ -148,6 +148,8 @@ UNITS_IN_WORDS = {
     "g_0": "multiples of standard gravity",
 }
 """Names of units in words."""
+SAME_UNIT_TOLERANCE = 1e-6
+"""Relative difference of two factors up to which they are the same unit."""
 
 
 @dataclass(frozen=True)
@@ -556,7 +558,9 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
     stated = abs(first.gain / first.scale)
     tested_factors = {1.0}
     for unit, gain in units.items():
-        if unit != first.specified_unit and not math.isclose(gain, stated, rel_tol=1e-6):
+        if unit != first.specified_unit and not math.isclose(
+            gain, stated, rel_tol=SAME_UNIT_TOLERANCE
+        ):
             yield Hypothesis(signals, (unit,) * len(signals))
             yield Hypothesis(signals, (unit,) * len(signals), -1.0)
             tested_factors.add(gain / stated)

@@ -33,6 +33,8 @@ It is added to the height that the ball needs so that it does not land during it
 """
 MAX_UNKNOWN_FALL_SPEED = 100.0
 """Maximum assumed fall speed in m/s of a ball whose height and speed are not recorded."""
+DEFAULT_GRAVITY = 9.81
+"""Gravity of a system that does not declare it, m/s²."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
         run: the run; its constant ``gravity`` (m/s²) replaces that of the simulator.
         simulator: simulator of the ball.
     """
-    constant = simulator.constant_values.get("gravity", 9.81)
+    constant = simulator.constant_values.get("gravity", DEFAULT_GRAVITY)
     gravity = float(run.constants.get("gravity", constant))
     seconds = float(run.times[-1] - run.times[0])
     # Allow for twice the fall due to gravity and for a fast downward throw.

@@ -22,6 +22,10 @@ from sims.core.simulator import Array, Scenario
 
 Interval = tuple[float, float]
 UNLIMITED: Interval = (-np.inf, np.inf)
+MAX_PROBE_FREQUENCY = 8.0
+"""Largest frequency of a proposed command, Hz."""
+MAX_CYCLES_PER_SAMPLE = 0.1
+"""Largest frequency of a proposed command, in cycles per sample interval."""
 
 
 @dataclass(frozen=True)
@@ -435,7 +439,9 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     # In Hz. The slow frequency has one cycle in the run, but is 0.1 to 0.5 Hz. The fast one has at
     # least ten samples in a cycle, but is at most 8 Hz.
     slow_frequency = min(max(1.0 / max(seconds, step), 0.1), 0.5)
-    fast_frequency = max(min(8.0, 0.1 / step), 2.0 * slow_frequency)
+    fast_frequency = max(
+        min(MAX_PROBE_FREQUENCY, MAX_CYCLES_PER_SAMPLE / step), 2.0 * slow_frequency
+    )
     text = COMMAND_FORMS[form].format(
         slow=slow_frequency, middle=min(1.0, 0.5 * fast_frequency), fast=fast_frequency
     )

@@ -57,6 +57,18 @@ MAX_FIT_ITERATIONS = 12
 MAX_DAMPING = 1e8
 """Damping (D. W. Marquardt 1963) above which a fit of a competing model to a candidate run stops.
 """
+FIRST_DAMPING = 1e-6
+"""Damping of the first step of a fit, relative to the squared sensitivities."""
+DAMPING_INCREASE = 100.0
+"""Factor of the damping after a step that failed or did not lower the cost."""
+DAMPING_DECREASE = 10.0
+"""Divisor of the damping after a step that lowered the cost."""
+MIN_RELATIVE_DECREASE = 1e-3
+"""Relative decrease of the cost below which a fit has converged."""
+FIRST_ORDER_DAMPING = 1e-9
+"""Damping of a single linear step, which only keeps the normal equations regular."""
+RIDGE = 1e-18
+"""Ridge of the normal equations, for parameters without any influence."""
 
 
 class _ParameterInformation(NamedTuple):
@@ -293,7 +305,7 @@ class RunRanker:
             run.states.copy(),
             np.zeros(fit.free_indices.size),
         )
-        linearisation, damping = self._linearise_run(run, competing_model, theta), 1e-6
+        linearisation, damping = self._linearise_run(run, competing_model, theta), FIRST_DAMPING
         if linearisation is None or not np.isfinite(target).all():
             return 0.0
         lowest_cost = float(np.square(target - linearisation.centre).sum())
@@ -319,9 +331,9 @@ class RunRanker:
             )
             if trial_linearisation is None or not cost < lowest_cost:
                 # The step was too long or failed, so the next one is much shorter (Marquardt).
-                damping *= 100.0
+                damping *= DAMPING_INCREASE
                 continue
-            is_converged = lowest_cost - cost < 1e-3 * lowest_cost
+            is_converged = lowest_cost - cost < MIN_RELATIVE_DECREASE * lowest_cost
             theta, states, deviation, linearisation, lowest_cost = (
                 trial_theta,
                 trial_states,
@@ -329,7 +341,7 @@ class RunRanker:
                 trial_linearisation,
                 cost,
             )
-            damping /= 10.0
+            damping /= DAMPING_DECREASE
             if is_converged:
                 break
         return lowest_cost
@@ -368,7 +380,7 @@ def _compute_remaining_difference(
     slopes: _LinearisedRun,
     information: _ParameterInformation,
     deviation: Array | None = None,
-    damping: float = 1e-9,
+    damping: float = FIRST_ORDER_DAMPING,
 ) -> tuple[float, Array, Array]:
     """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
@@ -386,7 +398,7 @@ def _compute_remaining_difference(
     normal, pull = columns.T @ columns, columns.T @ gap
     normal[:q, :q] += information.inverse
     pull[:q] -= information.inverse @ deviation
-    damped = normal + damping * np.diag(np.diagonal(normal)) + 1e-18 * np.eye(len(normal))
+    damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
     step = np.linalg.solve(damped, pull)
     initial_cost = float(gap @ gap + deviation @ information.inverse @ deviation)
     minimum_cost = initial_cost - 2.0 * float(pull @ step) + float(step @ normal @ step)

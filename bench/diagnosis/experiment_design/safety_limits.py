@@ -42,6 +42,8 @@ IDLE_JOINT_SHARE = 0.1
 """Minimum value used as the present maximum speed and force of a joint that was at rest, as a share
 of the maximum over all joints.
 """
+ROUNDING_TOLERANCE = 1e-9
+"""Distance beyond a limit that counts as rounding, relative to the larger limit."""
 
 
 class RigLimits:
@@ -187,7 +189,11 @@ class RigLimits:
         """
         for name, values in channels.items():
             low, high = self.bounds[name]
-            tolerance = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
+            tolerance = (
+                ROUNDING_TOLERANCE * max(abs(low), abs(high))
+                if np.isfinite([low, high]).all()
+                else 0.0
+            )
             if not np.isfinite(values).all():
                 return False
             if values.min() < low - tolerance or values.max() > high + tolerance:

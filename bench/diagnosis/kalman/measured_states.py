@@ -29,6 +29,13 @@ from sims.robot.robot_model import RobotModel
 
 JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
 """Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
+PRIOR_WIDTHS = (10.0, 10.0, 100.0)
+"""Prior deviations of position, velocity and acceleration.
+
+They are in ranges of the position, per second and second squared.
+"""
+DEFAULT_SIGMA = 1e-6
+"""Noise of a channel whose noise is neither stated nor visible, in rad or m (and per second)."""
 
 
 def estimate_measured_states(
@@ -122,7 +129,8 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     # The prior of position, velocity and acceleration is so wide that the readings decide. Its
     # scale is the range per second, or per duration of the run if that is shorter.
     span = min(float(times[-1] - times[0]), 1.0)
-    prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(position_ranges.max()), 1e-9)
+    widths = np.array(PRIOR_WIDTHS) / np.array([1.0, span, span**2])
+    prior = widths * max(float(position_ranges.max()), 1e-9)
     jerk_count = JERKS.size
     joints, zeros = np.arange(count), np.zeros((count, samples - 1, 3))
     runs = LinearRuns(
@@ -235,7 +243,7 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tup
             sigma = recording.noise.get(name, 0.0)
             if not sigma > 0 and name in run.channels:
                 sigma = estimate_noise([(run.times, values)]).sigma
-            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
+            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else DEFAULT_SIGMA)
         readings.append((np.stack(columns, axis=1), np.array(noise)))
     return readings
 

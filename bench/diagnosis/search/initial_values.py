@@ -32,6 +32,8 @@ EVENT_TIME_SHIFTS_SAMPLES = (-8, -4, -2, -1, 1, 2, 4, 8)
 """Shifts of the time of a single event that are tried, in samples."""
 FREQUENCY_SHIFTS_CYCLES = (-1.0, -0.5, 0.5, 1.0)
 """Shifts of a frequency or period that are tried, in cycles over the longest run."""
+CONTACT_DEPTH_EXPONENT = -0.4
+"""Exponent of the stiffness in the depth of contact of a motion with given energy."""
 
 
 def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]:
@@ -256,7 +258,7 @@ def generate_equal_travel_end_stops(
     for factor in REFIT_STIFFNESS_FACTORS:
         end_stop = c.copy()
         end_stop[0] = factor * c[0]
-        end_stop[1] = end - (end - c[1]) * factor**-0.4
+        end_stop[1] = end - (end - c[1]) * factor**CONTACT_DEPTH_EXPONENT
         yield end_stop
 
 

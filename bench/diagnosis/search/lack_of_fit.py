@@ -54,6 +54,8 @@ TIME, POSITION, SPEED = 0, 1, 2
 """Variables of a hat: time, position or speed of the joint."""
 ALONG, AGAINST, DRY = 0, 1, 2
 """Directions of a hat: along the joint, against its motion in proportion to speed, or dry."""
+HIGH_SPEED_QUANTILE = 0.98
+"""Quantile of the recorded speed that counts as the highest speed of a joint."""
 
 
 class JointHatForce(Force):
@@ -162,7 +164,7 @@ def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
             # Use every third sample, because differences of neighbours are mostly noise.
             step = np.diff(run_data.scenario.times[::3])
             rates.append(np.diff(run_data.observed[::3, channel]) / step)
-    return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))
+    return float(np.nanquantile(np.abs(np.concatenate(rates)), HIGH_SPEED_QUANTILE))
 
 
 HAT_COUNT = 7
@@ -543,5 +545,5 @@ def _compute_high_speed_quantile(evaluator: RunEvaluator) -> float:
     # Without recorded coordinates there is no speed.
     if not squares:
         return 0.0
-    speed = np.nanquantile(sum(squares), 0.98)
+    speed = np.nanquantile(sum(squares), HIGH_SPEED_QUANTILE)
     return float(np.sqrt(speed))

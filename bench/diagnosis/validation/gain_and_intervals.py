@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
 from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
@@ -55,6 +56,12 @@ MIN_REPORTED_GAIN = -9.0
 """Lower limit of the reported share of the gap closed; for a failed model the exact value has no
 meaning.
 """
+PSEUDOINVERSE_CUTOFF = 1e-13
+"""Relative size of eigenvalues that the pseudoinverse takes for zero."""
+MIN_EIGENVALUE = 1e-12
+"""Eigenvalue of the scaled curvature below which a direction counts as unidentified."""
+UNIDENTIFIED_VARIANCE = 1e12
+"""Variance of an unidentified direction, in units of the scale."""
 
 
 def compute_central_jacobian(
@@ -187,13 +194,13 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
     units = np.outer(scale, scale)
     scaled = schur_complement / units
-    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    inverse = np.linalg.pinv(scaled, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True)
     values, vectors = np.linalg.eigh(scaled)
-    is_unidentified = values < 1e-12
+    is_unidentified = values < MIN_EIGENVALUE
     # The pseudo-inverse of an unidentified direction is zero, which would look certain.
     if is_unidentified.any():
         unidentified = vectors[:, is_unidentified]
-        inverse = inverse + (unidentified * 1e12) @ unidentified.T
+        inverse = inverse + (unidentified * UNIDENTIFIED_VARIANCE) @ unidentified.T
     result: Array = inverse / units  # (2)
     return result
 
@@ -354,7 +361,7 @@ def compute_held_out_gain(
     low = high = np.nan
     # All resamples of a single part are equal, and would look certain.
     if parts > 1:
-        low, high = np.quantile(shares, [0.025, 0.975]).tolist()
+        low, high = np.quantile(shares, INTERVAL_QUANTILES).tolist()
     gap_closed = float(_compute_closed_share(total_sums[None], floor)[0])
     return HeldOutGain(base, extended, floor, gap_closed, low, high)
 

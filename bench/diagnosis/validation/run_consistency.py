@@ -51,7 +51,11 @@ from bench.diagnosis.evaluation.noise_model import whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
-from bench.diagnosis.validation.gain_and_intervals import Z95, compute_fisher_blocks
+from bench.diagnosis.validation.gain_and_intervals import (
+    MIN_EIGENVALUE,
+    Z95,
+    compute_fisher_blocks,
+)
 from sims.core.simulator import Array
 from sims.recording.recording import Run
 
@@ -531,7 +535,9 @@ def _invert_regularised(curvature: Array) -> Array:
     """Invert a curvature matrix; directions that the runs do not identify get a huge variance."""
     scale = np.sqrt(np.maximum(np.diagonal(curvature), 1e-200))
     values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
-    result: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
+    result: Array = (
+        (vectors / np.maximum(values, MIN_EIGENVALUE)) @ vectors.T / np.outer(scale, scale)
+    )
     return result
 
 
