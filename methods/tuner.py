@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+FAILED_RESIDUAL = 1e10
+"""Residual of every sample of a failed simulation, in scales of the channel."""
 
 
 class Evaluation(NamedTuple):
@@ -109,7 +111,10 @@ class Task:
     def compute_finite_residuals(self, evaluation: Evaluation) -> Array:
         """Return the residuals of an evaluation; those of a failed simulation are large numbers."""
         return np.nan_to_num(
-            self.residuals(evaluation.observations), nan=1e10, posinf=1e10, neginf=1e10
+            self.residuals(evaluation.observations),
+            nan=FAILED_RESIDUAL,
+            posinf=FAILED_RESIDUAL,
+            neginf=FAILED_RESIDUAL,
         )
 
 

@@ -31,6 +31,8 @@ _SLOW_MOTION_FACTOR = 2.0
 _HOLD_FRAMES = 9
 """Number of frames for which the end is shown."""
 _DPI = 70
+TIME_ROUNDING = 1e-6
+"""Difference of two times that is a rounding error, s."""
 
 
 class FilmFrames(NamedTuple):
@@ -205,5 +207,7 @@ def _read_film(path: Path) -> FilmFrames:
     # 1e-6 s below is a tolerance for rounded times.
     frame_times = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
     track = np.stack([run.extra["u"], run.extra["v"]], axis=1)
-    pictures = [frames[int(np.searchsorted(times, time - 1e-6))][1] for time in frame_times]
-    return FilmFrames(pictures, [track[run.times <= time + 1e-6] for time in frame_times])
+    pictures = [
+        frames[int(np.searchsorted(times, time - TIME_ROUNDING))][1] for time in frame_times
+    ]
+    return FilmFrames(pictures, [track[run.times <= time + TIME_ROUNDING] for time in frame_times])

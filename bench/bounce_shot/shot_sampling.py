@@ -44,6 +44,8 @@ CAMERA_TARGET_HEIGHT = 0.9
 """Height of the point at which the camera looks, m."""
 ASPECT_RATIO = 0.4
 """Aspect ratio of the picture, width over height; a falling ball needs no wide picture."""
+DEFAULT_HEIGHT = 1.5
+"""Height from which the ball falls if the experiment states none, m."""
 
 
 def film_and_track_drop(
@@ -189,7 +191,7 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     for leftover in (path, path.with_suffix(".toml")):
         leftover.unlink(missing_ok=True)
     rng = make_rng(*_get_stream_prefix(setup.salt), experiment.name, "drop", setup.name)
-    height = experiment.initial.get("z", 1.5)
+    height = experiment.initial.get("z", DEFAULT_HEIGHT)
     drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = setup.ball.radius, experiment.sampling
     times = np.arange(sampling.samples) / sampling.rate

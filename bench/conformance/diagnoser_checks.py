@@ -51,6 +51,12 @@ TIME_LIMIT_SECONDS = 60.0
 
 TRAINED_DIAGNOSERS: dict[type[Diagnoser], dict[str, Array]] = {}
 """Trained state of each diagnoser in this process."""
+_DRAG = 0.6
+"""Hidden linear drag of the slider, N s/m."""
+_POSITION_NOISE = 0.002
+"""Standard deviation of the position noise, m."""
+_SAMPLING_RATE = 50.0
+"""Sampling rate of the recordings, Hz."""
 
 
 @cache
@@ -59,13 +65,13 @@ def _get_recording(hidden: bool) -> SimulatedRecording:
     return simulate_recording(
         SimulationSpec(
             system=TEST_SYSTEM,
-            effects={"drag.linear": (0.6,)} if hidden else {},
-            noise={"x": 0.002},
+            effects={"drag.linear": (_DRAG,)} if hidden else {},
+            noise={"x": _POSITION_NOISE},
             observe=("x",),
             inputs={"u": "sine:2:0.7"},
             runs=3,
             seconds=2.0,
-            rate=50.0,
+            rate=_SAMPLING_RATE,
             engine="batch",
             seed=7,
         )

@@ -44,6 +44,8 @@ _RUN_SIMULATIONS = 5
 """Number of simulations of a run, enough for a tuner to use all of its features."""
 _SEED = 0
 """Seed of the runs that are compared."""
+_SIGNIFICANCE_LEVEL = 0.05
+"""Significance level of the comparison with random search, over all targets together."""
 
 
 def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
@@ -385,7 +387,8 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
             return
     medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random)]
     found_text = f"p = {p:.2g}, median error {' against '.join(medians)}"
-    expected = f"errors below random search's (p < {0.05 / len(_SEQUENTIAL_TEST_TARGETS):.2g})"
+    level = _SIGNIFICANCE_LEVEL / len(_SEQUENTIAL_TEST_TARGETS)
+    expected = f"errors below random search's (p < {level:.2g})"
     raise CheckError(f"expected {expected}; found {found_text}; see {kind.__name__}.tune")
 
 

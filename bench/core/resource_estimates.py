@@ -32,6 +32,8 @@ BYTES_PER_NUMBER = 8
 """Size of a number in bytes."""
 _CONTAINER_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
 """File in which Linux states the memory limit of a container."""
+DAYS_PER_YEAR = 365.25
+"""Mean length of a year in days."""
 
 
 @dataclass(frozen=True)
@@ -173,4 +175,4 @@ def format_bytes(count: float) -> str:
 
 def _format_long_duration(seconds: float) -> str:
     days = seconds / 86400
-    return f"{days:.3g} days" if days < 1000 else f"{days / 365.25:.3g} years"
+    return f"{days:.3g} days" if days < 1000 else f"{days / DAYS_PER_YEAR:.3g} years"

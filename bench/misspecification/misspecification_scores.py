@@ -67,6 +67,8 @@ RANK_AGREEMENT_COLUMNS = [
     "friedman_extended",
 ]
 TRAINING_WIDTHS_UNIT = "training widths"
+SIGNIFICANCE_LEVEL = 0.05
+"""P-value below which the difference of two tuners is significant."""
 
 
 @dataclass(frozen=True)
@@ -348,7 +350,7 @@ def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
         if len(errors_by_tuner) >= MIN_PROBLEMS_FOR_RANKS and errors_by_tuner.shape[1] >= 3:
             friedman[model], p_values = compute_nemenyi_p_values(tables[model])
             upper = np.triu(p_values.to_numpy(), k=1)
-            significant_pairs[model] = int(((upper > 0) & (upper < 0.05)).sum())
+            significant_pairs[model] = int(((upper > 0) & (upper < SIGNIFICANCE_LEVEL)).sum())
     tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]
     mean_ranks = [tables[model][tuners].mean().to_numpy() for model in MODEL_LABELS]
     return JointRanks(tables, compute_kendall_tau(*mean_ranks), friedman, significant_pairs)

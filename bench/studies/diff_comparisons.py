@@ -40,6 +40,8 @@ COMPARED_SIMULATION_COUNTS = (3, 10)
 """Numbers of simulations at which errors are compared, in addition to the last common one."""
 _TARGET_KEY_COLUMNS = ("true_", "recommendation_")
 """Prefixes of the columns that identify a target: its true parameters and its start."""
+RELATIVE_TOLERANCE = 1e-9
+"""Relative difference up to which two numbers of the tables are equal."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,7 @@ class ComparisonDiff:
         is_close = np.isclose(
             a.loc[names].to_numpy(dtype=float),
             b.loc[names].to_numpy(dtype=float),
-            rtol=1e-9,
+            rtol=RELATIVE_TOLERANCE,
             atol=0.0,
             equal_nan=True,
         )

@@ -32,6 +32,8 @@ _ERROR_TOLERANCE = 1e-3
 
 Initial states are estimated again, possibly on another machine.
 """
+RELATIVE_TOLERANCE = 1e-9
+"""Relative difference up to which two numbers of the files are equal."""
 
 
 class ExplanationVerification(NamedTuple):
@@ -173,7 +175,7 @@ def _find_differing_numbers(
     for name, number in verdict.parameters.items():
         model_value = extended.parameters.get(name)
         if model_value is not None and not math.isclose(
-            number.value, model_value.value, rel_tol=1e-9
+            number.value, model_value.value, rel_tol=RELATIVE_TOLERANCE
         ):
             yield VerificationFailure(
                 VERDICT_FILE,
@@ -184,7 +186,7 @@ def _find_differing_numbers(
         coefficients: Mapping[str, Any] = extended.effects.get(cause.effect, {})
         for name, number in cause.coefficients.items():
             value = coefficients[name].value if name in coefficients else math.nan
-            if not math.isclose(number.value, value, rel_tol=1e-9):
+            if not math.isclose(number.value, value, rel_tol=RELATIVE_TOLERANCE):
                 label = f"{cause.effect} {name}"
                 yield VerificationFailure(
                     VERDICT_FILE,

@@ -17,6 +17,8 @@ _MAX_COMPONENTS = 10
 """Maximum number of principal components of the residuals that the network reads."""
 _POSTERIOR_DRAWS = 1000
 """Number of posterior samples of which the mean is the recommendation."""
+_MIN_SINGULAR_VALUE = 1e-9
+"""Singular value, relative to the largest one, below which a component is a rounding error."""
 
 
 class PosteriorRounds:
@@ -76,7 +78,9 @@ class PosteriorRounds:
         """
         self._centre = residuals.mean(axis=0)
         _, singular, directions = np.linalg.svd(residuals - self._centre, full_matrices=False)
-        component_count = max(int((singular[:_MAX_COMPONENTS] > 1e-9 * singular[0]).sum()), 1)
+        component_count = max(
+            int((singular[:_MAX_COMPONENTS] > _MIN_SINGULAR_VALUE * singular[0]).sum()), 1
+        )
         self._components = directions[:component_count].T
         spread = ((residuals - self._centre) @ self._components).std(axis=0)
         self._widths = np.where(spread > 0, spread, 1.0)

@@ -13,6 +13,9 @@ import numpy as np
 from methods.learning.library_optimisers import minimise_with_nlopt
 from methods.tuner import Task, Tuner, TunerGenerator, from_callback
 
+FAILED_LOSS = 1e6
+"""Loss of a failed simulation, in place of infinity."""
+
 
 @dataclass(eq=False)
 class DIRECT(Tuner):
@@ -31,5 +34,5 @@ class DIRECT(Tuner):
         """
         # nlopt's DIRECT stops at an infinite loss.
         return from_callback(
-            lambda loss: minimise_with_nlopt("GN_DIRECT_L", loss, task, failed_loss=1e6)
+            lambda loss: minimise_with_nlopt("GN_DIRECT_L", loss, task, failed_loss=FAILED_LOSS)
         )

@@ -30,6 +30,10 @@ _PUBLISHED_DRAWS = 200
 """Number of posterior samples of the published search."""
 _REFIT_INTERVAL_THRESHOLD = 20
 """Number of simulations from which on hyper-parameters are not fitted after each simulation."""
+_MIN_DISTANCE_SHARE = 0.1
+"""Smallest distance of a nearby candidate, as a share of the distance to the nearest neighbour."""
+_LOSS_FLOOR_SHARE = 1e-6
+"""Number added to losses before the logarithm, as a share of the median loss."""
 
 
 @dataclass(eq=False)
@@ -163,7 +167,7 @@ class EntropySearch(Tuner):
         distances = np.linalg.norm(process.points - best, axis=1)
         # Distances range from a tenth of the distance to the nearest neighbour to half the cube.
         nearest = np.min(distances, where=distances > 0.0, initial=0.5)
-        min_scale = max(0.1 * nearest, 1e-9)
+        min_scale = max(_MIN_DISTANCE_SHARE * nearest, 1e-9)
         exponents = rng.uniform(np.log(min_scale), np.log(0.5), size=(self.nearby, 1))
         # The expected length is the same in any number of dimensions.
         scales = np.exp(exponents) / np.sqrt(dim)
@@ -206,5 +210,5 @@ def replace_failed_losses(losses: Array) -> Array:
 
 def compute_log_losses(losses: Array) -> Array:
     """Compute the logarithm of the losses, with a floor far below the typical loss."""
-    values: Array = np.log(losses + 1e-6 * np.median(losses) + 1e-300)
+    values: Array = np.log(losses + _LOSS_FLOOR_SHARE * np.median(losses) + 1e-300)
     return values

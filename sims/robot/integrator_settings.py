@@ -44,6 +44,8 @@ OPTION_EFFECTS: Mapping[str, str] = {
     "numerics.iterations": "iterations",
 }
 """Options of a model file by the effect that names them as a cause."""
+MAX_RK4_FRICTION_RATE = 2.5
+"""Largest decay rate of stiff friction at which RK4 does not chatter, in 1 / time step."""
 
 
 class IntegratorSettings(NamedTuple):
@@ -199,15 +201,15 @@ def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]
 
     Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
     the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
-    tolerate b = 2.5 / h, and 3 / h chatters. MuJoCo's default time constant, 0.02 s, creeps at
-    rest.
+    tolerate `MAX_RK4_FRICTION_RATE` / h, and 3 / h chatters. MuJoCo's default time constant,
+    0.02 s, creeps at rest.
 
     Args:
         timestep: time step h in seconds.
         integrator: MuJoCo's number of the integrator.
     """
     return (
-        (SOLREF_PLACEHOLDER_STIFFNESS, -2.5 / timestep)
+        (SOLREF_PLACEHOLDER_STIFFNESS, -MAX_RK4_FRICTION_RATE / timestep)
         if integrator == RK4_INTEGRATOR_ID
         else (2.0 * timestep, 1.0)
     )

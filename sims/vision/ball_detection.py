@@ -60,6 +60,31 @@ _MAX_GAUSS_NEWTON_STEPS = 12
 GreyLevels: TypeAlias = NDArray[np.float32]
 """Grey levels, or positions in pixels."""
 Mask: TypeAlias = NDArray[np.bool_]
+_MIN_REFIT_RAY_SHARE = 0.4
+"""Smallest share of rays with an edge point from which a centre is refitted."""
+_CENTRE_TOLERANCE = 1e-3
+"""Change of a fitted centre, in pixels, below which its fit has converged."""
+_RAY_SHARES = (0.7, 1.5)
+"""Beginning and end of the rays, as shares of the approximate radius."""
+_RAY_MARGIN = 2
+"""Distance, in pixels, by which a ray begins earlier and ends later, for small balls."""
+_INNER_SHARES = (0.5, 0.7)
+"""Part of a ray just inside the edge, as shares of the radius."""
+_INNER_MARGINS = (3.5, 1.3)
+"""Distances of this part from the edge, in pixels, for large balls.
+
+The blur of the edge does not reach it.
+"""
+_MIN_BRIGHTNESS_LEVELS = 1.5
+"""Brightness difference, in detection levels, from which brightness replaces the worst colour."""
+_MIN_BRIGHTNESS_SHARE = 0.7
+"""Smallest share of the worst colour's difference at which brightness replaces it."""
+_MIN_EDGE_LEVELS = 0.4
+"""Smallest half height of an edge, and smallest difference of a small ball's pixel, in levels."""
+_SMALL_BALL_MARGIN = 2.5
+"""Distance from the edge of a small ball, in pixels, within which pixels are summed."""
+_CENTRE_PATCH_SHARE = 0.4
+"""Half width of the patch that shows the colour of a ball, as a share of its radius."""
 
 
 class BallDetection(NamedTuple):
@@ -92,7 +117,7 @@ class BallDetection(NamedTuple):
 
         If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
         """
-        if len(self.edges) < 0.4 * _RAY_COUNT:
+        if len(self.edges) < _MIN_REFIT_RAY_SHARE * _RAY_COUNT:
             return self
         u, v = self.u, self.v
         for _ in range(_MAX_GAUSS_NEWTON_STEPS):
@@ -114,7 +139,7 @@ class BallDetection(NamedTuple):
             dv = (a * q - b * p) / area
             u += du
             v += dv
-            if abs(du) + abs(dv) < 1e-3:
+            if abs(du) + abs(dv) < _CENTRE_TOLERANCE:
                 break
         # The fit has moved to the edge of another object.
         if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
@@ -387,23 +412,24 @@ class BallDetector:
         Returns:
             Edge points in the window; None if there are too few.
         """
-        start = max(0.0, 0.7 * radius - 2)
-        distances = np.arange(start, 1.5 * radius + 2, _RAY_SAMPLE_SPACING, dtype=np.float32)
+        start = max(0.0, _RAY_SHARES[0] * radius - _RAY_MARGIN)
+        end = _RAY_SHARES[1] * radius + _RAY_MARGIN
+        distances = np.arange(start, end, _RAY_SAMPLE_SPACING, dtype=np.float32)
         cos, sin = _compute_ray_directions()
         along_u = (u + cos * distances).astype(np.float32)
         along_v = (v + sin * distances).astype(np.float32)
         profiles = [_interpolate_window(window, along_u, along_v) for window in windows]
         # Last pixels inside the edge, except those affected by blur.
-        is_inner = distances > min(0.5 * radius, radius - 3.5)
-        is_inner &= distances < max(0.7 * radius, radius - 1.3)
+        is_inner = distances > min(_INNER_SHARES[0] * radius, radius - _INNER_MARGINS[0])
+        is_inner &= distances < max(_INNER_SHARES[1] * radius, radius - _INNER_MARGINS[1])
         median_index = int(is_inner.sum()) // 2
         levels = []
         for profile in profiles:
             ranked = np.partition(profile[:, is_inner], median_index, axis=1)
             levels.append(ranked[:, median_index])
         brightness, worst = levels
-        is_bright = brightness > 1.5 * self.level
-        is_bright &= brightness > 0.7 * worst
+        is_bright = brightness > _MIN_BRIGHTNESS_LEVELS * self.level
+        is_bright &= brightness > _MIN_BRIGHTNESS_SHARE * worst
         values = np.where(is_bright[:, None], *profiles)
         half_level = 0.5 * np.where(is_bright, brightness, worst)
         crossing_level = half_level[:, None]
@@ -416,7 +442,7 @@ class BallDetector:
         rays = np.arange(_RAY_COUNT)
         value_before = values[rays, crossing_index]
         value_after = values[rays, crossing_index + 1]
-        has_edge = is_crossing.any(axis=1) & (half_level > 0.4 * self.level)
+        has_edge = is_crossing.any(axis=1) & (half_level > _MIN_EDGE_LEVELS * self.level)
         # A fall to the value for outside is the end of the picture, not of the ball.
         has_edge &= value_after > 0.5 * _PADDING_VALUE
         if has_edge.sum() < 0.5 * _RAY_COUNT:
@@ -441,8 +467,8 @@ class BallDetector:
         """Measure a ball of a few pixels: centroid of the difference, and radius from its sum."""
         height, width = window.shape
         rows, columns = np.mgrid[:height, :width]
-        is_near = np.hypot(columns - u, rows - v) <= radius + 2.5
-        weights = np.where(is_near & (window > 0.4 * self.level), window, 0.0)
+        is_near = np.hypot(columns - u, rows - v) <= radius + _SMALL_BALL_MARGIN
+        weights = np.where(is_near & (window > _MIN_EDGE_LEVELS * self.level), window, 0.0)
         total = float(weights.sum())
         peak = float(np.percentile(window[is_near], 90))
         if total <= 0 or peak < self.level:
@@ -469,7 +495,7 @@ def _compute_median_colours(
 
 def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array:
     """Return the mean colour (3,) at a detection's centre."""
-    side = 2 * max(1, int(0.4 * detection.radius)) + 1
+    side = 2 * max(1, int(_CENTRE_PATCH_SHARE * detection.radius)) + 1
     patch = import_package("cv2").getRectSubPix(picture, (side, side), (detection.u, detection.v))
     colour: Array = patch.reshape(-1, 3).mean(axis=0)
     return colour

@@ -36,6 +36,14 @@ _CHROMA_BLUR_PIXELS = 1.5
 
 Video files store colours at half the resolution.
 """
+_SAME_CENTRE_SHARE = 0.3
+"""Distance of the centres of two circles at rest that are one object, as a share of the radius."""
+_SAME_RADIUS_RATIOS = (0.7, 1.4)
+"""Ratios of the radii of two circles between which they may be one object."""
+_SIMILAR_RADIUS_RATIOS = (0.4, 2.5)
+"""Ratios of the radii of two moving objects between which they may be taken for each other."""
+_MIN_MOTION_SHARE = 1e-3
+"""Smallest motion per sample of a window for the noise estimate, as a share of the travel."""
 
 
 @dataclass
@@ -520,10 +528,11 @@ def _find_shadows(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 def _is_same_object(a: Circle, b: Circle) -> bool:
     """Return whether two circles are the same object at rest.
 
-    Their centres may differ by 0.3 radii and half a pixel, and their radii by a factor of 1.4.
+    Their centres may differ by `_SAME_CENTRE_SHARE` of the radius and half a pixel.
     """
     distance = abs(a[0] - b[0]) + abs(a[1] - b[1])
-    return distance < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
+    smallest, largest = _SAME_RADIUS_RATIOS
+    return distance < _SAME_CENTRE_SHARE * b[2] + 0.5 and smallest < a[2] / b[2] < largest
 
 
 def _note_other_objects(
@@ -540,7 +549,9 @@ def _note_other_objects(
         # A brief, small or resting object is not a second ball.
         is_simultaneous = shared >= max(8, 0.25 * len(path.frames))
         is_moving = other_path.travel > 2 * other_path.radius
-        if is_simultaneous and is_moving and 0.4 < other_path.radius / path.radius < 2.5:
+        smallest, largest = _SIMILAR_RADIUS_RATIOS
+        is_similar = smallest < other_path.radius / path.radius < largest
+        if is_simultaneous and is_moving and is_similar:
             notes.append(
                 f"a second ball, or its shadow, moves in {shared} of the same frames; "
                 "the clearer one is tracked"
@@ -654,7 +665,8 @@ def estimate_roughness(values: Array) -> float:
     # At rest the same pixels give the same error again and again, which is no scatter.
     finite_values = values[np.isfinite(values)]
     travel = max(float(np.ptp(finite_values)), 1e-12)
-    windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _NOISE_WINDOW_SAMPLES]
+    min_motion = _MIN_MOTION_SHARE * travel * _NOISE_WINDOW_SAMPLES
+    windows = windows[np.ptp(windows, axis=1) > min_motion]
     if not len(windows):
         return float("nan")
     # A cubic has four coefficients, which reduces the degrees of freedom by four.

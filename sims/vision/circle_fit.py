@@ -41,6 +41,10 @@ _MIN_RADIUS = 0.5
 """Minimum radius, pixels."""
 _MAX_RADIUS = 1e4
 """Maximum radius in pixels; with a larger one, the points are on a straight line."""
+_INLIER_PIXELS = 0.7
+"""Distance in pixels up to which a point is on a small circle."""
+_INLIER_SHARE = 0.1
+"""Distance up to which a point is on a large circle, as a share of its radius."""
 
 
 def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
@@ -119,9 +123,9 @@ def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None
 
 
 def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
-    """Return which points are on the circle, within 0.7 pixels or 10 % of its radius, (n,)."""
+    """Return which points are on the circle, (n,)."""
     (_, _, radius), residuals = fitted
-    tolerance = max(0.7, 0.1 * radius)
+    tolerance = max(_INLIER_PIXELS, _INLIER_SHARE * radius)
     result: NDArray[np.bool_] = np.abs(residuals) < tolerance
     return result
 

@@ -40,6 +40,8 @@ from sims.core.files import lock_file
 from sims.engines.compiled import machine_code as compiled
 
 _FOLDER_PREFIX = "simgap-tuner-"
+_EXIT_WAIT_SECONDS = 5.0
+"""Time that a tuner's process has to end after it was told to."""
 
 
 class LockedFolder(NamedTuple):
@@ -256,7 +258,7 @@ class ForkServerClient:
         atexit.unregister(self.close)
         self._link.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=5.0)
+            self._process.wait(timeout=_EXIT_WAIT_SECONDS)
         self._process.kill()
         self._process.wait()
         if self._place is not None:

@@ -43,6 +43,8 @@ FileContents = tuple[tuple[str, bytes], ...]
 """Names and contents of files."""
 PluginContents = tuple[tuple[Plugin, bytes], ...]
 """Plugins and the contents of their files; the content is empty for an installed plugin."""
+CONNECTION_TIMEOUT = 10.0
+"""Time to wait for the scheduler's answer, s."""
 
 
 @runtime_checkable
@@ -87,7 +89,7 @@ class ClusterPool:
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
         try:
-            self._client = Client(address, timeout=10.0, set_as_default=False)
+            self._client = Client(address, timeout=CONNECTION_TIMEOUT, set_as_default=False)
         # Dask asserts that the event loop of an earlier, failed client is still running.
         except (OSError, ValueError, TypeError, ImportError, AssertionError) as error:
             raise InputError(

@@ -37,6 +37,9 @@ from sims.engines import describe_stepping
 if TYPE_CHECKING:
     from bench.benchmark.runner.plugin_discovery import Plugin
 
+_EXIT_WAIT_SECONDS = 5.0
+"""Time that a worker has to end before it is left behind."""
+
 
 class WorkerProcess(SpawnProcess):
     """Spawned process that skips the parent's main module and starts with interrupts blocked.
@@ -460,7 +463,7 @@ class _WorkerSlot:
         # sender was killed.
         ending = threading.Thread(target=end, daemon=True, name="ending-a-worker")
         ending.start()
-        ending.join(timeout=5.0)
+        ending.join(timeout=_EXIT_WAIT_SECONDS)
 
     def give(self, call: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
         """Assign a call to the process; replace a pool that broke in the meantime.

@@ -25,6 +25,12 @@ TRAINING_SAMPLE_COUNT = 160
 """Maximum number of samples on which the process is conditioned."""
 HELD_OUT_BLOCK_COUNT = 12
 """Number of blocks of the held-out runs whose improvements are compared."""
+VARIANCE_BOUNDS = (1e-3, 1e3)
+"""Bounds of the kernel's variance, in units of the standardised residual squared."""
+LENGTH_BOUNDS = (0.05, 100.0)
+"""Bounds of the kernel's length scales, in standard deviations of each input."""
+NOISE_BOUNDS = (1e-2, 1e2)
+"""Bounds of the noise variance, in units of the standardised residual squared."""
 
 
 class GaussianProcessDiscrepancy(Diagnoser):
@@ -77,9 +83,9 @@ def _compute_gain_p_value(
     training_indices = np.sort(
         rng.choice(len(inputs), min(TRAINING_SAMPLE_COUNT, len(inputs)), replace=False)
     )
-    kernel = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(
-        np.ones(inputs.shape[1]), (0.05, 100.0)
-    ) + WhiteKernel(1.0, (1e-2, 1e2))
+    kernel = ConstantKernel(1.0, VARIANCE_BOUNDS) * RBF(
+        np.ones(inputs.shape[1]), LENGTH_BOUNDS
+    ) + WhiteKernel(1.0, NOISE_BOUNDS)
     process = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -54,6 +54,14 @@ _RESIDUAL_CLIP = 30.0
 """Absolute value at which residuals are clipped, in units of the noise."""
 _NOISE_RANGES = {"point": (2e-3, 2e-2), "linear": (1e-3, 1e-2), "rotary": (1e-3, 1e-2)}
 """Noise range of the first channel by kind of system, SI units."""
+LEARNING_RATE = 2e-3
+"""Learning rate of Adam."""
+WEIGHT_DECAY = 1e-4
+"""Weight decay of Adam."""
+DROPOUT = 0.2
+"""Share of units that are dropped in training."""
+ALL_CHANNELS_SHARE = 0.4
+"""Share of the training recordings in which all channels are observed."""
 
 
 class NeuralClassifier(Diagnoser):
@@ -157,7 +165,9 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}
     channels = [c.name for c in kind.channels if not c.name.startswith("accel")]
     default_recording = system.usual_recording
-    observe = list(default_recording.observe) or (channels if rng.random() < 0.4 else channels[:1])
+    observe = list(default_recording.observe) or (
+        channels if rng.random() < ALL_CHANNELS_SHARE else channels[:1]
+    )
     forms = ("steps:{a}:{b}", "sine:{a}:{c}", "chirp:{a}:0.3:{c}")
     inputs = dict(default_recording.inputs)
     if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
@@ -298,7 +308,7 @@ def _make_network(features: int, classes: int) -> Any:
             self.decide = nn.Sequential(
                 nn.Linear(2 * LAYER_WIDTH, 2 * LAYER_WIDTH),
                 nn.ReLU(),
-                nn.Dropout(0.2),
+                nn.Dropout(DROPOUT),
                 nn.Linear(2 * LAYER_WIDTH, classes),
             )
 
@@ -367,7 +377,9 @@ def _train_network(
         targets = torch.from_numpy(labels.astype(np.int64))
         split = max(1, round(VALIDATION_SHARE * len(labels)))
         validation, training = slice(0, split), np.arange(split, len(labels))
-        optimiser = torch.optim.Adam(network.parameters(), lr=2e-3, weight_decay=1e-4)
+        optimiser = torch.optim.Adam(
+            network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
+        )
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, TRAINING_EPOCHS)
         best, state = np.inf, network.state_dict()
         for _ in range(TRAINING_EPOCHS):

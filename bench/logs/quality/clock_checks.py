@@ -65,6 +65,8 @@ A signal that changes this fast does not repeat its value by coincidence.
 """
 SIGNIFICANCE_SIGMAS = 4.0
 """Detection threshold in standard deviations."""
+UNEVEN_SHARE = 0.01
+"""Relative difference from the median interval from which an interval counts as uneven."""
 
 
 def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
@@ -132,12 +134,12 @@ def _select_timestamps(run: Run) -> Array:
 
 
 def _compute_uneven_share(times: Array) -> float:
-    """Return the share of intervals that differ from the median interval by more than 1 %."""
+    """Return the share of intervals that differ from the median interval (`UNEVEN_SHARE`)."""
     steps = np.diff(times)
     if not steps.size:
         return 1.0
     median_step = float(np.median(steps))
-    return float(np.mean(np.abs(steps - median_step) > 0.01 * median_step))
+    return float(np.mean(np.abs(steps - median_step) > UNEVEN_SHARE * median_step))
 
 
 def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:

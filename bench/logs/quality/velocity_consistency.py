@@ -50,6 +50,8 @@ integrated; over a longer gap it is not known.
 """
 _UNIT_BY_RATIO = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
 """Ratios of velocity to position derivative that a wrong unit causes, and the unit."""
+MAX_UNIT_LOG_ERROR = 0.1
+"""Largest difference of the logarithms of a ratio and of the factor between two units."""
 
 
 def check_velocities(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
@@ -273,6 +275,6 @@ def _recommend_correction(log_ratio: float, rate: str) -> str:
         rate: name of the velocity.
     """
     for factor, unit in _UNIT_BY_RATIO.items():
-        if abs(log_ratio - np.log(factor)) < 0.1:
+        if abs(log_ratio - np.log(factor)) < MAX_UNIT_LOG_ERROR:
             return f"one of the two is in {unit}: correct its unit"
     return f"correct the unit or the gain of {rate}, or leave it out"

@@ -57,6 +57,10 @@ MAX_REGISTERS = 4000
 """Maximum number of registers of a program."""
 MAX_CACHED_PROGRAMS = 2000
 """Maximum number of cached programs of a system."""
+_TEST_STATES = ((0.0, 0.0), (0.37, 0.1))
+"""Time (s) and shift of the initial state (SI units) at which a program is compared with NumPy."""
+_TEST_IMPACT_SPEEDS = (0.3, 2.0)
+"""Impact speeds at which a program is compared with NumPy, m/s."""
 
 
 class PreparedProgram(NamedTuple):
@@ -505,7 +509,7 @@ def _check_program(
     # The initial state, and another one at an arbitrary later time.
     states = [
         np.concatenate([[t], batch.x[first[0]] + shift, batch.v[first[0]] - 2.0 * shift, inputs])
-        for t, shift in ((0.0, 0.0), (0.37, 0.1))
+        for t, shift in _TEST_STATES
     ]
     programs = tracer.build_program(effects), NumpyForceProgram(batch.system, names, effects)
     values, expected_values = (
@@ -544,7 +548,7 @@ def _evaluate_program(
         results.append(r[output_rows, 0])
         if flags[HAS_FRICTION]:
             results.append(r[rows[OUT_LIMIT], :1].copy())
-    for speed in (0.3, 2.0):
+    for speed in _TEST_IMPACT_SPEEDS:
         r[rows[IN_E] : rows[IN_E] + 3, 0] = _TEST_RESTITUTION, _TEST_FRICTION, speed
         compute_impact()
         results.append(r[rows[[OUT_E, OUT_MU]], 0])

@@ -45,6 +45,8 @@ CHECKED_INSTANTS = 16
 """Maximum number of times at which a program is compared with its source."""
 MAX_CACHED_PROGRAMS = 500
 """Maximum number of cached programs for one robot and set of inputs."""
+TEST_STATE_SIZES = (0.01, 1.0, 10.0)
+"""Standard deviations of the random states at which a program is compared with NumPy, SI units."""
 
 
 class _TracedEffect(NamedTuple):
@@ -422,7 +424,7 @@ def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
     steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.applied_inputs.values())])
     for k in range(steps):
         shape = (len(JointStates._fields), *forces.stiffness.shape)
-        joint_states = JointStates(*(rng.normal(size=shape) * rng.choice([0.01, 1.0, 10.0])))
+        joint_states = JointStates(*(rng.normal(size=shape) * rng.choice(TEST_STATE_SIZES)))
         for result, expected in zip(
             compiled.compute(k, joint_states), forces.compute(k, joint_states), strict=True
         ):

@@ -37,6 +37,10 @@ from sims.robot.state_snapshots import RobotSnapshot
 
 IndexArray = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+MIN_EXPONENT = 1e-6
+"""Absolute exponent below which (exp(z) - 1) / z is computed by its series."""
+LINEARITY_TOLERANCE = 1e-9
+"""Relative deviation from linearity up to which the rate of a hidden state counts as linear."""
 
 
 class JointStates(NamedTuple):
@@ -236,7 +240,7 @@ def advance_state(
     _, rate = effect.act(c, snapshot, state)
     _, perturbed_rate = effect.act(c, snapshot, HiddenState(state.x, state.v + STATE_STEP))
     z = step * (perturbed_rate - rate) / STATE_STEP
-    is_small = np.abs(z) < 1e-6
+    is_small = np.abs(z) < MIN_EXPONENT
     phi = np.where(is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z))
     v = state.v + step * phi * rate  # (3)
     return HiddenState(state.x + 0.5 * step * (state.v + v), v)
@@ -268,7 +272,9 @@ def integrate_state(
         return effect.act(coefficients, snapshots, HiddenState(zero + x, zero + w))[1]
 
     rate_at_zero, rate_at_one, rate_at_half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
-    if np.allclose(rate_at_half, 0.5 * (rate_at_zero + rate_at_one), rtol=1e-9, atol=0.0):
+    if np.allclose(
+        rate_at_half, 0.5 * (rate_at_zero + rate_at_one), rtol=LINEARITY_TOLERANCE, atol=0.0
+    ):
         return _integrate_linear_state(
             state, step * rate_at_zero, step * (rate_at_one - rate_at_zero)
         )
@@ -289,7 +295,7 @@ def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array)
     Returns:
         Hidden states (S + 1, 1).
     """
-    is_small = np.abs(z) < 1e-6
+    is_small = np.abs(z) < MIN_EXPONENT
     changes = change_at_zero * np.where(
         is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z)
     )

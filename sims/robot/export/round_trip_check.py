@@ -43,6 +43,10 @@ _UNCOMPARED_FIELDS = (
 
 Inverse weights belong to the reference pose, which is another one if a joint's zero has moved.
 """
+MEAN_DISPLACEMENT = 0.1
+"""Mean displacement of the joints from the reference pose in the check, rad or m."""
+DISPLACEMENT_AMPLITUDE = 0.05
+"""Largest difference of a joint's displacement from the mean, rad or m."""
 
 
 def check_written_files(
@@ -179,7 +183,8 @@ def displace_reference_pose(model: Any) -> Array:
 
     # Different values detect swapped coordinates.
     pose: Array = model.qpos0.copy()
-    mujoco.mj_integratePos(model, pose, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
+    displacements = MEAN_DISPLACEMENT + DISPLACEMENT_AMPLITUDE * np.sin(np.arange(model.nv))
+    mujoco.mj_integratePos(model, pose, displacements, 1.0)
     return pose
 
 
