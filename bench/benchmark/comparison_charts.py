@@ -294,6 +294,7 @@ def _make_simulations_axis(budget: int) -> Axis:
         "symlog",
         ("symlog", "linear"),
         ticks,
+        # Marks at the ends must not be cut off.
         ends=(-0.08, budget * 1.1),
     )
 
@@ -303,6 +304,7 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
     table = view.statistics.runtime_distribution
     budget = int(table["simulations"].max())
     x_axis = _make_simulations_axis(budget)
+    # A margin of 0.02, so that lines at 0 and 1 are visible.
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panels = []
     for kind in dict.fromkeys(table["range"]):
@@ -363,6 +365,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
 
 def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the number of targets from which on a training pays."""
+    # From a tenth of a target, since a training may pay at once.
     y_axis = Axis("number of targets at which training breaks even", "log", ends=(0.1, 1e5))
     rules = (
         ReferenceLine(AT_ONCE, "at once: the untrained tuner never reaches the error"),
@@ -388,6 +391,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                     "low",
                     "high",
                     "points",
+                    # The tuners are spread over 0.6 of a category.
                     0.6 * ((tuner_index + 0.5) / len(trained) - 0.5),
                 )
                 for tuner_index, name in enumerate(trained)

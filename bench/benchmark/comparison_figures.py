@@ -62,6 +62,8 @@ _RANGE_LABELS = {
 }
 _RANGE_MARKERS = (("o", BLUE), ("^", VERMILION))
 """Markers and colours of the ranges, in their order."""
+_WHITE_TEXT_SHARE = 0.55
+"""Share from which a cell is so dark that its number is white."""
 
 
 def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
@@ -75,6 +77,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
         table: Rows of identifiability.csv.
     """
     names = [c for c in table.columns if c not in IDENTIFIABILITY_COLUMNS]
+    # Width and height in inches, with the space for each parameter.
     size = (4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names))
     figure, axes = make_panel_grid(1, 2, size, width_ratios=[1, 1.25])
     _draw_spectra(axes[0, 0], table, len(names))
@@ -106,9 +109,11 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
         # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
         target_indices = range_rows.groupby("direction").cumcount()
         target_offsets = (
+            # Marks of the targets are spread over 0.3 of the distance of two directions.
             (target_indices / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * target_indices
         )
         x_values = (
+            # Ranges are 0.4 of the distance of two directions apart.
             range_rows["direction"] + target_offsets + (range_index - 0.5 * (len(ranges) - 1)) * 0.4
         )
         axis.plot(
@@ -160,11 +165,12 @@ def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) ->
         axis.text(
             column,
             row,
+            # From 0.995 on, two digits would show 1.00.
             f"{share:.2f}".lstrip("0") if share < 0.995 else "1",
             ha="center",
             va="center",
             fontsize=8,
-            color="white" if share > 0.55 else "black",
+            color="white" if share > _WHITE_TEXT_SHARE else "black",
         )
     axis.set_xticks(range(len(names)), [str(i + 1) for i in range(len(names))])
     axis.set_yticks(range(len(names)), names, fontsize=8)
@@ -381,6 +387,7 @@ def draw_critical_difference_figure(
     """
     from scikit_posthocs import critical_difference_diagram
 
+    # Width and height in inches, with the space for each tuner.
     figure, axes = make_panel_grid(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
     axis = axes[0, 0]
     # Each tuner has its colour of every other figure; text stays dark, since light colours are hard

@@ -150,6 +150,7 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
             "low",
             "high",
             "points",
+            # The methods are spread over 0.6 of a category.
             (i - (len(methods) - 1) / 2) * 0.6 / len(methods),
         )
         for i, method in enumerate(methods)
@@ -160,6 +161,7 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
         shot_counts = dict.fromkeys(counts.loc[ball].tolist())
         names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
     x_axis = Axis("ball; n shots of each method", names=tuple(names))
+    # A margin of 0.03, so that marks at 0 and 1 are visible.
     y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
     panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
     return panel, lines.assign(place=lines["ball"].map(places))

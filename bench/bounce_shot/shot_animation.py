@@ -115,6 +115,7 @@ def write_animation(
     figure, axes = make_panel_grid(
         1,
         len(methods) + film_columns,
+        # Width and height in inches.
         (2.9 * len(methods) + 1.5 * film_columns, 3.2),
         layout=None,
         gridspec_kw={"width_ratios": [0.5] * film_columns + [1] * len(methods)},

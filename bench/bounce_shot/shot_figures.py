@@ -113,6 +113,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
     """
     panel, table = make_success_panel(lines)
+    # Width and height in inches, with the space for each category.
     size = (2.0 + 1.5 * len(panel.across.names), 4.2)
     figure, axes = draw_chart([replace(panel, title="")], {panel.table: table}, size=size)
     entries = axes[0].get_legend_handles_labels()
@@ -151,6 +152,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
         rows: rows of shots.csv.
     """
     methods = list(rows["method"].unique())
+    # Width and height in inches, with the space for each method.
     figure, axes = make_panel_grid(1, 2, (11.5, 1.6 + 0.42 * len(methods)), sharey=True)
     miss_axis, error_axis = axes[0]
     for place, method in enumerate(methods):
@@ -284,6 +286,7 @@ def execute_example(
     """
     models = {model["method"]: TunedModel(**model) for model in stored[setup.name]["models"]}
     shot_results = {method: execute_shot(setup, settings, models[method]) for method in methods}
+    # Upper end of the axis, 0.1 m above the highest flight.
     top = max(float(np.nanmax(t.flown[:, 2])) for t in shot_results.values()) + 0.1
     return ExampleShot(models, shot_results, top)
 
@@ -299,6 +302,7 @@ def draw_shots_figure(
         stored: stored results by name of the shot.
     """
     columns = max(len(methods) for _, methods in chosen)
+    # Width and height in inches, with the space for each shot.
     size = (4.1 * columns, 0.9 + 3.1 * len(chosen))
     figure, axes = make_panel_grid(len(chosen), columns, size)
     for row, (setup, methods) in zip(axes, chosen, strict=True):
@@ -328,7 +332,9 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
         shot: the executed example.
     """
     scene, flight = setup.scene, shot.results[method]
+    # Ends of the drawn incline in m: behind the release, and before the hoop.
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
+    # Down to the lower end of the axis, -0.35 m.
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=INCLINE_GREY, linewidth=0)
     rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
     level = [scene.hoop_z] * 2

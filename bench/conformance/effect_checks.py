@@ -167,6 +167,7 @@ def _compute_contributions(
     acts.
     """
     moment = _make_state_snapshot(host, system)
+    # Arbitrary impact speeds (m/s), restitutions, signals and times (s) of two batch elements.
     speed, e = np.array([[0.3], [2.0]]), np.array([[0.4], [0.8]])
     values = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.6]])
     times = np.cumsum(np.full((2, 3), 0.1), axis=1)
@@ -207,6 +208,7 @@ def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSn
     shape = (2, len(system.coordinates))
     theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)
     constants = {c.name: np.full((2, 1), c.value) for c in host.constants}
+    # Inputs, and all other numbers here, are arbitrary and not zero, SI units.
     inputs = {c.name: np.full((2, 1), 0.3) for c in host.inputs}
     numbers = np.linspace(0.2, 1.1, 2 * shape[1])
     return StateSnapshot(
@@ -234,6 +236,7 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
             host(engine=_choose_engine(host)),
             _make_scenario(host.system),
         )
+        # Shares of the ranges of the parameters.
         thetas = np.concatenate([_make_parameters(simulator, share) for share in (0.05, 0.3, 0.7)])
         observations = simulator.simulate(thetas, scenario)
         location = f"{effect.__name__} on {host.name}"
@@ -255,6 +258,7 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
         simulator, scenario = _make_simulator_with_effect(host, effect), _make_scenario(host.system)
+        # Shares of the ranges of the parameters.
         lanes = np.concatenate([_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)])
         batch_result = simulator.simulate(lanes, scenario)
         single_results = np.concatenate(

@@ -311,6 +311,7 @@ def _find_forced_coordinates(
     from sims.robot.dynamics.effect_forces import make_snapshot
 
     system = kind.system()  # type: ignore[attr-defined]
+    # Positions, inputs and forces are arbitrary and not zero, SI units.
     x = np.array([[0.3, -0.4], [0.8, 0.2]])
     inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
     stiffness = np.ones_like(x)

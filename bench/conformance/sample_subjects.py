@@ -320,6 +320,7 @@ def make_scenario() -> Scenario:
     """Make a run in which both joints reverse and every command changes."""
     # The first samples are at the ends of simulation steps, the others between them.
     times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _RUN_SECONDS, 0.021)])
+    # Arbitrary angles (rad) and rates (rad/s), and torques (N m) that change every 0.2 s.
     initial = {"q.shoulder": 0.4, "q.elbow": -0.7, "qd.shoulder": -1.0, "qd.elbow": 2.0}
     first = np.where(times % 0.4 < 0.2, 0.6, -0.3)
     return Scenario(times, initial, {"u.m_shoulder": first, "u.m_elbow": 0.4 - 2.0 * first})

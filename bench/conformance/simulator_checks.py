@@ -219,6 +219,7 @@ def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
         _start_run(simulator)
         _make_step(simulator)
         levels_before = {level: float(simulator.observe()[level]) for level in kind.levels}
+        # Another level than before, also if that is zero.
         expected_levels = {**levels_before, name: 0.9 * levels_before[name] + 0.01}
         simulator.put({name: expected_levels[name]})
         found_levels = {level: float(simulator.observe()[level]) for level in kind.levels}

@@ -300,6 +300,7 @@ def draw_summary_figure(
         tables: Tables of the panels.
         caption: Caption below the figure.
     """
+    # Height in inches: title and axis, and a line for each log.
     height = 1.2 + _NAME_HEIGHT * len(panels[0].across.names) if panels[0].across.names else 4.0
     figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
     for axis, panel in zip(axes, panels, strict=True):

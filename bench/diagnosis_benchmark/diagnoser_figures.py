@@ -83,6 +83,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
         order: names of the diagnosers.
         title: title of the figure.
     """
+    # Width and height in inches, with the space for each diagnoser.
     figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
     bar_positions = np.arange(len(order))[::-1]
@@ -159,6 +160,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     column_count = min(_PANELS_PER_ROW, len(order))
     row_count = -(-len(order) // column_count)
     size = (
+        # Width and height in inches, with the space for each label.
         1.6 + column_count * max(2.2, 0.16 * len(answer_labels)),
         1.4 + row_count * max(1.4, 0.17 * len(hidden)),
     )

@@ -158,6 +158,7 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
         elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
         # Of the two sides, use the one where x points to the right, as in a drawing.
         right = _compute_camera_axes(azimuth, elevation)[0]
+        # The small second component decides if the first one is zero.
         flipped = right @ (1.0, 1e-3, 0.0) < 0
         return ((azimuth + 180) % 360, -elevation) if flipped else (azimuth, elevation)
     moving, _ = compute_bounding_points(robot.compiled, data)

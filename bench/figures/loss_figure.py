@@ -48,6 +48,7 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
     # In the order in which they were trained.
     stages = list(dict.fromkeys(row[1] for row in rows))
     seeds = sorted({row[0] for row in rows})
+    # Width and height in inches.
     figure, axes = make_panel_grid(1, len(stages), (1.0 + 4.0 * len(stages), 3.4), sharey=True)
     for axis, stage in zip(axes[0], stages, strict=True):
         for seed in seeds:

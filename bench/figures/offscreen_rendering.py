@@ -33,6 +33,8 @@ _START = (
 )
 _failed: set[str] = set()
 """OpenGL backends that failed in this process; each is tried only once."""
+LUMA_QUANTILES = (0.02, 0.98)
+"""Quantiles of the robot's brightness that are stretched to the ends of the range."""
 
 
 def list_gl_backends() -> tuple[str, ...]:
@@ -124,6 +126,7 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
     global_options.orthographic, global_options.fovy = 1, view.height
     size = float(np.hypot(view.width, view.height))
     model.stat.extent = size
+    # Nearest and farthest visible distance, in extents of the model.
     model.vis.map.znear, model.vis.map.zfar = 0.01, 3 * CAMERA_DISTANCE_FACTOR
     # Shadows and reflections give no information about places.
     model.light_castshadow[:] = 0
@@ -156,7 +159,7 @@ def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
     # Luma of ITU-R BT.601.
     luma = colours @ (0.299, 0.587, 0.114)
     robot_luma = luma[shape]
-    low, high = np.quantile(robot_luma, [0.02, 0.98]) if robot_luma.size else (0.0, 1.0)
+    low, high = np.quantile(robot_luma, LUMA_QUANTILES) if robot_luma.size else (0.0, 1.0)
     # The robot's own range of luma is mapped to medium to light grey.
     share = np.clip((luma - low) / max(high - low, 1.0), 0.0, 1.0)
     grey = np.where(shape, 120 + 112 * share, 255)

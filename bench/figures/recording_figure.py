@@ -82,7 +82,9 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
     """
     signals = list_recorded_signals(recording, kind)
     placed_runs = _place_runs(recording.runs)
+    # Width in inches: 0.8 for each run, between 9 and 16.
     width = float(np.clip(3 + 0.8 * len(placed_runs), 9, 16))
+    # Width and height in inches, with the space for each signal.
     figure, axes = make_panel_grid(len(signals), 1, (width, 1.2 + 2.0 * len(signals)), sharex=True)
     for axis, (channel, role) in zip(axes[:, 0], signals, strict=True):
         unit = "" if channel.unit == "1" else f" [{format_unit(channel.unit)}]"

@@ -245,6 +245,7 @@ def draw_robot_figure(
     label_height = max(_compute_column_height(side) for side in label_columns)
     width, height = scale * projection.width, scale * projection.height
     tall = max(height, label_height)
+    # 0.15 inches are the space above the scale bar.
     size = (columns[0] + width + columns[1], tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
     figure, axes = make_panel_grid(1, 1, size, layout=None)
     axis = axes[0, 0]
@@ -382,6 +383,7 @@ def _compute_column_width(labels: Sequence[_Label]) -> float:
     if not labels:
         return 0.3
     longest = max(len(line) for label in labels for line in label.lines)
+    # 0.3 inches are margins at both sides of the letters.
     return max(MIN_LABEL_COLUMN_INCHES, 0.3 + LETTER_WIDTH_INCHES * longest)
 
 
@@ -482,6 +484,7 @@ def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: floa
 
     `scale` is in inches per metre, `tall` the height of the drawing in inches.
     """
+    # The bar is at most 0.3 of the picture's width.
     length = round_down_length(0.3 * projection.width)
     left_edge = -projection.width / 2
     y = -tall / scale / 2 - 0.2 / scale

@@ -144,6 +144,7 @@ def draw_rank_slope_figure(
         ranking: Rank agreement (Kendall's tau, p-value) of each study and metric.
     """
     metrics = {"param_error": "error of the parameters", "heldout_error": "prediction"}
+    # Width in inches, with the space for each system.
     width = max(6.0, 2.6 + 1.75 * len(systems))
     figure, axes = make_panel_grid(len(metrics), len(systems), (width, 6.6), sharey=True)
     for row, (metric, label) in zip(axes, metrics.items(), strict=True):
@@ -180,6 +181,7 @@ def _make_panels(count: int) -> tuple[Figure, list[Axes]]:
     """
     columns = min(count, _PANEL_COLUMNS)
     rows = -(-count // columns)
+    # Width and height in inches, with the space for each panel.
     figure, axes = make_panel_grid(rows, columns, (1.6 + 3.4 * columns, 1.3 + 2.9 * rows))
     panels = list(np.ravel(axes))
     for panel in panels[:count]:
@@ -256,6 +258,7 @@ def _draw_rank_lines(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> No
             [0, 1], [plain_rank, extended_rank], markersize=5, **style.get_plot_style(str(tuner))
         )
     panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)
+    # The two simulators are at 0 and 1.
     panel.set_xlim(-0.25, 1.25)
 
 

@@ -90,6 +90,7 @@ def draw_chart(
     figure, grid = make_panel_grid(
         rows,
         columns,
+        # Width and height in inches: margins and panels.
         (1.2 + width * columns, 0.6 + height * rows),
         sharey=shared or ("row" if rows > 1 else False),
         sharex=rows > 1,

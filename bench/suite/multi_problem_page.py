@@ -128,6 +128,7 @@ def make_runtime_panel(
         for name, mark_style in styles
     )
     x_axis = Axis("simulations used, in hundredths of the problem's budget", scales=("linear",))
+    # A margin of 0.02, so that lines at 0 and 1 are visible.
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panel = Panel("All problems", "runtime", "hundredths", series, x_axis, y_axis)
     return panel, pd.concat(parts, ignore_index=True)
@@ -144,6 +145,7 @@ def _make_error_panels(page_data: MultiProblemPageData) -> tuple[list[Panel], pd
             "symlog",
             ("symlog", "linear"),
             tuple(float(k) for k in select_checkpoints(experiment.budget)),
+            # Marks at the ends must not be cut off.
             ends=(-0.08, experiment.budget * 1.1),
         )
         for kind in dict.fromkeys(statistics.curves.keys["range"]):

@@ -43,6 +43,8 @@ RANK_TOLERANCE = 0.5
 """Difference from the lowest mean rank up to which the headline keeps a method."""
 _SIGNIFICANCE = 0.05
 """Significance level of the tests against the best method."""
+MAX_PRINTED_RATIO = 1e4
+"""Largest ratio that is printed as a number."""
 
 
 def build_headline(tables: SuiteTables) -> str:
@@ -177,7 +179,7 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
 
 
 def _format_ratio(ratio: float) -> str:
-    return f"{float(f'{ratio:.2g}'):g}×" if ratio < 1e4 else "more than 10000×"
+    return f"{float(f'{ratio:.2g}'):g}×" if ratio < MAX_PRINTED_RATIO else "more than 10000×"
 
 
 _TEMPLATE = Path(__file__).with_name("suite_page.html")

@@ -41,7 +41,7 @@ from sims.engines.compiled import machine_code as compiled
 
 _FOLDER_PREFIX = "simgap-tuner-"
 _EXIT_WAIT_SECONDS = 5.0
-"""Time that a tuner's process has to end after it was told to."""
+"""Time in seconds that the fork server has to end after its link is closed."""
 
 
 class LockedFolder(NamedTuple):
@@ -253,7 +253,8 @@ class ForkServerClient:
     def close(self) -> None:
         """End the fork server and every process that it started, and delete their scratch folder.
 
-        The server ends by itself when its link is closed; it is killed if this takes more than 5 s.
+        The server ends by itself when its link is closed; it is killed if this takes longer than
+        `_EXIT_WAIT_SECONDS`.
         """
         atexit.unregister(self.close)
         self._link.close()

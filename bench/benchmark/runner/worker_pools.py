@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from bench.benchmark.runner.plugin_discovery import Plugin
 
 _EXIT_WAIT_SECONDS = 5.0
-"""Time that a worker has to end before it is left behind."""
+"""Time in seconds that a worker has to end before it is left behind."""
 
 
 class WorkerProcess(SpawnProcess):

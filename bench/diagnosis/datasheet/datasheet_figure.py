@@ -67,6 +67,14 @@ _STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "pdf.fonttype": 42,
 }
+_NAME_TOP, _TITLE_TOP, _FOOT_TOP = 0.965, 0.938, 0.028
+"""Heights of the name, the title and the foot of the page, as shares of the page."""
+_TITLE_LINE, _TITLE_GAP = 0.014, 0.012
+"""Height of a line of the title, and of the space below it, as shares of the page."""
+_HALF_WIDTH = 0.45
+"""Width of one of two columns, as a share of the page."""
+_FOOT_HEIGHT = 0.045
+"""Height of the foot of the page, which no table overlaps, as a share of the page."""
 
 
 def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
@@ -110,9 +118,11 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
             text = f" {format_number(force)} {unit}"
             axes.annotate(text, position, xytext=(4, 4), textcoords="offset points")
     text_style: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
+    # Places of the labels in the regions of the diagram, as shares of the range of its axes.
     axes.text(-0.55 * load_range, 0.75 * load_range, "moves forward", **text_style)
     axes.text(0.55 * load_range, -0.75 * load_range, "moves back", **text_style)
     axes.text(0.72 * load_range, 0.25 * load_range, "back-driven:\nthe load slips", **text_style)
+    # The region in which the joint holds is labelled where it is wide enough.
     middle = 0.62 * load_range
     if np.interp(middle, load, forward - backward) > 0.15 * load_range:
         axes.text(middle, middle, "holds", **text_style)
@@ -146,6 +156,8 @@ def draw_sheet(content: SheetContent) -> Figure:
         _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, table_top=top - 0.09)
         return figure
     table_top = _draw_effects_not_shown(figure, content, size=_SMALL_SIZE)
+    # Positions are shares of the page; the labels of the axes need 0.09 of the width and the
+    # height.
     height = min(_MAX_DIAGRAM_HEIGHT, top - table_top - 0.09)
     if height > 0.1:
         width = height * A4_INCHES[1] / A4_INCHES[0]
@@ -164,14 +176,16 @@ def _draw_heading(figure: Figure, content: SheetContent) -> float:
     Returns:
         Upper end of the free space, as a share of the page height.
     """
-    figure.text(_MARGIN, 0.965, sanitise(content.name, 60), fontsize=17, weight="bold", va="top")
+    figure.text(
+        _MARGIN, _NAME_TOP, sanitise(content.name, 60), fontsize=17, weight="bold", va="top"
+    )
     title = content.recording.title or content.recording.path.stem
     text = f"Data sheet from {sanitise(title, 90)}. {format_sentence(content.verdict.meaning)}"
     lines = textwrap.wrap(sanitise(text, 300), _LETTERS)[:3]
     figure.text(
-        _MARGIN, 0.938, "\n".join(lines), color=style.CAPTION_GREY, va="top", linespacing=1.3
+        _MARGIN, _TITLE_TOP, "\n".join(lines), color=style.CAPTION_GREY, va="top", linespacing=1.3
     )
-    return 0.938 - 0.014 * len(lines) - 0.012
+    return _TITLE_TOP - _TITLE_LINE * len(lines) - _TITLE_GAP
 
 
 def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> float:
@@ -199,6 +213,7 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
     for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top", fontsize=size)
     for cells, is_found in zip(rows, is_cause, strict=True):
+        # Lines of the table are a quarter wider apart than those of a text.
         top -= _LINE * 1.25
         for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
             weight = "bold" if is_found and i == 1 else "normal"
@@ -211,6 +226,7 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
     size = _TABLE_SIZE
     while True:
         widths = [measure_text_width(column, size, "bold") for column in zip(*rows, strict=True)]
+        # Space between two columns in inches, for this font size.
         gap = 0.14 * size / _TABLE_SIZE
         if (
             sum(widths) + gap * (len(widths) - 1) <= A4_INCHES[0] * (1 - 2 * _MARGIN)
@@ -244,7 +260,7 @@ def _draw_effects_not_shown(
     name_length = min(max(map(len, names), default=0), _NAME_LETTERS)
     # A character of the monospaced font is 0.602 of its size wide.
     beside_name = (0.602 * size / POINTS * name_length + 0.12) / A4_INCHES[0]
-    letters = int((0.45 - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
+    letters = int((_HALF_WIDTH - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
     for row in content.rows:
         if row.number is None:
             confounding = format_confounding(row)
@@ -258,9 +274,9 @@ def _draw_effects_not_shown(
     split_row = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
     table_height = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
     # A long table must not overlap the foot of the page.
-    table_top = max(table_top, 0.045 + table_height)
+    table_top = max(table_top, _FOOT_HEIGHT + table_height)
     for column, part in enumerate((rows[:split_row], rows[split_row:])):
-        x, y = _MARGIN + 0.45 * column, table_top
+        x, y = _MARGIN + _HALF_WIDTH * column, table_top
         for name, lines in part:
             figure.text(
                 x, y, sanitise(name, name_length), va="top", fontsize=size, family="monospace"
@@ -271,7 +287,7 @@ def _draw_effects_not_shown(
     heading = "Not detected in these data, with the detection limit (95 %)"
     figure.text(_MARGIN, table_top + 0.018, heading, weight="bold", va="top")
     text = "Limits and backlash are detectable from the given size on. Made by simgap datasheet."
-    figure.text(_MARGIN, 0.028, text, fontsize=6, color=style.CAPTION_GREY, va="top")
+    figure.text(_MARGIN, _FOOT_TOP, text, fontsize=6, color=style.CAPTION_GREY, va="top")
     return table_top + 0.02
 
 

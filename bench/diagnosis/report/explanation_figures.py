@@ -128,6 +128,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     # Names of causes are bold, which is a little wider.
     left_margin = _EDGE + 0.12 + measure_text_width(names, _NAME_SIZE, "bold")
     shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
+    # Width in inches; a title needs at least 7.
     width = max(left_margin + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
     row = _ROW + _LINE * count_max_lines(names)
@@ -157,6 +158,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
         handles,
         labels,
         loc="center left",
+        # The legend is 0.46 inches below the upper edge.
         bbox_to_anchor=(_EDGE / width, 1 - 0.46 / height),
         ncols=4,
         fontsize=8.5,
@@ -243,6 +245,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
         )
     axis.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.6)
     axis.axvline(1.0, color=ZERO_LINE_GREY, linewidth=0.6, linestyle=":")
+    # Shares from the lowest one to 1, with a margin for marks.
     axis.set_xlim(lowest - 0.03, 1.05)
     ticks = [tick for tick in (-0.5, 0.0, 0.25, 0.5, 0.75, 1.0) if tick >= lowest - 0.03]
     axis.set_xticks(ticks, [f"{100 * tick:.0f}".replace("-", "−") for tick in ticks])
@@ -514,6 +517,7 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
     if is_robot(report):
         return draw_joint_figure(report, view)
     count = len(view.channels)
+    # Width and height in inches.
     size = (_WIDTHS[count], 5.2)
     figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(view.channels):
@@ -532,7 +536,13 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
     )
     left_margin = 0.75 / figure.get_figwidth()
     figure.subplots_adjust(
-        left=left_margin, right=0.985, top=0.92, bottom=0.165, hspace=0.1, wspace=0.2
+        # Margins as shares of the figure, and spaces as shares of a panel.
+        left=left_margin,
+        right=0.985,
+        top=0.92,
+        bottom=0.165,
+        hspace=0.1,
+        wspace=0.2,
     )
     return figure
 
@@ -557,7 +567,7 @@ def _draw_signal(
     t = times[rows]
     measured, before, after = (signal[rows] for signal in signals)
 
-    size = 3.6 if rows.size < 250 else 2.6
+    size = 3.6 if rows.size < 250 else 2.6  # points: smaller dots for many samples
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
     # Thousands of vector outlines would dominate the file size.
     marks["rasterized"] = rows.size > MAX_OUTLINED_DOTS
@@ -646,15 +656,19 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     left_margin = max(_MIN_NAMES_WIDTH, 0.25 + measure_text_width(names, _STYLE["font.size"]))
     profiles_from = left_margin + _PROFILES_AFTER
     # A single column of profiles is wider than one of several columns.
+    # Widths in inches: panel of the gaps, and each column of profiles.
     width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
+    # Height of a row in inches, and of each further line of a name.
     row_height = 0.27 + 0.13 * (count_max_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
     label_height = 0.15 * (
         count_max_lines([format_profile_label(profile) for profile in profiles]) - 1
     )
+    # Height in inches of title, axis and rows; or of titles and panels of the profiles.
     height = max(2.6 + row_height * len(locations), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
+    # Left, bottom, width and height, given in inches, as shares of the figure.
     axis.set_position((left_margin / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
     draw_gap_location_panel(axis, locations, report)
     layout.heading(0.15, "Where the gap is")
@@ -676,6 +690,7 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
         columns,
         left=layout.across(profiles_from),
         right=1 - layout.across(0.12),
+        # The labels below the panels need 0.85 inches and their further lines.
         bottom=layout.up(0.85 + label_height),
         top=1 - layout.up(0.5),
         hspace=0.45 + 0.6 * label_height,

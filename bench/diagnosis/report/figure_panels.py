@@ -145,6 +145,7 @@ def draw_gap_location_panel(
     # The noise floor must be visible, whatever the sizes.
     _use_log_axis_if_needed(axis, [*shown_values, 1.0])
     axis.set_yticks(rows, place_names(places), linespacing=1.05)
+    # Rows are one apart, the first at the top; leave space for the last mark.
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
 
@@ -194,6 +195,7 @@ def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
         axis.set_xlim(left=0)
         return
     axis.set_xscale("log")
+    # The axis extends by a factor of 1.4 beyond the smallest and the largest value.
     low = positive.min() / 1.4
     high = positive.max() * 1.4
     ticks = _compute_log_ticks(low, high)

@@ -129,9 +129,11 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
+    # Widths in inches: names, panels of motion and legend, and each panel of residuals.
     names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_GAP_INCHES)
     width = names_width + 5.15 + 2.6 * len(quantities)
     size = (width, _TOP_MARGIN_INCHES + _BOTTOM_MARGIN_INCHES + height * len(rows))
+    # A panel of motion is 1.4 times as wide as one of residuals.
     ratios = (4.2, *[3.0] * len(quantities))
     figure, axes = make_panel_grid(
         len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
@@ -221,7 +223,7 @@ def _draw_motion(
     rows = decimate(signals[0])
     measured, before, after = (signal[rows] for signal in signals)
     t = times[rows]
-    size = 4.0 if rows.size < 250 else 3.4
+    size = 4.0 if rows.size < 250 else 3.4  # points: smaller dots for many samples
     panel.plot(
         t,
         measured,
@@ -321,6 +323,7 @@ def _unify_scale(
             )
             finite = residual[np.isfinite(residual)]
             if finite.size:
+                # 8 % above the quantile, so that its samples do not touch the edge.
                 limit = max(limit, 1.08 * float(np.quantile(finite, RESIDUAL_AXIS_QUANTILE)))
     for panel in panels:
         panel.set_ylim(-limit, limit)
@@ -387,6 +390,7 @@ def _add_title_and_legend(
         [*handles, *band_handles],
         [*labels, *band_labels],
         loc="lower center",
+        # The legend is 0.22 inches above the lower edge.
         bbox_to_anchor=(0.5, 0.22 / height),
         ncols=4,
         fontsize=9,

@@ -69,6 +69,8 @@ MIN_REPORTED_CHANGE = 1e-3
 """Minimum relative change of a parameter that can be reported as absorption, however narrow its
 interval.
 """
+NOISE_TOLERANCE = 0.02
+"""Relative difference up to which two noise levels are printed as one."""
 
 
 def format_summary(report: DiagnosisReportData) -> list[str]:
@@ -407,7 +409,7 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     for unit in units:
         noises = [c.sigma for c in report.channels if c.unit == unit]
         combined_noise = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
-        if isclose(combined_noise, floor or 0.0, rel_tol=0.02):
+        if isclose(combined_noise, floor or 0.0, rel_tol=NOISE_TOLERANCE):
             return unit
     return units[0] if len(units) == 1 else "1"
 

@@ -20,6 +20,10 @@ REST_SPEED = 1e-5  # m/s: after slower rebounds the ball rests
 UNMODELLED_CAUSES = ("updraft", "gust", "wear", "layer")
 Acceleration = tuple[float, float, float]
 STATES = ("x", "y", "z", "vx", "vy", "vz")
+LAYER_BLUR = 0.02
+"""Height over which the drag of a layer fades in, m."""
+MAX_FIRST_STEP = 0.02
+"""Longest first step of the solver, s."""
 
 
 class FlightDynamics:
@@ -136,7 +140,7 @@ def _compute_layer_drag(
         v: velocity along y, m/s.
         w: upward velocity, m/s.
     """
-    fade_in = 0.5 * (1 + tanh((z - c[1]) / 0.02))
+    fade_in = 0.5 * (1 + tanh((z - c[1]) / LAYER_BLUR))
     return _compute_quadratic_drag(c[0] * fade_in, u, v, w, sqrt(u * u + v * v + w * w))
 
 
@@ -254,7 +258,7 @@ def _integrate_flight(
     events = None if floor is None else impact_event
     settings: dict[str, Any] = {
         "dense_output": True,
-        "first_step": min(0.02, end - start),
+        "first_step": min(MAX_FIRST_STEP, end - start),
         **SOLVER_TOLERANCES,
     }
     solved = solve_ivp(rate, (start, end), state, "DOP853", events=events, **settings)

@@ -16,6 +16,14 @@ FIRST_DAMPING = 1e-3  # first damping factor of the Levenberg-Marquardt method
 MAX_DAMPING_TRIALS = 8  # maximum number of damping factors tried in one step
 CONVERGED_STEP = 1e-4  # step at which a fit has converged, in scaled units
 FINITE_DIFFERENCE_STEP = 1e-3  # in scaled units
+MIN_SINGULAR_VALUE = 1e-6
+"""Singular value, relative to the largest one, below which columns are dependent."""
+FIRST_STRENGTH = 1e-3
+"""Strength that is tried first."""
+SIZE_TOLERANCE = 0.03
+"""Relative deviation from the requested size that is accepted."""
+BRACKET_MARGIN = 0.05
+"""Smallest distance of a trial from the ends of a bracket, as a share of its logarithmic width."""
 
 
 def compute_rms(values: Array) -> float:
@@ -36,7 +44,7 @@ def compute_orthonormal_basis(columns: Array) -> Array:
     left_vectors, singular_values, _ = np.linalg.svd(
         columns / np.where(scale > 0, scale, 1.0), full_matrices=False
     )
-    basis: Array = left_vectors[:, singular_values > 1e-6 * singular_values[0]]
+    basis: Array = left_vectors[:, singular_values > MIN_SINGULAR_VALUE * singular_values[0]]
     return basis
 
 
@@ -87,9 +95,9 @@ def find_strength_for_size(
     compute_residual: Callable[[float], float],
     target_size: float,
     largest: float,
-    first: float = 1e-3,
+    first: float = FIRST_STRENGTH,
     max_exponent: float = 2.0,
-    tolerance: float = 0.03,
+    tolerance: float = SIZE_TOLERANCE,
 ) -> tuple[float, float] | None:
     """Find the strength at which the size of a cause has the requested value.
 
@@ -139,6 +147,7 @@ def _choose_next_strength(
     """
     if not low[0]:
         return (
+            # From 1 % to 90 % of the upper strength.
             high[0] * min(max(target_size / high[1], 1e-2), 0.9)
             if np.isfinite(high[1])
             else high[0] / 5
@@ -148,5 +157,5 @@ def _choose_next_strength(
     if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
         return float(np.sqrt(low[0] * high[0]))
     log_position = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
-    limited_position = min(max(log_position, 0.05), 0.95)
+    limited_position = min(max(log_position, BRACKET_MARGIN), 1.0 - BRACKET_MARGIN)
     return float(low[0] * (high[0] / low[0]) ** limited_position)

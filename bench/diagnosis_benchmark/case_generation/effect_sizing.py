@@ -26,6 +26,26 @@ from sims.core.simulator import Array
 
 FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale
 DIVERGED_VALUE = 1e30  # in units of the noise: larger values count as diverged
+FIRST_DAMPING = 1e-6
+"""Damping of the first step, relative to the squared sensitivities."""
+DAMPING_INCREASE = 30.0
+"""Factor of the damping after a step that does not decrease the sum of squares."""
+DAMPING_DECREASE = 10.0
+"""Divisor of the damping after any other step."""
+MAX_DAMPING = 1e3
+"""Damping at which a fit ends."""
+MIN_RELATIVE_GAIN = 1e-3
+"""Relative decrease of the RMS residual below which a fit has converged."""
+RIDGE = 1e-9
+"""Constant part of the damping, relative to the largest squared sensitivity."""
+SATURATION_SHARES = (0.9, 0.6)
+"""Limits of an input from which its fit starts, as shares of the input's peak."""
+STOP_INSET_SHARES = (0.03, 0.15)
+"""Distances of an end stop from the end of the travel, as shares of the travel."""
+STOP_STIFFNESS_SHARES = (0.001, 0.01, 0.1)
+"""Stiffnesses of an end stop from which its fit starts, as shares of the largest one."""
+STOP_LOSS = 0.05
+"""Damping of an end stop from which its fit starts, as a factor of the approach velocity, s/m."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +96,7 @@ class NuisanceFitter:
             low,
             np.where(np.arange(low.size) < len(base), high, low + 2 * (high - low)),
         )
+        # Coefficients are scaled by a tenth of their ranges.
         self.scales = np.where(np.arange(low.size) < len(base), self.theta, 0.1 * (high - low))
 
     def __call__(
@@ -87,8 +108,8 @@ class NuisanceFitter:
     ) -> ResidualFit:
         """Fit observations by the Levenberg-Marquardt method.
 
-        A step that does not decrease the sum of squares multiplies the damping by 30, another one
-        divides it by 10. The fit stops when the RMS residual decreases by less than 0.1 %.
+        A step that does not decrease the sum of squares increases the damping, another one
+        decreases it. The fit stops when the RMS residual hardly decreases.
 
         Args:
             observed: observations, (R, T, C).
@@ -97,7 +118,7 @@ class NuisanceFitter:
             rounds: maximum number of iterations.
         """
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
-        starts, damping = self.starts if starts is None else starts, 1e-6
+        starts, damping = self.starts if starts is None else starts, FIRST_DAMPING
         residual, slope = self.linearise(observed, theta, starts)
         if not np.isfinite(residual).all():
             return ResidualFit(np.inf, theta, starts)
@@ -108,8 +129,8 @@ class NuisanceFitter:
             new_starts = starts + step[count:].reshape(starts.shape)
             new_residual, new_slope = self.linearise(observed, new_theta, new_starts)
             if not new_residual @ new_residual < residual @ residual:  # a NaN is no improvement
-                damping *= 30.0
-                if damping > 1e3:
+                damping *= DAMPING_INCREASE
+                if damping > MAX_DAMPING:
                     break
                 continue
             relative_gain = 1.0 - np.sqrt((new_residual @ new_residual) / (residual @ residual))
@@ -118,9 +139,9 @@ class NuisanceFitter:
                 new_starts,
                 new_residual,
                 new_slope,
-                damping / 10.0,
+                damping / DAMPING_DECREASE,
             )
-            if relative_gain < 1e-3:
+            if relative_gain < MIN_RELATIVE_GAIN:
                 break
         return ResidualFit(float(np.sqrt(np.mean(residual**2))), theta, starts)
 
@@ -128,7 +149,7 @@ class NuisanceFitter:
     def compute_step(residual: Array, slope: Array, damping: float) -> Array:
         """Solve the damped normal equations of Levenberg and Marquardt.
 
-        The damping is relative to the diagonal. The small constant part, 1e-9 of its largest entry,
+        The damping is relative to the diagonal. The small constant part (`RIDGE`)
         keeps the matrix regular if an unknown has no influence.
 
         Args:
@@ -141,7 +162,7 @@ class NuisanceFitter:
         """
         normal_matrix = slope.T @ slope
         diagonal = np.diag(normal_matrix)
-        normal_matrix = normal_matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+        normal_matrix = normal_matrix + np.diag(damping * diagonal + RIDGE * diagonal.max())
         with np.errstate(invalid="ignore"):  # a simulation that diverges has an infinite residual
             gradient = slope.T @ residual
         return np.asarray(np.linalg.solve(normal_matrix, gradient), dtype=np.float64)
@@ -321,7 +342,7 @@ def _rank_starts(
     fit = NuisanceFitter(setting, [name])
     if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
-        guesses = [np.array([*base_fit.theta, share * peak]) for share in (0.9, 0.6)]
+        guesses = [np.array([*base_fit.theta, share * peak]) for share in SATURATION_SHARES]
         result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
     elif name == "state.limit":  # an end stop that is not reached has no derivative either
         guesses = [
@@ -352,10 +373,10 @@ def _iterate_stop_starts(
     low, high = float(path.min()), float(path.max())
     # Scale of the stiffness, N m/rad for a pendulum and N/m for a slider.
     max_stiffness = 20.0 if setting.system == "pendulum" else 5000.0
-    for inset_share, stiffness_share in product((0.03, 0.15), (0.001, 0.01, 0.1)):
+    for inset_share, stiffness_share in product(STOP_INSET_SHARES, STOP_STIFFNESS_SHARES):
         inset = inset_share * (high - low)
-        yield stiffness_share * max_stiffness, high - inset, 0.05
-        yield -stiffness_share * max_stiffness, low + inset, 0.05
+        yield stiffness_share * max_stiffness, high - inset, STOP_LOSS
+        yield -stiffness_share * max_stiffness, low + inset, STOP_LOSS
 
 
 def _compute_residual(

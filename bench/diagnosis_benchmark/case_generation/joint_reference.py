@@ -37,6 +37,10 @@ ResistanceLaw = Callable[[float, float, float], float]
 """Function from time, position and velocity of a coordinate to a force."""
 GravityForce = Callable[[float], float]
 SegmentResult = tuple[float, Array, Any]
+MAX_FIRST_STEPS = (0.01, 0.02)
+"""Longest first step of the solver with and without dry friction, s."""
+MAX_STEP = 0.05
+"""Longest step of the solver, s."""
 
 
 class JointDynamics:
@@ -565,11 +569,13 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     stop_event: Any = compute_directed_velocity
     stop_event.terminal, stop_event.direction = True, -1
     events, first_step = (
-        (stop_event, min(0.01, end - start)) if joint.limits else (None, min(0.02, end - start))
+        (stop_event, min(MAX_FIRST_STEPS[0], end - start))
+        if joint.limits
+        else (None, min(MAX_FIRST_STEPS[1], end - start))
     )
     settings: dict[str, Any] = {
         "dense_output": True,
-        "max_step": 0.05,
+        "max_step": MAX_STEP,
         "first_step": first_step,
         **SOLVER_TOLERANCES,
     }
@@ -613,6 +619,7 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
 
     break_away_event: Any = excess
     break_away_event.terminal, break_away_event.direction = True, 1
+    # Short steps, s, because the solver looks for events only between them.
     settings: dict[str, Any] = {"dense_output": True, "max_step": 0.01, **SOLVER_TOLERANCES}
     solved = solve_ivp(rate, (start, end), state, "RK45", events=break_away_event, **settings)
     return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol

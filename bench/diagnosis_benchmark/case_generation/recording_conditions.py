@@ -211,7 +211,9 @@ def _draw_sensor_noise(
     return SensorNoise(
         by_channel,
         kind,
+        # Correlation of neighbouring samples, if the noise is autocorrelated.
         float(rng.uniform(0.3, 0.9)),
+        # Standard deviation of the dither, in rounding steps.
         float(rng.uniform(0.3, 0.6)),
         bool(rng.random() < 0.5),
     )
@@ -234,11 +236,13 @@ def _draw_ball_conditions(
     Returns:
         Parameters by name, names of the channels, and the runs.
     """
+    # Speeds are in m/s, heights in m.
     is_vertical = not set(hidden) & set(GROUND_PARALLEL_EFFECTS) and rng.random() < 0.3
     speed = 0.0 if is_vertical else 3.0
     parameters, scenarios = {"restitution": float(rng.uniform(0.5, 0.9))}, []
     for _ in range(runs):
         vx, vy = rng.uniform(-speed, speed, 2)
+        # Initial height in m, and upward velocity in m/s, which is zero for half of them.
         z, vz = rng.uniform(2.0, 5.0), rng.choice([0.0, rng.uniform(-2.0, 3.0)])
         scenarios.append(
             Scenario(times, {"x": 0.0, "y": 0.0, "z": z, "vx": vx, "vy": vy, "vz": vz})
@@ -263,17 +267,21 @@ def _draw_pendulum_conditions(
     Returns:
         Parameters by name, names of the channels, and the runs.
     """
+    # Inertia in kg m².
     parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
     driven = any(name.startswith(INPUT_DEPENDENT_EFFECTS) for name in hidden) or rng.random() < 0.5
+    # The rate is recorded in 40 % of the recordings.
     channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
     signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     scenarios: list[Scenario] = []
     while len(scenarios) < runs:
         inputs = (
+            # Amplitude in N m, and lowest and highest frequency in Hz.
             {"u": rng.uniform(0.05, 0.2) * draw_input_signal(signal_form, times, rng, (0.3, 3.0))}
             if driven
             else {}
         )
+        # Initial rate in rad/s, and angle in rad.
         rates = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
         start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rates}
         scenario = Scenario(times, start, inputs)
@@ -302,13 +310,16 @@ def _draw_slider_conditions(
         Parameters by name, names of the channels, and the runs.
     """
     parameters = {"mass": float(rng.uniform(0.5, 2.0))}
+    # The rate is recorded in 40 % of the recordings.
     channels = ("x",) if rng.random() < 0.6 else ("x", "v")
     signal_form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
     for _ in range(runs):
         start = {
             "x": rng.choice([0.0, rng.uniform(-0.5, 0.5)]),
+            # Initial velocity in m/s.
             "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
         }
+        # Lowest and highest frequency in Hz.
         u = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
         u -= u.mean()  # otherwise the slider drifts away
         travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]

@@ -63,6 +63,8 @@ FINE_STEP_SECONDS = 5e-4  # seconds: maximum step in which a lagging sensor is i
 MUJOCO_STEP_SECONDS = (
     1e-3  # seconds: at MuJoCo's default step its error would be a tenth of the noise
 )
+HIDDEN_STATE_STEP = 2.5e-3
+"""Step of the engine for effects with hidden states, s."""
 
 
 def get_constants(system: str, **changed: float) -> dict[str, float]:
@@ -140,7 +142,9 @@ def simulate_with_mujoco(
     has_hidden_states = any(
         library.get_effect(name).hook == "hidden" for name in true_system.effects
     )
-    engine, step = ("batch", 2.5e-3) if has_hidden_states else ("mujoco", MUJOCO_STEP_SECONDS)
+    engine, step = (
+        ("batch", HIDDEN_STATE_STEP) if has_hidden_states else ("mujoco", MUJOCO_STEP_SECONDS)
+    )
     effects = {name: list(c) for name, c in true_system.effects.items()}
     kind = SIMULATORS[true_system.system]
     simulator = kind(true_system.constants, channels, engine=engine, fixed=effects, time_step=step)

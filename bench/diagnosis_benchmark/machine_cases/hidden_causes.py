@@ -86,6 +86,12 @@ _MAX_COEFFICIENTS = {
     "sensor.gain": 0.3,
 }
 """Coefficient at strength 1 of effects that need no scale of the motion."""
+TILT_AT_STRENGTH_ONE = 0.3
+"""Tilt of gravity at strength 1, rad."""
+DEADBAND_AT_STRENGTH_ONE = 0.3
+"""Dead band of a servo at strength 1, rad."""
+STRIBECK_FORCE_SHARE = 0.3
+"""Coulomb friction at strength 1, as a share of the joint's typical force."""
 
 
 def list_effect_places(system: str, effect: str) -> tuple[str, ...]:
@@ -148,7 +154,7 @@ def draw_effect_shape(
         return MOTION_SCALED_EFFECTS[effect](typical_scales, rng)
     if effect == "gravity.tilt":
         phase_coefficients = (0.0,) if setting.system == "arm2" else ()
-        return lambda s: (0.3 * sign * s, *phase_coefficients)
+        return lambda s: (TILT_AT_STRENGTH_ONE * sign * s, *phase_coefficients)
     command = setting.fitted_runs.commands[:, :, joint]
     max_command = float(np.abs(command).max())
     return {
@@ -156,7 +162,7 @@ def draw_effect_shape(
         "input.deadband": lambda s: (max_command * s,),
         # Strength 0 limits the command at its peak, strength 1 at zero.
         "input.saturation": lambda s: (max_command * (1 - s),),
-        "servo.deadband": lambda s: (0.3 * s,),
+        "servo.deadband": lambda s: (DEADBAND_AT_STRENGTH_ONE * s,),
     }[effect]
 
 
@@ -195,6 +201,7 @@ def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> 
         Function from the strength to sine amplitude, cosine amplitude, and period.
     """
     angle = rng.uniform(0, 2 * np.pi)
+    # 1.5 to 4 periods within the travel, between 0.08 and 1 rad.
     period = float(np.clip(typical_scales["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
     sine, cosine = (
         2 * typical_scales["force"] * float(function(angle)) for function in (np.sin, np.cos)
@@ -215,11 +222,12 @@ def _draw_stribeck(
         Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
         speed.
     """
+    # Additional friction at rest, in Coulomb frictions.
     extra = float(rng.uniform(2.0, 6.0))
     speed = typical_scales["speed"] * float(rng.uniform(0.15, 0.5))
     return lambda s: (
-        0.3 * typical_scales["force"] * s,
-        0.3 * extra * typical_scales["force"] * s,
+        STRIBECK_FORCE_SHARE * typical_scales["force"] * s,
+        STRIBECK_FORCE_SHARE * extra * typical_scales["force"] * s,
         speed,
     )
 
@@ -257,11 +265,13 @@ def draw_unmodelled_cause(
     joint = get_joint(setting.system, place)
     force = float(setting.motion_scales["force"][joint])
     if cause == "gust":
+        # Duration and begin of the gust, in s.
         duration = float(rng.uniform(0.1, 0.3) * setting.seconds)
         start = float(rng.uniform(0.1, 0.6) * setting.seconds)
         sign = float(rng.choice([-1.0, 1.0]))
         return lambda s: (2.0 * sign * force * s, start, duration)
     path = setting.base_motion.q[:, :, joint]
+    # Centre and half width of the region, in rad.
     centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
     half_width = float(np.ptp(path) * rng.uniform(0.08, 0.2))
     return lambda s: (2.0 * force * s, centre, half_width)

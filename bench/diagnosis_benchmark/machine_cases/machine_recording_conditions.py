@@ -180,7 +180,9 @@ def draw_conditions(
     noise = SensorNoise(
         dict.fromkeys(plant.channels, sigma),
         requested.noise or str(rng.choice(NOISE_KINDS)),
+        # Correlation of neighbouring samples, if the noise is autocorrelated.
         float(rng.uniform(0.3, 0.9)),
+        # Standard deviation of the dither, in rounding steps.
         float(rng.uniform(0.3, 0.6)),
         bool(rng.random() < 0.5),
     )
@@ -197,6 +199,7 @@ def _draw_servo_parameters(rng: np.random.Generator) -> dict[str, float]:
         constants, by name.
     """
     fitted_parameters = {
+        # In N m/A, Ohm and kg m².
         "torque_constant": float(rng.uniform(0.3, 0.8)),
         "resistance": float(rng.uniform(2.5, 6.0)),
         "armature": float(rng.uniform(1e-3, 6e-3)),
@@ -213,18 +216,21 @@ def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
     Returns:
         Parameters by name, SI units; see `machine_dynamics.ArmDynamics`.
     """
+    # Lengths of upper arm and forearm in m, and their masses in kg.
     length, outer = rng.uniform(0.25, 0.45), rng.uniform(0.2, 0.35)
     mass1, mass2 = rng.uniform(0.8, 2.0), rng.uniform(0.4, 1.0)
     numbers = {
         "mass1": mass1,
         "centre1": length * rng.uniform(0.4, 0.55),
         "inertia1": mass1 * length**2 * rng.uniform(0.08, 0.11),
+        # In N m s/rad, and the rotor's inertia in kg m².
         "damping1": rng.uniform(0.1, 0.4),
         "armature1": rng.uniform(0.005, 0.02),
         "length": length,
         "mass2": mass2,
         "centre2": outer * rng.uniform(0.4, 0.55),
         "inertia2": mass2 * outer**2 * rng.uniform(0.08, 0.11),
+        # In N m s/rad, and the rotor's inertia in kg m².
         "damping2": rng.uniform(0.03, 0.12),
         "armature2": rng.uniform(0.002, 0.01),
     }
@@ -256,6 +262,7 @@ def _draw_runs(
         ]
     )
     commands = np.moveaxis(signals, 1, 2)
+    # Angles in rad.
     initial_positions = rng.uniform(-0.4, 0.4, (count, joints))
     probe_positions = 0.4 * np.ones((1, joints))
     # Amplitude of the commands: rad for a servo, N m for an arm.
@@ -267,5 +274,6 @@ def _draw_runs(
         max_angles = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))
         if (max_angles <= MAX_JOINT_ANGLE).all():
             break
+        # The next motion aims at 70 % of the limit.
         commands = commands * np.minimum(1.0, 0.7 * MAX_JOINT_ANGLE / max_angles)[:, None, None]
     return runs

@@ -99,6 +99,7 @@ class DiagnoserReportData:
                 "low",
                 "high",
                 "points",
+                # The diagnosers are spread over 0.7 of a category.
                 (place - (count - 1) / 2) * 0.7 / count if is_shifted else 0.0,
             )
             for place, (name, line_style) in enumerate(self.get_line_styles())
@@ -208,6 +209,7 @@ def _make_board(data: DiagnoserReportData) -> list[Panel]:
         (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0),
         ends=(-0.15, 110.0),
     )
+    # A margin of 3 %, so that marks at 0 and 100 % are visible.
     y_axis = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
     series, percent = data.make_interval_series("share"), 100 * TARGET_FALSE_ALARM_RATE
     rules = (ReferenceLine(percent, f"{percent:g} %", "x"),)
