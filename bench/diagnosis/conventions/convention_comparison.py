@@ -211,6 +211,9 @@ class ConventionComparison:
             corrected: Recording with its conventions corrected.
             hypotheses: Differences of the conventions that were corrected.
         """
+        # The comparison with causes takes longest.
+        if not self._removes_missing_force(described, corrected):
+            return False
         parts = self._select_parts(corrected)
         with_conventions = _get_log_likelihood(
             self._filter_runs(parts)
@@ -224,8 +227,6 @@ class ConventionComparison:
             np.isinf(with_causes)
             and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE
         ):
-            return False
-        if not self._removes_missing_force(described, corrected):
             return False
         before, after = (
             _get_log_likelihood(self._filter_runs(recording))

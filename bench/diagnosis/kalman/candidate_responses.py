@@ -451,9 +451,19 @@ class FollowedRuns:
             tuple(probes), np.array(column_indices, dtype=np.intp), sizes, pushed, readings
         )
 
+    @property
+    def step_errors(self) -> Array:
+        """Errors (R, T - 1, Z) of the integrator's steps, composed over each interval."""
+        result = np.zeros_like(self.runs.defects)
+        for run, linear in enumerate(self.linear):
+            result[run, : len(linear.step_errors)] = linear.step_errors
+        # A step in which the model diverges gives no information on the next one.
+        result[~(np.abs(result) < MAX_MAGNITUDE)] = 0.0
+        return result
+
     def step_error_response(self) -> Array:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
-        step_errors = self.runs.step_errors[..., None].astype(np.float32)
+        step_errors = self.step_errors[..., None].astype(np.float32)
         no_readings = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
         response: Array = self._propagate_through_filter(step_errors, no_readings)[..., 0].astype(
             np.float64

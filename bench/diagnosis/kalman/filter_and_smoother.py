@@ -67,7 +67,7 @@ CONVERGENCE_TOLERANCE = 0.15
 """Maximum relative change of the standard deviations at which (7) has converged."""
 SMALLEST_FORCE = 1e-6
 """Minimum standard deviation of a missing force, as a share of the typical force."""
-STACKED = ("states", "defects", "forces", "inputs", "readings", "step_errors", "jumps")
+STACKED = ("states", "defects", "forces", "inputs", "readings", "jumps")
 """Arrays of the linear models of single runs that are stacked as they are."""
 
 
@@ -84,7 +84,6 @@ class LinearRuns:
         residuals: r (R, T, C), zero where nothing was recorded.
         recorded: (R, T, C) mask of recorded samples.
         prior: (Z,) standard deviations of the first states.
-        step_errors: (R, T - 1, Z) errors of the steps of the integrator.
         jumps: (R, T - 1, Z) standard deviations of further process noise of each state.
     """
 
@@ -96,7 +95,6 @@ class LinearRuns:
     residuals: Array
     recorded: Mask
     prior: Array
-    step_errors: Array
     jumps: Array
 
     def subset(self, chosen: IndexArray) -> LinearRuns:

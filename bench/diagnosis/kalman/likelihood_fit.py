@@ -229,4 +229,7 @@ def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> f
     size = DIFFERENCE_SHARE * min(plausible_high - plausible_low, high - low)
     if not size > 0:
         return 0.0
-    return size if followed.theta[index] + size <= high else -size
+    value = float(followed.theta[index])
+    # Dry friction above that of the file has another form, so the difference stays on one side.
+    is_up = value + size <= high and (value >= 0.0 or value - size < low)
+    return size if is_up else -size

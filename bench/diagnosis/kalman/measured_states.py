@@ -142,7 +142,6 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
         residuals=residuals,
         recorded=recorded,
         prior=prior,
-        step_errors=zeros,
         jumps=zeros,
     ).subset(np.repeat(joints, jerk_count))
     force = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)

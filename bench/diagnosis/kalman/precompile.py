@@ -23,7 +23,6 @@ def precompile() -> None:
         residuals=np.zeros((1, 2, 1)),
         recorded=np.ones((1, 2, 1), dtype=bool),
         prior=np.ones(2),
-        step_errors=np.zeros((1, 1, 2)),
         jumps=np.zeros((1, 1, 2)),
     )
     force, white = np.ones(1), np.ones(1)

@@ -289,7 +289,7 @@ class ModelFilters:
                 followed = followed.with_parameters(model.fit.theta, similar=followed)
             self._of_sets[names] = followed
             if self.numerics:
-                defects = followed.runs.defects - self.numerics * followed.runs.step_errors
+                defects = followed.runs.defects - self.numerics * followed.step_errors
                 followed = followed.refit_noise(replace(followed.runs, defects=defects))
             self._of_models[key] = followed
         return self._of_models[key]

@@ -559,7 +559,7 @@ def follow_linear_with_effects(
     """
     own_columns = [c for group in chosen for c in group.column_indices]
     runs = followed.runs
-    defects, residuals = runs.defects - numerics * runs.step_errors, runs.residuals
+    defects, residuals = runs.defects - numerics * followed.step_errors, runs.residuals
     if own_columns:
         pushed, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
         defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sims.core.simulator import Array
 from sims.robot.floating_joints import FloatingJoints
-from sims.robot.robot_model import Joint, RobotModel
+from sims.robot.robot_model import Joint, RobotModel, cache_per_robot
 
 
 class MotionForces(NamedTuple):
@@ -102,6 +102,7 @@ class JointScales(NamedTuple):
     inertia: Array
 
 
+@cache_per_robot
 def compute_joint_scales(robot: RobotModel) -> JointScales:
     """Compute typical forces and inertias over random poses within the joints' ranges.
 

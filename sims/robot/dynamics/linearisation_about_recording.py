@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.effect import ActiveEffects, members_of
+from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array, Scenario
 from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
 from sims.robot.dynamics.linearisation_about_simulation import (
@@ -48,6 +48,7 @@ from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.dynamics.tangent_propagation import Perturbation
 from sims.robot.floating_joints import FloatingState
 from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_simulator import RobotSimulator
 from sims.system_simulator import SystemSimulator
 
 SingleArray = NDArray[np.float32]
@@ -89,7 +90,6 @@ class IntervalMaps:
         inputs: (T - 1, Z, E + nu) responses to constant forces and controls.
         readings: H (T, C, Z).
         predicted: h(x̄) (T, C).
-        step_errors: (T - 1, Z) discretisation errors of the integrator.
         jumps: (T - 1, Z) standard deviations of state jumps at force limits of servos.
     """
 
@@ -99,7 +99,6 @@ class IntervalMaps:
     inputs: Array
     readings: Array
     predicted: Array
-    step_errors: Array
     jumps: Array
 
 
@@ -182,8 +181,12 @@ class MeasuredLinear(RunLinearisation):
         joints = trajectory.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
         x[:, :joints], v[:, :joints] = trajectory.x, trajectory.v
-        return self._add_transmission_loads(
-            replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
+        moved = replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
+        simulator, acting = self._simulator, self._work.acting
+        if self._reuses_loads and not any(e.of in LOAD_DEPENDENT_EFFECTS for e, _ in acting):
+            return moved
+        return replace(
+            moved, compute_loads=lambda: compute_transmission_loads(simulator, acting, moved)
         )
 
     def _get_nearby_motion(self) -> RobotMotion | None:
@@ -205,6 +208,7 @@ class MeasuredLinear(RunLinearisation):
         self._readings = dict(self._nearby._readings)
         return replace(
             motion,
+            compute_loads=lambda: motion.carried,
             **self._compute_command_fields(self._simulator.compute_controls(self._work, steps)),
         )
 
@@ -220,37 +224,6 @@ class MeasuredLinear(RunLinearisation):
         joints = len(self._simulator.addresses.positions)
         return Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
 
-    def _add_transmission_loads(self, motion: RobotMotion) -> RobotMotion:
-        """Return the motion with the loads of the transmissions, if any effect depends on them.
-
-        Only active effects count if the loads of another motion are reused.
-        """
-        available = (
-            [effect for effect, _ in self._work.acting]
-            if self._reuses_loads
-            else self._simulator.effects
-        )
-        effects = [m for effect in available for m in members_of(effect)]
-        if not any((e.of or e.name) in LOAD_DEPENDENT_EFFECTS for e in effects):
-            return motion
-        simulator = self._simulator
-        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
-        outputs = [
-            (name, int(c))
-            for name in TRANSMISSION_FORCE_FIELDS
-            for c in mujoco_batch.all_joints.velocities
-        ]
-        acting = self._work.acting
-        points = LinearisationPoints(
-            mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.all_joints
-        )
-        _, loads = points.compute_accelerations(acting)
-        joints = motion.x.shape[1]
-        carried = np.stack(
-            [loads[points.point_of_step, :joints], loads[points.point_of_step, joints:]]
-        )
-        return replace(motion, carried=carried)
-
     # -- the model from sample to sample
 
     def interval_maps(self) -> IntervalMaps:
@@ -265,21 +238,14 @@ class MeasuredLinear(RunLinearisation):
         forces = tangent.quotients.forces.shape[2]
         intervals = self.knots.size - 1
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            defects = self._tangent.defects
+            defects = self._compose(self._tangent.defects)
         states = np.tile(np.eye(state_size), (intervals, 1, 1))
-        defect = np.zeros((intervals, state_size))
         force = np.zeros((intervals, state_size, forces))
-        step_errors = np.zeros((intervals, state_size))
-        point_errors = self._estimate_step_errors()
         points, quotients = tangent.point_of_step, tangent.quotients
         for steps, active in self._list_active_intervals():
             a = quotients.states[points[steps]]
             states[active] = a @ states[active]
-            defect[active] = np.einsum("izy,iy->iz", a, defect[active]) + defects[steps]
             force[active] = a @ force[active] + quotients.forces[points[steps]]
-            step_errors[active] = (
-                np.einsum("izy,iy->iz", a, step_errors[active]) + point_errors[points[steps]]
-            )
         count = self._motion.x.shape[0]
         unit_changes = np.broadcast_to(
             STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
@@ -295,12 +261,11 @@ class MeasuredLinear(RunLinearisation):
         readings = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
         return IntervalMaps(
             states,
-            defect,
+            defects,
             force,
             self._input_responses,
             readings,
             self.observed,
-            step_errors,
             self._compute_limit_jumps(),
         )
 
@@ -316,13 +281,17 @@ class MeasuredLinear(RunLinearisation):
             Changes of d in (3), (T - 1, Z), and of h(x̄) in (4), (T, C).
         """
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            changes = self._tangent.defects - similar._tangent.defects
-        defects = np.zeros((self.knots.size - 1, self._tangent.state_size))
+            changes = self._tangent.compute_defect_changes(similar._tangent)
+        return self._compose(changes), self.observed - similar.observed
+
+    def _compose(self, values: Array) -> Array:
+        """Compose state changes (S, Z) in each step to those of each interval, (T - 1, Z)."""
+        result = np.zeros((self.knots.size - 1, self._tangent.state_size))
         points, states = self._tangent.point_of_step, self._tangent.quotients.states
         for steps, active in self._list_active_intervals():
-            ahead = np.einsum("izy,iy->iz", states[points[steps]], defects[active])
-            defects[active] = ahead + changes[steps]
-        return defects, self.observed - similar.observed
+            ahead = np.einsum("izy,iy->iz", states[points[steps]], result[active])
+            result[active] = ahead + values[steps]
+        return result
 
     def _compute_limit_jumps(self) -> Array:
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
@@ -342,13 +311,15 @@ class MeasuredLinear(RunLinearisation):
         result[:, position_count : 2 * position_count] = result[:, :position_count] / lengths
         return result
 
-    def _estimate_step_errors(self) -> Array:
-        """Return the discretisation errors (N, Z); zero for the fourth-order Runge-Kutta."""
+    @cached_property
+    def step_errors(self) -> Array:
+        """Discretisation errors (T - 1, Z) of each interval; zero for the Runge-Kutta method."""
         simulator, tangent = self._simulator, self._tangent
         if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
-            return np.zeros((tangent.point_count, tangent.state_size))
+            return np.zeros((self.knots.size - 1, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            return tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
+            errors = tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
+            return self._compose(errors[tangent.point_of_step])
 
     def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
         """Return the active intervals of the first step, then of the second, and so on.
@@ -517,6 +488,31 @@ class MeasuredLinear(RunLinearisation):
             motion.v[:, :joints] + deviations[:, size : size + joints],
             FloatingState(pose, rate),
         )
+
+
+def compute_transmission_loads(
+    simulator: RobotSimulator, acting: ActiveEffects, motion: RobotMotion
+) -> Array:
+    """Compute the loads (2, S, D) of the transmissions in a motion.
+
+    Args:
+        simulator: simulator of the robot.
+        acting: active effects.
+        motion: motion whose own loads are used only by effects with hidden states.
+    """
+    mujoco_batch = simulator.make_linearisation_batch(acting)
+    outputs = [
+        (name, int(c))
+        for name in TRANSMISSION_FORCE_FIELDS
+        for c in mujoco_batch.all_joints.velocities
+    ]
+    points = LinearisationPoints(
+        mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.all_joints
+    )
+    with np.errstate(all="ignore"), capture_mujoco_warnings():
+        _, loads = points.compute_accelerations(acting)
+    joints = motion.x.shape[1]
+    return np.stack([loads[points.point_of_step, :joints], loads[points.point_of_step, joints:]])
 
 
 def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:

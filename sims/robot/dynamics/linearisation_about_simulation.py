@@ -133,7 +133,7 @@ class RunLinearisation:
             x=np.concatenate([simulated.x[0], simulated.series[0][0]], axis=1),
             v=np.concatenate([simulated.v[0], simulated.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
-            carried=carried,
+            compute_loads=lambda: carried,
             floating_state=self._get_floating_states(simulated.fields),
             step=simulator.time_step,
             **self._compute_command_fields(inputs),

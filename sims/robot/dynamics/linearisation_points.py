@@ -6,7 +6,7 @@ accelerations, and effect forces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -54,7 +54,7 @@ class RobotMotion:
         instant: (S, nu) controls at the beginning of each step.
         forces: (S, nv) precomputed generalised forces.
         inputs: (S,) applied inputs by name.
-        carried: (2, S, D) forces on both sides of the transmissions.
+        compute_loads: computes the forces on both sides of the transmissions, (2, S, D).
         floating_state: (S + 1, P) poses and (S + 1, F) velocities of floating bodies.
         step: step length in seconds.
         off: (S, K) whether each actuator is switched off.
@@ -67,10 +67,15 @@ class RobotMotion:
     instant: Array
     forces: Array
     inputs: Mapping[str, Array]
-    carried: Array
+    compute_loads: Callable[[], Array]
     floating_state: FloatingState
     step: float
     off: Mask
+
+    @cached_property
+    def carried(self) -> Array:
+        """Forces (2, S, D) on both sides of the transmissions, which few effects need."""
+        return self.compute_loads()
 
     @property
     def velocities(self) -> Array:
@@ -136,6 +141,9 @@ class LinearisationPoints:
         self._bind_fields(mujoco_batch)
         self.placed_count = 0
         self._stepwise_effects = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
+        if self._stepwise_effects:
+            # The loads are computed with the same batch, so they must be known before it is used.
+            _ = motion.carried
         mujoco_batch.write_effects(_repeat_coefficients(acting, mujoco_batch.count))
         self._stiffness = mujoco_batch.get_servo_stiffness(joints)[:1]
         self._is_servo_on = find_working_servos(mujoco_batch.robot, joints.velocities, motion.off)
@@ -355,7 +363,6 @@ class LinearisationPoints:
         v = bind("qvel")[:n, joints.velocities]
         inputs = {name: u[steps][:, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * steps[:, None].astype(np.float64)
-        carried = motion.carried[:, steps]
         if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._stepwise_effects):
             # As in the simulation, a servo's force must follow the perturbed state.
             self._mujoco_batch.batch.forward(
@@ -364,6 +371,8 @@ class LinearisationPoints:
             carried = np.stack(
                 [bind(name)[:n, joints.velocities] for name in TRANSMISSION_FORCE_FIELDS]
             )
+        else:
+            carried = motion.carried[:, steps]
         snapshot = make_snapshot(
             self._system, t, x, v, inputs, carried, self.get_servo_stiffness(steps)
         )
@@ -418,10 +427,10 @@ class LinearisationPoints:
             self._mujoco_batch, self._reset_state = previous
 
     @contextmanager
-    def every_step(self) -> Iterator[None]:
-        """Evaluate every step, instead of the linearisation points only."""
+    def at_steps(self, steps: IndexArray) -> Iterator[None]:
+        """Evaluate other steps, instead of the linearisation points."""
         previous = self.point_steps
-        self.point_steps = np.arange(len(self.motion.controls))
+        self.point_steps = steps
         try:
             yield
         finally:

@@ -382,11 +382,6 @@ class TangentModel:
         return self._at.point_of_step
 
     @property
-    def point_count(self) -> int:
-        """Number N of linearisation points."""
-        return int(self._at.point_steps.size)
-
-    @property
     def hidden_state_effects(self) -> Sequence[int]:
         """Numbers of the effects with hidden states."""
         return self._at.hidden_state_effects
@@ -395,7 +390,7 @@ class TangentModel:
     def motion_readings(self) -> Array:
         """Readings (S, O) of the motion at the beginnings of steps, as computed by the model."""
         motion, points = self._motion, self._at.point_of_step
-        with self._at.every_step():
+        with self._at.at_steps(np.arange(self._steps)):
             _, read = self._at.compute_accelerations(self._at.acting)
         # A step applies the mean of a command, while a sensor shows its value at the beginning.
         difference = motion.instant - motion.controls
@@ -436,6 +431,24 @@ class TangentModel:
             result[:, -moves:] = motion.floating_state.rate[1:] - base[:, -moves:]
         return result
 
+    def compute_defect_changes(self, similar: TangentModel) -> Array:
+        """Compute how the defects (S, Z) differ from those of a model with other parameters.
+
+        One step in the middle of those that a linearisation point stands for represents them all,
+        unless commands differ too.
+
+        Args:
+            similar: model of the same motion.
+        """
+        if not np.array_equal(self._motion.controls, similar._motion.controls):
+            return self.defects - similar.defects
+        ends = np.append(self._at.point_steps[1:], self._steps)
+        middle = (self._at.point_steps + ends) // 2
+        with self._at.at_steps(middle):
+            states, _ = self._at.step_displaced({}, self._at.acting)
+        changes: Array = similar._every_step[0][middle] - states
+        return changes[self._at.point_of_step]
+
     @property
     def limited_forces(self) -> Array:
         """Forces (S, K) with limits at stiff servos, in each step."""
@@ -444,7 +457,7 @@ class TangentModel:
     @cached_property
     def _every_step(self) -> tuple[Array, Array]:
         """States (S, Z) after each step, and the limited forces (S, K)."""
-        with self._at.every_step(), self._at.limited_forces():
+        with self._at.at_steps(np.arange(self._steps)), self._at.limited_forces():
             return self._at.step_displaced({}, self._at.acting)
 
     def _interpolate_to_steps(self, values: Array) -> Array:

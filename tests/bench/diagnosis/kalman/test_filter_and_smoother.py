@@ -34,7 +34,6 @@ def runs_of(residuals, prior=(0.5, 0.8), with_jumps=False):
         residuals=residuals,
         recorded=np.isfinite(residuals),
         prior=np.array(prior),
-        step_errors=np.zeros((*shape, 2)),
         jumps=jumps if with_jumps else np.zeros_like(jumps),
     )
 

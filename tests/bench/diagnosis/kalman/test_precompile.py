@@ -40,7 +40,6 @@ def make_runs():
         residuals=rng.standard_normal((b, t, c)),
         recorded=rng.random((b, t, c)) < 0.9,
         prior=np.ones(z),
-        step_errors=np.zeros((b, t - 1, z)),
         jumps=np.full((b, t - 1, z), 0.01),
     )
 
