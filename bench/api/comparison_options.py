@@ -103,6 +103,12 @@ def apply_changes(
 ) -> Experiment:
     """Apply changes to an experiment; None leaves a field unchanged.
 
+    Args:
+        experiment: configuration of the experiment.
+        labels: tuners or diagnosers to compare.
+        seeds: number of seeds of each tuner.
+        changes: numbers of the experiment by name.
+
     Raises:
         InputError: A tuner or diagnoser does not exist.
     """
@@ -125,7 +131,13 @@ def apply_changes(
 def _choose_diagnosers(
     experiment: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
 ) -> Experiment:
-    """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
+    """Apply changes to a comparison of diagnosers, whose targets are benchmark cases.
+
+    Args:
+        experiment: configuration of the comparison.
+        labels: diagnosers to compare; None for all.
+        changes: numbers of the experiment by name; ``targets`` is the number of cases.
+    """
     from bench.core.plugin_registries import diagnosers
 
     sample = changes.get("targets")

@@ -444,7 +444,9 @@ def _make_notes(
 ) -> dict[str, str]:
     """Make the notes of the legend, by tuner: failed runs and coinciding curves.
 
-    `coinciding` are the notes on tuners whose curves lie on those of others; None for none.
+    Args:
+        view: the comparison.
+        coinciding: notes on tuners whose curves lie on those of others; None for none.
     """
     parts = (view.statistics.notes, coinciding or {})
     names = dict.fromkeys(name for part in parts for name in part)
@@ -471,7 +473,13 @@ def _make_panel(
 
 
 def _add_error_threshold(panel: Panel, view: ComparisonView, level: float) -> Panel:
-    """Add the error threshold to a panel's facets."""
+    """Add the error threshold to a panel's facets.
+
+    Args:
+        panel: the panel.
+        view: the comparison, with the unit of the thresholds.
+        level: the threshold.
+    """
     reached = f"{format_number(level)}{view.unit_of_levels}"
     return replace(panel, facets={**panel.facets, "error reached": reached})
 

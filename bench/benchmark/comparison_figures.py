@@ -99,6 +99,11 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 
     A direction is a combination of parameters; stiff ones are determined by the data, sloppy ones
     are not. The ranges of targets are drawn side by side.
+
+    Args:
+        axis: axes to draw on.
+        table: one row for each target and direction: standard error, and range of the target.
+        directions: number of directions.
     """
     ranges = list(dict.fromkeys(table["range"]))
     for range_index, (kind, (marker, colour)) in enumerate(
@@ -359,7 +364,14 @@ def format_threshold_caption(thresholds: Array) -> str:
 def _draw_reference_lines(
     axis: Axes, panel: Panel, reference: ReferenceResult, style: TunerStyles
 ) -> None:
-    """Draw each tuner's median of a reference, at the simulation counts of its table."""
+    """Draw each tuner's median of a reference, at the simulation counts of its table.
+
+    Args:
+        axis: axes to draw on.
+        panel: panel that the axes show, with its range and metric.
+        reference: results to draw.
+        style: line style of each tuner.
+    """
     conditions = panel.series[0].where
     for tuner in reference.tuners:
         curve = reference.get_curve(

@@ -122,7 +122,11 @@ def write_conclusion(view: ComparisonView) -> list[str]:
 def _conclude_range(view: ComparisonView, kind: str) -> str:
     """Write one sentence with the verdicts on all tuners of a range after all simulations.
 
-    `kind` is the range of the targets. Tuners that share the smallest error are not listed here.
+    Tuners that share the smallest error are not listed here.
+
+    Args:
+        view: the comparison.
+        kind: range of the targets.
     """
     rankings, title = headline.rank_at_checkpoints(view.statistics, kind), _format_title(view, kind)
     if not rankings:
@@ -184,8 +188,12 @@ def _format_running_times(results: ComparisonReportData, kind: str) -> str:
 def _format_running_time(view: ComparisonView, row: Mapping[Any, Any]) -> str:
     """Format the expected running time (ERT) of one tuner.
 
-    The text has its 95 % interval, the successful runs and the simulations of a training. `row` is
-    a row of the table of ERT; an interval without an upper limit ends with ∞.
+    The text has its 95 % interval, the successful runs and the simulations of a training. An
+    interval without an upper limit ends with ∞.
+
+    Args:
+        view: the comparison, with the costs of trainings.
+        row: row of the table of ERT.
     """
     high = format_number(row["high"]) if np.isfinite(row["high"]) else "∞"
     interval = f"95 % {format_number(row['low'])} to {high}"

@@ -136,7 +136,12 @@ def _render_figures(
 
 
 def _write_figures(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
-    """Write the figures to the folder ``figures``; return the paths of the PNG files."""
+    """Write the figures to the folder ``figures``; return the paths of the PNG files.
+
+    Args:
+        folder: result folder.
+        pictures: rendered figures by name.
+    """
     return [
         write_figure_files(
             folder / "figures" / comparison_figures.FIGURE_FILES[name], picture.png, picture.pdf
@@ -298,7 +303,9 @@ def _format_direction_errors(
 def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
     """Format the mean seconds per run of each tuner, of its simulations, and of its training.
 
-    `lines` are rows of table.csv; the values after all simulations are used.
+    Args:
+        lines: rows of table.csv; the values after all simulations are used.
+        statistics: statistics of the comparison, with the order of the tuners.
     """
     last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
     columns = {

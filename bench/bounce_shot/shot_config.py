@@ -254,6 +254,12 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
 def _convert_value(source: str, key: str, value: Any, declared: Any) -> Any:
     """Convert a value to the type of its field; numbers must not be negative.
 
+    Args:
+        source: beginning of error messages.
+        key: key of the entry.
+        value: its value.
+        declared: type of the field.
+
     Raises:
         InputError: the value has a wrong type or range.
     """

@@ -130,7 +130,12 @@ def _label_methods(axis: Axes, methods: Sequence[str]) -> None:
 
 
 def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
-    """Draw the legend of the groups that occur, below the figure."""
+    """Draw the legend of the groups that occur, below the figure.
+
+    Args:
+        figure: the figure.
+        methods: labels of the methods that are drawn.
+    """
     from matplotlib.lines import Line2D
 
     present_groups = {get_method_group(method) for method in methods}

@@ -362,7 +362,13 @@ class _ShotStages:
     def _execute_and_store(
         self, index: int, models: list[dict[str, Any]], visible_share: float
     ) -> None:
-        """Execute a shot in the true world with every model, and store the result."""
+        """Execute a shot in the true world with every model, and store the result.
+
+        Args:
+            index: index of the shot among the missing ones.
+            models: fitted model of each method.
+            visible_share: share of the frames in which the ball was detected.
+        """
         store_shot(
             self._study.folder, self._missing_shots[index], self._settings, models, visible_share
         )

@@ -137,7 +137,12 @@ def _describe_channels(channels: Iterable[Any]) -> list[JsonDocument]:
 
 
 def _pick(part: Any, *names: str) -> JsonDocument:
-    """Return some attributes of an object by name."""
+    """Return some attributes of an object by name.
+
+    Args:
+        part: the object.
+        *names: names of its attributes.
+    """
     return {name: getattr(part, name) for name in names}
 
 

@@ -65,7 +65,12 @@ def collect_options(values: argparse.Namespace, options: type) -> dict[str, Any]
 
 
 def add_recordings_argument(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add the positional argument of one or more recordings; `text` is its help."""
+    """Add the positional argument of one or more recordings.
+
+    Args:
+        parser: parser of the command.
+        text: help text.
+    """
     parser.add_argument(
         "recordings", metavar="RECORDING.csv", type=parse_path, nargs="+", help=text
     )
@@ -110,7 +115,12 @@ def add_plugin_option(parser: argparse.ArgumentParser, parts: str) -> None:
 
 
 def add_model_option(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add the option ``--model FILE``; `text` is its help."""
+    """Add the option ``--model FILE``.
+
+    Args:
+        parser: parser of the command.
+        text: help text.
+    """
     parser.add_argument("--model", type=parse_path, metavar="FILE", help=text)
 
 

@@ -179,7 +179,13 @@ class _Run(NamedTuple):
 
 @cache
 def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
-    """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
+    """Run a diagnoser; the result is cached for several checks.
+
+    Args:
+        kind: class of the diagnoser.
+        hidden: whether the recording has a hidden cause.
+        turn: number of the run; another number repeats it.
+    """
     with _open_case(kind, hidden) as case:
         files_before, random_state_error = _copy_case_bytes(case), ""
         answers: list[Answer] = []

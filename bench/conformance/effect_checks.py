@@ -68,6 +68,10 @@ def _make_simulator_with_effect(
 
     It uses the batch engine, or its own engine if it is a user-defined simulator.
 
+    Args:
+        host: simulator class.
+        effect: class of the effect.
+
     Raises:
         CheckError: another effect has the same name.
     """

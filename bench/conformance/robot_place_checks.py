@@ -283,7 +283,13 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
 
 
 def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[object, ...]:
-    """Return the model fields that an effect changes on the joint in series with its own joint."""
+    """Return the model fields that an effect changes on the joint in series with its own joint.
+
+    Args:
+        effect: effect at a joint.
+        c: its coefficients; all zero if it is off.
+        kind: simulator class of the robot.
+    """
     from sims.robot.dynamics import series_joints
 
     if not c.any():

@@ -348,7 +348,13 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
 
 
 def _describe_first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
-    """Describe where two observations (n, T, C) first differ in time."""
+    """Describe where two observations (n, T, C) first differ in time.
+
+    Args:
+        kind: class of the simulator, with the names of its channels.
+        expected: (n, T, C) expected observations.
+        observations: (n, T, C) observations that were found.
+    """
     if expected.shape != observations.shape:
         return f"shape {observations.shape} in place of {expected.shape}"
     is_different = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))

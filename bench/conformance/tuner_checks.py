@@ -397,6 +397,10 @@ def _compute_final_log_errors(subjects: tuple[Tuner, ...], target: int) -> Array
 
     Each runs on the toy problem with 2 parameters and 30 simulations. The error is the mean
     absolute error of the recommendation, at least 1e-12, so that its logarithm is finite.
+
+    Args:
+        subjects: the tuners.
+        target: number of the target, which is also the seed.
     """
     _, truth = make_task(2, 30, target)
     traces = [run_tuner(tuner, 2, 30, seed=target, target=target) for tuner in subjects]

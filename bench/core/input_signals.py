@@ -151,6 +151,11 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
 
     The limits on the numbers prevent values that overflow, and signals that change too often.
 
+    Args:
+        text: form and numbers of the signal.
+        times: (T,) times, s.
+        rng: random numbers of forms with random phases.
+
     Raises:
         InputError: the text is not a known form with valid numbers.
     """

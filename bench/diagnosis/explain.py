@@ -205,7 +205,12 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
 
 
 def _rate_model(search: EffectSearch, model: FittedModel) -> tuple[float, float]:
-    """Return the penalised log-likelihood and the excess RMS residual of a fitted model."""
+    """Return the penalised log-likelihood and the excess RMS residual of a fitted model.
+
+    Args:
+        search: search with the noise that defines the excess.
+        model: the fitted model.
+    """
     return model.penalised_log_likelihood, search.compute_excess_residual(model)
 
 
@@ -380,6 +385,10 @@ class _ExplainRun:
         """Build a run evaluator of some runs that shares the search control and the worker pool.
 
         It also has the widened bounds and the identified parameters of the base model found so far.
+
+        Args:
+            kind: class of the simulator.
+            runs: the runs.
         """
         evaluator = RunEvaluator(
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
@@ -1188,6 +1197,10 @@ class _ExplainRun:
     ) -> tuple[float, float]:
         """Fit all subsets of a finding's effects with the present step, and rate the best model.
 
+        Args:
+            search: search with another step, whose fixed parameters stay fixed.
+            finding: its result.
+
         Returns:
             Penalised log-likelihood and excess RMS residual of the best model.
         """
@@ -1226,7 +1239,12 @@ class _ExplainRun:
         return nearby
 
     def _predict_with_file_step(self, base: BaseFit, validation: Validation | None) -> Array | None:
-        """Predict the held-out runs with the file's own step; None without validation."""
+        """Predict the held-out runs with the file's own step; None without validation.
+
+        Args:
+            base: fit of the base model with the file's own step.
+            validation: validation with this step; None without held-out runs.
+        """
         if validation is None:
             return None
         return validation.validate([base.fit])[0].simulated

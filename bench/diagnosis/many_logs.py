@@ -158,7 +158,12 @@ def _read_held_out_errors(folder: Path) -> dict[str, float]:
 
 
 def _convert_to_noise_floors(error: Mapping[str, float], key: str) -> float | None:
-    """Convert a held-out error to noise floors."""
+    """Convert a held-out error to noise floors.
+
+    Args:
+        error: held-out errors in the unit of the channel, and ``noise_floor``, by name.
+        key: name of the error.
+    """
     value, floor = error.get(key), error.get("noise_floor")
     return value / floor if value is not None and floor else None
 

@@ -253,7 +253,12 @@ def _make_log_axis(logs: pd.DataFrame) -> Axis:
 
 
 def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
-    """Make a panel for each number of a cause, the most common first."""
+    """Make a panel for each number of a cause, the most common first.
+
+    Args:
+        numbers: one row for each coefficient of a cause of a log.
+        across: horizontal axis with the logs.
+    """
     panels = []
     for label_with_cause in dict.fromkeys(numbers["what"].astype(str)):
         name, _, label = label_with_cause.rpartition(": ")
@@ -319,7 +324,15 @@ def _make_printed_figure(
     alternative: str,
     caption: str,
 ) -> PrintedFigure | None:
-    """Render the printed version of a chart; None without panels."""
+    """Render the printed version of a chart; None without panels.
+
+    Args:
+        panels: panels of the chart.
+        tables: their tables by name.
+        name: name of the figure's file.
+        alternative: text for readers who cannot see the figure.
+        caption: text below the figure.
+    """
     if not panels:
         return None
     files = figure_output.render_all_formats(draw_summary_figure(panels, tables, caption))

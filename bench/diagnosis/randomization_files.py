@@ -377,7 +377,12 @@ def _build_body_term(
 
 
 def _format_asset(key: str, name: str) -> str:
-    """Format the asset with one joint or body; Isaac Lab reads names as regular expressions."""
+    """Format the asset with one joint or body; Isaac Lab reads names as regular expressions.
+
+    Args:
+        key: kind of the name in Isaac Lab, such as ``joint_names``.
+        name: name of the joint or body.
+    """
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 

@@ -165,7 +165,12 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
 
 
 def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
-    """Return why a number has no range; empty if it has one."""
+    """Return why a number has no range; empty if it has one.
+
+    Args:
+        number: fitted value of the coefficient.
+        entry: the coefficient and its cause.
+    """
     from sims.robot.fitted_causes import is_gravity_compensated
 
     name = entry.cause.name
@@ -238,6 +243,12 @@ def _convert_to_range(
     """Convert the interval of a fitted coefficient to a range of the number in the model file.
 
     Its operation says whether a simulator sets, adds or multiplies with the random value.
+
+    Args:
+        robot: model of the robot.
+        totals: numbers of the model file with all effects applied.
+        number: index of the cause in `totals`.
+        entry: the coefficient and its cause.
     """
     from sims.robot.model_field_effects import model_fields, operation_of
 

@@ -167,7 +167,12 @@ def _find_lasting_stretches(mask: Mask) -> Mask:
 
 
 def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
-    """Return the mask (R, T) of the samples around each minimum of the simulated height."""
+    """Return the mask (R, T) of the samples around each minimum of the simulated height.
+
+    Args:
+        evaluator: the runs of a ball.
+        simulated: (R, T, C) simulated channels.
+    """
     name = evaluator.simulator.system.coordinates[-1]
     mask = np.zeros(simulated.shape[:2], dtype=bool)
     if name not in evaluator.channels:
@@ -317,7 +322,12 @@ def _compute_run_times(evaluator: RunEvaluator) -> Array:
 def _iterate_inputs(
     evaluator: RunEvaluator, names: Collection[str]
 ) -> Iterator[tuple[str, str, Array]]:
-    """Yield name, unit and values (R, T) of the recorded inputs with these names."""
+    """Yield name, unit and values (R, T) of the recorded inputs with these names.
+
+    Args:
+        evaluator: the runs.
+        names: names of the inputs.
+    """
     for channel in evaluator.kind.inputs:
         values = np.full(evaluator.observed.shape[:2], np.nan)
         for r, run_data in enumerate(evaluator.prepared_runs):
@@ -334,6 +344,11 @@ def _iterate_joint_variables(
     """Yield the variables for residual profiles of a joint's channel: name, unit and values (R, T).
 
     The velocity has its sign, because friction acts against it.
+
+    Args:
+        evaluator: the runs of a robot.
+        simulated: (R, T, C) simulated channels.
+        channel: name of the channel, such as ``q.elbow``.
     """
     times = _compute_run_times(evaluator)
     yield "time", "s", times

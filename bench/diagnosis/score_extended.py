@@ -142,14 +142,29 @@ def _load_robot(
 def _get_system_name(
     recording: Path | Recording, model_reference: ModelFileReference | None
 ) -> str:
-    """Return the system of a recording: the name of a robot's model file, or of a system."""
+    """Return the system of a recording: the name of a robot's model file, or of a system.
+
+    Args:
+        recording: the recording, or the path of its description.
+        model_reference: model file of a robot; None for a system.
+    """
     if model_reference is not None:
         return model_reference.path.name
     return recording.system if isinstance(recording, Recording) else read_system_name(recording)
 
 
 def _check_system(recording: Path, system: str, extended: ExtendedSimulator, model: Path) -> None:
-    """Refuse a recording of another system."""
+    """Refuse a recording of another system.
+
+    Args:
+        recording: path of the recording, for messages.
+        system: name of its system.
+        extended: the extended simulator.
+        model: path of its file, for messages.
+
+    Raises:
+        InputError: the recording is of another system.
+    """
     if system not in (extended.system, extended.name):
         raise InputError(
             f"{recording}: expected a recording of {extended.system}, as {model} is; "

@@ -341,8 +341,11 @@ class VerdictBuilder:
         """Build a cause of the verdict from an effect found by the search.
 
         Its description names the soft form of dry friction (MuJoCo's `frictionloss`) with the
-        solver parameters if the friction has it. `numbers` has the fitted values by their index in
-        the parameter vector.
+        solver parameters if the friction has it.
+
+        Args:
+            evidence: the effect and its evidence.
+            numbers: fitted values by their index in the parameter vector.
         """
         evaluator = self.fitting_evaluator
         # The coefficients of an effect are contiguous in the parameter vector, in the effect's
@@ -521,6 +524,10 @@ class VerdictBuilder:
 
         If the base model is not identifiable, the run should identify its parameters. Return None
         if nothing is open, or if the search was stopped early.
+
+        Args:
+            search: the search, with all fitted models.
+            finding: result of the diagnosis.
         """
         if finding.early_stop is not None:
             return None
@@ -537,7 +544,13 @@ class VerdictBuilder:
 
 
 def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]) -> float:
-    """Compute the RMS error over the channels that count, in their unit."""
+    """Compute the RMS error over the channels that count, in their unit.
+
+    Args:
+        evaluator: the runs.
+        simulated: (R, T, C) simulated channels.
+        channels: indices of the channels that count.
+    """
     observed_mask = np.isfinite(evaluator.observed)[..., channels]
     error = (evaluator.observed - simulated)[..., channels][observed_mask]
     return float(np.sqrt(np.square(error).mean()))
@@ -554,7 +567,12 @@ def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun
 
 
 def _build_held_out_result(gain: HeldOutGain, unit: str) -> HeldOutResult:
-    """Convert a gain to the form of the verdict; an interval that the data do not give is None."""
+    """Convert a gain to the form of the verdict; an interval that the data do not give is None.
+
+    Args:
+        gain: errors before and after, and the share of the gap closed.
+        unit: unit of the errors.
+    """
     return HeldOutResult(
         to_finite_or_none(gain.base),
         to_finite_or_none(gain.extended),

@@ -274,6 +274,10 @@ def _iterate_combinations(
 def _list_hidden_effects(request: CaseRequest, system: str) -> list[str | None]:
     """List the effects that cases of one system hide; None stands for an effect that is drawn.
 
+    Args:
+        request: kind and number of cases, and effects that are named.
+        system: name of the system.
+
     Raises:
         InputError: an effect is unknown, or effects are named for clean or double cases.
     """

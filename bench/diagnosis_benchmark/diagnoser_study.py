@@ -429,6 +429,11 @@ def _make_failed_answers(
 ) -> dict[str, Any]:
     """Make failed answers for a case whose worker died or exceeded its time limit.
 
+    Args:
+        question: the case.
+        labels: labels of the diagnosers.
+        error: error of the worker.
+
     Raises:
         InputError: the worker failed with this error.
     """

@@ -77,7 +77,12 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
 
 
 def _compute_share(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:
-    """Compute the fraction of successes with its 95 % interval; see `compute_share`."""
+    """Compute the fraction of successes with its 95 % interval; see `compute_share`.
+
+    Args:
+        successes: whether each case is a success.
+        is_exact: whether the interval is exact (Clopper-Pearson) and not Wilson's.
+    """
     return compute_share(int(successes.sum()), len(successes), is_exact)
 
 

@@ -149,6 +149,10 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
     """Choose azimuth and elevation of the camera, in degrees.
 
     A planar robot is viewed along its common axis; another one from where its joints look widest.
+
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
     """
     normal = _find_motion_plane_normal(robot, data)
     if normal is not None and abs(normal[2]) > 1 - PARALLEL_SINE_TOLERANCE:
@@ -176,7 +180,12 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
 
 
 def _find_motion_plane_normal(robot: RobotModel, data: Any) -> Array | None:
-    """Return (3,) the normal of the plane in which a planar robot moves; None for others."""
+    """Return (3,) the normal of the plane in which a planar robot moves; None for others.
+
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+    """
     if not all(joint.has_one_coordinate for joint in robot.joints):
         return None
     hinges = [data.xaxis[j.id] for j in robot.joints if j.kind == "hinge"]

@@ -80,7 +80,12 @@ def _make_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def render_png(figure: Figure, dpi: int = DPI) -> bytes:
-    """Render a figure as the bytes of a PNG file."""
+    """Render a figure as the bytes of a PNG file.
+
+    Args:
+        figure: the figure.
+        dpi: resolution in pixels per inch.
+    """
     file = _Pixels()
     figure.savefig(file, format="rgba", dpi=dpi)
     return encode_png(file.getbuffer(), *file.shape, dpi=dpi)
@@ -128,6 +133,10 @@ def render_svg(figure: Figure) -> bytes:
 def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
     """Render a figure as PNG, and as PDF if requested (`bench.figures.figure_settings`).
 
+    Args:
+        figure: the figure.
+        dpi: resolution of the PNG in pixels per inch.
+
     Returns:
         The bytes of the PNG file, and those of the PDF file or None.
     """
@@ -136,7 +145,12 @@ def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | N
 
 
 def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
-    """Render a figure as PNG, as SVG for a page, and as PDF if requested."""
+    """Render a figure as PNG, as SVG for a page, and as PDF if requested.
+
+    Args:
+        figure: the figure.
+        dpi: resolution of the PNG in pixels per inch.
+    """
     with _lay_out_once(figure, dpi):
         return FigureFiles(
             render_png(figure, dpi), render_svg(figure), _render_pdf_if_wanted(figure)
@@ -157,7 +171,12 @@ def _render_pdf_if_wanted(figure: Figure) -> bytes | None:
 
 @contextmanager
 def _lay_out_once(figure: Figure, dpi: int) -> Iterator[None]:
-    """Compute the layout of a figure once for all files that are written in the `with` block."""
+    """Compute the layout of a figure once for all files that are written in the `with` block.
+
+    Args:
+        figure: the figure.
+        dpi: resolution for which text is measured, in pixels per inch.
+    """
     engine, screen = figure.get_layout_engine(), figure.dpi
     try:
         if engine is not None:

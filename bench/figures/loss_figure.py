@@ -69,7 +69,13 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
 
 
 def _draw_losses(axis: Axes, values: Array, has_labels: bool) -> None:
-    """Draw one training; `values` are (3, epochs): epoch, training loss, held-out loss."""
+    """Draw the losses of one training.
+
+    Args:
+        axis: axes to draw on.
+        values: (3, epochs) epoch, training loss, and held-out loss.
+        has_labels: whether the lines have entries in the legend.
+    """
     epochs, training, held_out = values
     for losses, line, colour, name in (
         (training, "-", BLUE, "training"),

@@ -71,8 +71,13 @@ def render_robot(model: Any, positions: Array, view: Projection) -> Image | None
 def _render_in_child(backend: str, model: Any, positions: Array, view: Projection) -> Image | None:
     """Render a robot in a child process with one OpenGL backend; return None if that fails.
 
-    A missing graphics driver may crash a process, so it must not be this one. `positions` is
-    MuJoCo's qpos.
+    A missing graphics driver may crash a process, so it must not be this one.
+
+    Args:
+        backend: value of ``MUJOCO_GL``; empty for MuJoCo's own choice.
+        model: compiled model.
+        positions: (nq,) pose, MuJoCo's qpos.
+        view: camera.
     """
     import mujoco
 
@@ -117,7 +122,14 @@ def render_requested(folder: str) -> None:
 
 
 def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
-    """Render the robot by MuJoCo in grey on a white background, in parallel projection."""
+    """Render the robot by MuJoCo in grey on a white background, in parallel projection.
+
+    Args:
+        mujoco: the module.
+        model: compiled model.
+        data: its state at the pose.
+        view: camera.
+    """
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
     rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
     global_options = model.vis.global_

@@ -122,6 +122,11 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
     """Draw one signal of one run at its position on the common time axis.
 
     Missing samples are marked at the foot; a held-out run is shaded.
+
+    Args:
+        axis: axes to draw on.
+        part: the run, with its place on the time axis.
+        values: (T,) signal, NaN where missing.
     """
     times = part.times
     if part.run.held_out:
@@ -166,7 +171,9 @@ def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
 def _style_panels(axes: Sequence[Axes], placed_runs: Sequence[_PlacedRun]) -> None:
     """Style the panels, and mark with dotted lines where each run after the first begins.
 
-    `axes` has the panels from top to bottom; the last one gets the label of the time axis.
+    Args:
+        axes: panels from top to bottom; the last one gets the label of the time axis.
+        placed_runs: the runs, with their places on the time axis.
     """
     for axis in axes:
         axis.grid(visible=True, axis="y", linewidth=0.4, alpha=0.5)
@@ -269,7 +276,12 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
 
 
 def _draw_scene(axis: Axes, track: BallTrack) -> None:
-    """Draw the track on the background with some outlines, on white for dark scenes."""
+    """Draw the track on the background with some outlines, on white for dark scenes.
+
+    Args:
+        axis: axes to draw on.
+        track: the tracked ball, with the background.
+    """
     from matplotlib.patches import Circle
 
     axis.imshow(_overlay_balls(track), interpolation="nearest")
@@ -284,10 +296,14 @@ def _draw_scene(axis: Axes, track: BallTrack) -> None:
 
 
 def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: str) -> None:
-    """Draw a quantity of the ball (T,) over time, with marks where the ball was not detected.
+    """Draw a quantity of the ball over time, with marks where the ball was not detected.
 
-    `part` selects the recorded frames, which have a grey background. The marks are at 2 % of the
-    height of the panel.
+    Args:
+        axis: axes to draw on.
+        track: the tracked ball.
+        part: recorded frames, which have a grey background.
+        values: (T,) quantity.
+        label: label of the vertical axis.
     """
     times, is_missing = track.times, ~np.isfinite(track.u)
     axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)

@@ -88,7 +88,13 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
 
 
 def _find_link_start(model: Any, data: Any, body: int) -> Array:
-    """Return (3,) the anchor of a body's first joint, or the body's origin without a joint."""
+    """Return (3,) the anchor of a body's first joint, or the body's origin without a joint.
+
+    Args:
+        model: compiled model (`mujoco.MjModel`).
+        data: its state at the pose (`mujoco.MjData`).
+        body: number of the body.
+    """
     first = int(model.body_jntadr[body])
     return np.array(data.xanchor[first] if first >= 0 else data.xpos[body])
 
@@ -98,6 +104,12 @@ def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
 
     It is the point of its shapes that is furthest from the joint; without shapes, the joint
     mirrored at the centre of mass.
+
+    Args:
+        model: compiled model (`mujoco.MjModel`).
+        data: its state at the pose (`mujoco.MjData`).
+        body: number of the body.
+        start: (3,) anchor of its first joint, m.
     """
     points = [2 * data.xipos[body] - start]
     for g in range(model.ngeom):
@@ -329,7 +341,11 @@ def _make_labels(
 ) -> list[_Label]:
     """Make a label for each marked place, and for the other joints if the robot has few.
 
-    `data` is the mujoco.MjData of the pose, from which places are located.
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`), from which places are located.
+        projection: camera.
+        marks: places that the verdict names.
     """
     lines_by_place: dict[tuple[str, str], list[str]] = {}
     for mark in marks:
@@ -453,7 +469,15 @@ def _draw_label_column(
 def _draw_place_rings(
     axis: Axes, robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> None:
-    """Draw a ring around each diagnosed place: dashed if the data allow other places as well."""
+    """Draw a ring around each diagnosed place: dashed if the data allow other places as well.
+
+    Args:
+        axis: axes to draw on.
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+        projection: camera.
+        marks: the places.
+    """
     certainty: dict[tuple[str, str], bool] = {}
     for mark in marks:
         key = mark.kind, mark.name
@@ -482,7 +506,11 @@ def _draw_place_rings(
 def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: float) -> None:
     """Draw a scale bar with a round length below the drawing.
 
-    `scale` is in inches per metre, `tall` the height of the drawing in inches.
+    Args:
+        axis: axes to draw on.
+        projection: camera, with the displayed width in metres.
+        scale: inches per metre.
+        tall: height of the drawing in inches.
     """
     # The bar is at most 0.3 of the picture's width.
     length = round_down_length(0.3 * projection.width)

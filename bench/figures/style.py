@@ -287,7 +287,12 @@ def make_panel_grid(
 
 
 def set_title(axis: Axes, title: str) -> None:
-    """Set a title above a panel that has no ticks there."""
+    """Set a title above a panel that has no ticks there.
+
+    Args:
+        axis: axes of the panel.
+        title: the title.
+    """
     # Without a fixed position, every drawing measures all ticks for the title.
     axis.set_title(title, fontsize=10, y=1.0)
 
@@ -353,7 +358,13 @@ _MAX_LEGEND_ROWS = 18
 def _make_reference_entries(
     axes: list[Axes], style: TunerStyles, reference: ReferenceResult
 ) -> list[tuple[Line2D, str]]:
-    """Make the legend entries of reference results: a heading, and each tuner that is drawn."""
+    """Make the legend entries of reference results: a heading, and each tuner that is drawn.
+
+    Args:
+        axes: all panels.
+        style: line style of each tuner.
+        reference: the reference results.
+    """
     from matplotlib.lines import Line2D
 
     line_ids = {line.get_gid() for axis in axes for line in axis.get_lines()}
@@ -375,7 +386,12 @@ def _format_reference_caption(reference: ReferenceResult, experiment: Experiment
 
 
 def make_reference_id(reference: ReferenceResult, tuner: str) -> str:
-    """Return the identifier of a reference's line in a figure."""
+    """Return the identifier of a reference's line in a figure.
+
+    Args:
+        reference: the reference results.
+        tuner: label of the tuner.
+    """
     return f"behind {reference.name} {tuner}"
 
 
@@ -392,7 +408,12 @@ TRUSTED_TUNERS_NOTE = (
 
 
 def add_trust_note(figure: Figure, trusted: bool) -> Figure:
-    """Mark a figure in its title and caption if its tuners were not isolated, and return it."""
+    """Mark a figure in its title and caption if its tuners were not isolated, and return it.
+
+    Args:
+        figure: the figure.
+        trusted: whether the tuners ran without isolation.
+    """
     if trusted:
         figure.suptitle(f"{figure.get_suptitle()} (trusted)", fontsize=11)
         add_caption(

@@ -179,7 +179,9 @@ def _smooth_radius(track: BallTrack) -> Array:
 def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     """Divide the motion of the ball at its bounces, and fit a parabola to each free flight.
 
-    `q` (T,) is the position downwards, in ball radii; NaN where the ball was not detected.
+    Args:
+        times: (T,) times of the frames, s.
+        q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
     """
     visible_frames = np.flatnonzero(np.isfinite(q))
     last = len(visible_frames) - 1
@@ -219,6 +221,11 @@ def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -
     """Return the position q, in ball radii, at which the ball touches the ground.
 
     It is where two successive flights meet, or the lowest position if there is only one flight.
+
+    Args:
+        track: the tracked ball, with the times of the frames.
+        q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
+        arcs: fitted flights in order.
     """
     crossings = []
     for earlier_arc, later_arc in pairwise(arcs):

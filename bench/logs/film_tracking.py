@@ -144,7 +144,13 @@ def track_film(
 def _estimate_height_noise(
     track: BallTrack, heights: ball_heights.BallHeights, part: slice
 ) -> float:
-    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights."""
+    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights.
+
+    Args:
+        track: the tracked ball, with the times of the frames.
+        heights: heights of the ball, m.
+        part: frames that are recorded.
+    """
     z = heights.z[part]
     noise = float(
         np.nanmax(

@@ -101,6 +101,12 @@ def _refuse_other(
 ) -> None:
     """Reject a recording that cannot be joined with the first one.
 
+    Args:
+        first: the first recording.
+        kind: its simulator class.
+        other: the other recording.
+        other_kind: its simulator class.
+
     Raises:
         InputError: System, model file, channels or inputs of the recordings differ.
     """

@@ -92,10 +92,12 @@ def get_simulator_class(
 ) -> type[Simulator]:
     """Find the simulator of the system or robot of a recording.
 
-    The arguments are those of `load_recording`.
-
-    Raises:
-        InputError: A system and a model file are both given, or the system is unknown.
+    Args:
+        source: The recording, or its path.
+        system: Registered system to use instead of the one that the recording names.
+        model: Model file of a robot to use instead of the one that the recording names.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
     """
     if system is not None and model is not None:
         raise InputError("expected a system or a model file, found both; leave one out")
@@ -294,6 +296,10 @@ def read_frame_recording(
 
 def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
     """Return the simulator class of the system or robot model that a description names.
+
+    Args:
+        name: path of the description, or name of a data frame, for messages.
+        meta: content of the description.
 
     Raises:
         InputError: It names neither, or an unknown system.

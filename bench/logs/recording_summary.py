@@ -107,6 +107,10 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
 
     `role` is the kind of the signal. The stated noise is "-" for a channel whose noise is not
     stated; steps are quantisation steps.
+
+    Args:
+        recording: the recording.
+        kind: simulator class, which declares the signals.
     """
     for channel, role in list_recorded_signals(recording, kind):
         statistics = compute_signal_statistics(recording, channel, role)
@@ -178,7 +182,12 @@ def _format_count(number: int, noun: str) -> str:
 
 
 def _align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> Iterator[str]:
-    """Align a table as text, with the first `left_columns` columns left-justified."""
+    """Align a table as text, with the first `left_columns` columns left-justified.
+
+    Args:
+        rows: cells of the table.
+        left_columns: number of columns that are left-justified.
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = zip(row, widths, strict=True)

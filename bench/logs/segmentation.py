@@ -155,7 +155,13 @@ def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
 
 
 def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
-    """Return the beginning of a run, the only part with a known pose of floating bodies."""
+    """Return the beginning of a run, the only part with a known pose of floating bodies.
+
+    Args:
+        run: the run.
+        seconds: length of the beginning.
+        _: unused.
+    """
     end = int(np.searchsorted(run.times, run.times[0] + seconds - ROUNDING_SECONDS))
     return [
         run.part(

@@ -288,12 +288,12 @@ class _RecordingSimulation:
     def _simulate_run(self, number: int, scenario: Scenario) -> Run:
         """Simulate a run, and add white Gaussian noise to each channel.
 
-        `number` counts runs from 1; the last ones are held out for validation. The true initial
-        states are left out, because a diagnosis has to estimate them; only the pose of a floating
-        body is given.
+        The true initial states are left out, because a diagnosis has to estimate them; only the
+        pose of a floating body is given.
 
-        Raises:
-            InputError: The simulation has values that are not finite.
+        Args:
+            number: number of the run from 1; the last ones are held out for validation.
+            scenario: times, inputs and initial states of the run.
         """
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
         if not np.isfinite(observed).all():
@@ -378,7 +378,12 @@ def _count_samples(options: SimulationSpec) -> int:
 
 
 def _make_sample_times(samples: int, rate: float) -> Array:
-    """Return the sample times (T,) of a run in seconds, from zero."""
+    """Return the sample times (T,) of a run in seconds, from zero.
+
+    Args:
+        samples: number T of samples.
+        rate: sampling rate in Hz.
+    """
     # Round as in the table, so that the times read back are the times simulated.
     return np.array([float(f"{t:.{_TABLE_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 
@@ -386,7 +391,15 @@ def _make_sample_times(samples: int, rate: float) -> Array:
 def _make_parameters(
     values: Mapping[str, float] | Sequence[float], kind: type[Simulator]
 ) -> dict[str, float]:
-    """Return every parameter's value by name, in the simulator's order."""
+    """Return every parameter's value by name, in the simulator's order.
+
+    Args:
+        values: values by name, or all in order.
+        kind: simulator class, which declares the parameters.
+
+    Raises:
+        InputError: there are too few or too many values, or a name is unknown.
+    """
     names = [p.name for p in kind.parameters]
     if not isinstance(values, Mapping):
         if len(values) != len(names):

@@ -204,7 +204,14 @@ def _draw_series(
 
 
 def _format_axis(axis: Axes, spec: Axis, which: str, reverse: bool = False) -> None:
-    """Set label, scale, ticks and limits of one axis of a panel."""
+    """Set label, scale, ticks and limits of one axis of a panel.
+
+    Args:
+        axis: axes of the panel.
+        spec: label, scale and limits.
+        which: ``x`` or ``y``.
+        reverse: whether the first category is at the top.
+    """
     axis.set(**{f"{which}label": _escape_math(spec.label)})
     set_ticks = axis.set_xticks if which == "x" else axis.set_yticks
     if spec.names:
@@ -250,6 +257,11 @@ def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) ->
     """Draw dashed lines with their texts, unless they are outside the panel.
 
     In a horizontal figure, a text up the line would cross the rows: only its name is written.
+
+    Args:
+        axis: axes of the panel.
+        rules: the lines.
+        horizontal: whether the axes of the panel are exchanged.
     """
     line: dict[str, Any] = {"color": CAPTION_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
     text: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7.5}

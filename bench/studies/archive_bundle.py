@@ -183,6 +183,10 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
 def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
     """Return the entries of an archive if all of them can be unpacked safely.
 
+    Args:
+        archive: path of the archive, for messages.
+        packed: the open archive.
+
     Raises:
         InputError: One cannot.
     """
@@ -237,6 +241,10 @@ def _make_refusal(archive: Path, reason: str) -> InputError:
 def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
     """Return the single top-level folder of an archive, which contains the manifest.
 
+    Args:
+        archive: path of the archive, for messages.
+        entries: its entries.
+
     Raises:
         InputError: the archive has another form, so it was not made by `simgap bundle`.
     """
@@ -280,6 +288,15 @@ def _unpack_file(
 
     The size is checked while it is written, because a compressed file may be far larger than the
     archive says and fill the disk.
+
+    Args:
+        archive: path of the archive, for messages.
+        packed: the open archive.
+        entry: entry of the file.
+        path: path to which it is written.
+
+    Raises:
+        InputError: the file is longer than its entry states.
     """
     digest, size = hashlib.sha256(), 0
     with packed.open(entry) as source, path.open("wb") as target:
@@ -302,7 +319,12 @@ def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
 def _compare_with_manifest(
     manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
 ) -> Iterator[ManifestMismatch]:
-    """Yield files that are missing, added, or different from the manifest."""
+    """Yield files that are missing, added, or different from the manifest.
+
+    Args:
+        manifest: content of the manifest.
+        unpacked: size in bytes and SHA-256 of each unpacked file, by path.
+    """
     listed_files = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
     if len(listed_files) < len(manifest["files"]):
         yield ManifestMismatch(MANIFEST_FILE, "expected each file once, found one listed twice")
@@ -553,7 +575,12 @@ def verify_archive(
 
 
 def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
-    """Return what the manifest says about an archive, as the beginning of the JSON document."""
+    """Return what the manifest says about an archive, as the beginning of the JSON document.
+
+    Args:
+        archive: path of the archive.
+        unpacked: its content.
+    """
     manifest = unpacked.manifest
     return {
         "file": archive,

@@ -159,7 +159,13 @@ def _verify_runs_table(
     """Verify runs.parquet, and return the failures.
 
     The targets are drawn again from the salt. Errors are computed from them in all rows; losses are
-    simulated again in a selection of rows, or in all with `is_every_row`.
+    simulated again.
+
+    Args:
+        stored: content of the result folder.
+        problem: the problem, from which targets are drawn.
+        print_line: prints one line of text.
+        is_every_row: whether losses are simulated again in all rows, and not in a selection.
     """
     targets = {target.blinded.name: target for target in problem.draw_targets()}
     runs = stored.runs
@@ -282,7 +288,12 @@ def _find_first_difference(
 
 
 def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:
-    """Select at most `max_count` rows, evenly spaced, since simulating all again takes long."""
+    """Select at most `max_count` rows, evenly spaced, since simulating all again takes long.
+
+    Args:
+        runs: rows of runs.parquet.
+        max_count: maximum number of rows.
+    """
     row_indices = np.unique(
         np.linspace(0, len(runs) - 1, min(max_count, len(runs))).round().astype(int)
     )

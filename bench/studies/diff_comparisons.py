@@ -397,7 +397,12 @@ def _compare_unpaired(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _compute_min_attainable_p_value(targets: int, paired: bool) -> float:
-    """Compute the smallest p-value that is possible with a number of targets."""
+    """Compute the smallest p-value that is possible with a number of targets.
+
+    Args:
+        targets: number of targets of each comparison.
+        paired: whether both comparisons have the same targets (sign test), or not (rank test).
+    """
     from math import comb
 
     return 2.0 / 2**targets if paired else 2.0 / comb(2 * targets, targets)

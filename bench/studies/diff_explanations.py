@@ -375,6 +375,10 @@ def _pair_coefficients(
 
     A row has name and unit, and for each explanation the value and its 95 % interval (low, high).
     An explanation without this number has None in all three columns.
+
+    Args:
+        a: numbers of the first explanation, by name.
+        b: numbers of the second one.
     """
     rows = []
     for name in dict.fromkeys([*a, *b]):

@@ -58,7 +58,13 @@ class ExplanationVerification(NamedTuple):
 def format_result(
     doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
 ) -> None:
-    """Print the doubts (numbers that do not follow from others), at most 20 of them."""
+    """Print the doubts (numbers that do not follow from others), at most 20 of them.
+
+    Args:
+        doubts: verification failures.
+        folder: folder of the explanation.
+        print_line: prints one line of text.
+    """
     for doubt in doubts[:20]:
         print_line(f"NOT REPRODUCED  {folder}/{doubt}")
     if len(doubts) > 20:
@@ -198,7 +204,14 @@ def _find_differing_numbers(
 def _score_extended_model(
     folder: Path, verdict: Verdict, verification: ExplanationVerification, note: PrintLine
 ) -> None:
-    """Repeat the held-out error of the extended simulator, if the folder has the recording."""
+    """Repeat the held-out error of the extended simulator, if the folder has the recording.
+
+    Args:
+        folder: folder of the explanation.
+        verdict: its verdict, with the stated error.
+        verification: result, to which failures and skipped checks are added.
+        note: prints one line of text.
+    """
     environment = read_environment(folder)
     stated_error = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / RECORDINGS_FOLDER).glob("*.csv"))

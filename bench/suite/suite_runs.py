@@ -210,7 +210,14 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
 
 
 def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -> str:
-    """Return the name of a cell: the problem, and what distinguishes it from its other cells."""
+    """Return the name of a cell: the problem, and what distinguishes it from its other cells.
+
+    Args:
+        problem: name of the problem.
+        kind: range of the targets.
+        condition: condition that distinguishes the cell, such as a noise; empty for none.
+        experiment: configuration of the problem, with its ranges.
+    """
     if condition:
         return f"{problem} {condition}"
     return f"{problem} {kind}" if len(experiment.ranges) > 1 else problem

@@ -147,7 +147,12 @@ class SuiteTables:
         return pd.DataFrame(columns)
 
     def _get_training_share(self, cell: str, tuner: str) -> float:
-        """Return a target's share of the training simulations of a tuner; 0 without training."""
+        """Return a target's share of the training simulations of a tuner; 0 without training.
+
+        Args:
+            cell: name of the cell.
+            tuner: label of the tuner.
+        """
         return self._fit_simulations.get((cell, tuner), 0.0) / TARGETS_SHARING_TRAINING
 
     @cached_property
@@ -178,7 +183,12 @@ class SuiteTables:
         return result
 
     def get_medians(self, k: int, training: str = FREE) -> pd.DataFrame:
-        """Return median log errors after k simulations: a row per cell, a column per tuner."""
+        """Return median log errors after k simulations: a row per cell, a column per tuner.
+
+        Args:
+            k: number of simulations.
+            training: `FREE` or `COUNTED`.
+        """
         return self._median_log_errors[training, k]
 
     def get_ranks(self, k: int) -> pd.DataFrame:

@@ -212,7 +212,12 @@ def _apply_linear_layer(w: dict[str, Any], layer: str, x: Any) -> Any:
 
 
 def _compute_swish(xp: Any, x: Any) -> Any:
-    """Compute x times its logistic function (swish), with a tanh that does not overflow."""
+    """Compute x times its logistic function (swish), with a tanh that does not overflow.
+
+    Args:
+        xp: module with ``tanh``, numpy or torch.
+        x: array or tensor of any shape.
+    """
     return x * (1.0 + xp.tanh(x / 2.0)) / 2.0
 
 
@@ -369,8 +374,12 @@ def _draw_initial_weights(
 ) -> dict[str, Any]:
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
 
-    `shapes_by_name` has the shape of each array. Layers whose output is added to another value
-    (names that begin with one of `_RESIDUAL_LAYERS`) get a smaller gain.
+    Layers whose output is added to another value (names that begin with one of `_RESIDUAL_LAYERS`)
+    get a smaller gain.
+
+    Args:
+        shapes_by_name: shape of each array.
+        generator: torch's random generator.
     """
     import torch
 
@@ -434,9 +443,13 @@ def _compute_loss(
     """Compute the mean squared error of the proposals: loss (8), or (9) if published.
 
     (8) compares each proposal with the target's parameters, relative to the distance of the
-    simulation before; (9) compares it with the next point of the history. `parts` are input rows
-    without and with noise, and parameters, of one batch of scenarios; `histories` are the indices
-    of the simulations that form each history and of its target.
+    simulation before; (9) compares it with the next point of the history.
+
+    Args:
+        w: weights by name.
+        design: design of the network.
+        parts: input rows without and with noise, and parameters, of one batch of scenarios.
+        histories: indices of the simulations that form each history, and of its target.
     """
     import torch
 

@@ -155,7 +155,14 @@ class ObservationFeatures:
 def _compute_feature_rows(
     observations: Array, lengths: tuple[int, ...], points: int, is_raw: bool
 ) -> Array:
-    """Compute all candidate numbers (n, D) of observations (n, T, C)."""
+    """Compute all candidate numbers (n, D) of observations (n, T, C).
+
+    Args:
+        observations: (n, T, C) observations.
+        lengths: number of samples of each run; T in total.
+        points: number of points to which each run is resampled.
+        is_raw: whether the numbers are the resampled values, and not descriptors of them.
+    """
     series = resample_runs(observations, lengths, points)
     return series.reshape(len(series), -1) if is_raw else compute_descriptors(series)
 
@@ -239,6 +246,10 @@ def _compute_weight_per_deviation(weight: Array, deviation: Array) -> Array:
 
 def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
     """Fit each number as a linear function of the parameters within scenarios.
+
+    Args:
+        parameters: (scenarios, m, dim) parameters of m simulations in each scenario.
+        rows: (scenarios, m, D) numbers of their observations.
 
     Returns:
         Root mean squares of each number (D,), of the part that each parameter explains (dim, D),

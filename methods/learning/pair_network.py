@@ -249,7 +249,14 @@ def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, 
 def _draw_initial_weights(
     inputs: tuple[int, int], dim: int, design: PairNetworkDesign, generator: torch.Generator
 ) -> dict[str, Any]:
-    """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
+    """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero.
+
+    Args:
+        inputs: numbers of inputs of the proposed and of the target side.
+        dim: number of parameters.
+        design: design of the network.
+        generator: torch's random generator.
+    """
     import torch
 
     weights: dict[str, Any] = {}

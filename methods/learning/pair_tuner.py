@@ -189,7 +189,13 @@ class TrainedPairNetwork:
 def _compute_input_rows(
     proposed: InputFeatures, target: InputFeatures, data: TrainingData
 ) -> PairInputs:
-    """Compute input rows of both sides; separate inputs of the proposed side have no noise."""
+    """Compute input rows of both sides; separate inputs of the proposed side have no noise.
+
+    Args:
+        proposed: inputs of the proposed side.
+        target: inputs of the target side; the same object if both sides are equal.
+        data: training data.
+    """
     rows = target.compute_rows(data)
     proposed_rows = rows if proposed is target else proposed.compute_rows(data.without_noise)
     return PairInputs(proposed_rows, rows)
@@ -199,6 +205,11 @@ def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork)
     """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
 
     This is done only if one channel is compared.
+
+    Args:
+        task: the task, with the observations of the target.
+        simulated: (T, C) a simulation.
+        network: network, with the channels that it compares.
     """
     sensor = network.proposed.reading.select_channels(simulated)
     filled = task.observed.copy()

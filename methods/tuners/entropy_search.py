@@ -161,6 +161,11 @@ class EntropySearch(Tuner):
         They are the best point so far, `everywhere` quasi-random points in the cube, and `nearby`
         points: half of these around the best point, half around the quasi-random point with the
         lowest predicted loss, at distances of all orders of magnitude.
+
+        Args:
+            process: Gaussian process of the loss.
+            best: (dim,) best point so far.
+            rng: random numbers of the run.
         """
         dim = len(best)
         spread_points = generate_quasi_random_points(self.everywhere, rng.uniform(size=dim))

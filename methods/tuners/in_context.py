@@ -248,6 +248,10 @@ class InContextTransformer(Tuner):
         A history is a sequence of simulations and a target among the others, given by their
         indices. As published it follows the order of the binary search; otherwise the order is
         random.
+
+        Args:
+            each: number of simulations per scenario.
+            rng: random numbers of the training.
         """
         window = min(self.window, each - 1)
         return (

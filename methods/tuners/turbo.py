@@ -183,6 +183,11 @@ class TuRBO(Tuner):
         """Draw points in the box around `centre`.
 
         In many dimensions each one differs from the centre in about 20 coordinates.
+
+        Args:
+            centre: (dim,) best point so far.
+            side_lengths: (dim,) lengths of the sides of the box, in the unit cube.
+            rng: random numbers of the run.
         """
         dim = len(centre)
         low = np.clip(centre - side_lengths / 2.0, 0.0, 1.0)

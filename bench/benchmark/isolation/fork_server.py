@@ -134,6 +134,10 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
 def _wait_for_child(child: int, control: int) -> int:
     """Wait for the end of a process, and kill it when the client closes the control socket.
 
+    Args:
+        child: id of the process.
+        control: descriptor of the control socket.
+
     Returns:
         Its exit code, or minus the number of the signal that killed it.
     """

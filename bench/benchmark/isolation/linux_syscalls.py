@@ -182,9 +182,16 @@ def make_mounts_read_only() -> None:
 
 
 def _call_mount(kind: str, mount_point: str, flags: int, options: str) -> None:
-    """Call mount(2); `kind` is the type of the file system, which also serves as its source.
+    """Call mount(2).
 
-    Raises an OSError if the kernel refuses.
+    Args:
+        kind: type of the file system, which also serves as its source.
+        mount_point: path at which it is mounted.
+        flags: flags of mount(2).
+        options: options of the file system.
+
+    Raises:
+        OSError: the kernel refuses.
     """
     filesystem = kind.encode()
     flags_argument = ctypes.c_ulong(flags)

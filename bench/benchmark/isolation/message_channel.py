@@ -213,7 +213,13 @@ class MessageChannel:
         return Message(kind, flags, size, body)
 
     def _read_long_body(self, received: int, length: int, deadline: float) -> memoryview:
-        """Read a body that is longer than the buffer; memory grows only with the data received."""
+        """Read a body that is longer than the buffer; memory grows only with the data received.
+
+        Args:
+            received: number of bytes of the body that are in the buffer already.
+            length: number of bytes of the body.
+            deadline: time limit on the clock `perf_counter`, in seconds.
+        """
         body = bytearray(self._view[_HEADER.size : _HEADER.size + received])
         while len(body) < length:
             part = self._view[: min(_MAX_READ_BYTES, length - len(body))]

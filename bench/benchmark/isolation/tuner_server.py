@@ -76,10 +76,15 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
 
 
 def _report_written_files(channel: MessageChannel, folder: str, reported_paths: set[str]) -> None:
-    """Report files that the tuner has written since the last report; add them to `reported_paths`.
+    """Report files that the tuner has written since the last report.
 
     Hidden files and compiled Python files are left out, because libraries write them and they are
     not needed.
+
+    Args:
+        channel: channel to the parent process.
+        folder: folder of the tuner.
+        reported_paths: paths that were reported, extended in place.
     """
     new = [
         path
@@ -102,7 +107,12 @@ def _iterate_written_files(folder: str) -> Iterator[str]:
 
 
 def _report_failure(channel: MessageChannel, text: str) -> None:
-    """Report a failure; a long text is cut to its end, which has the error."""
+    """Report a failure; a long text is cut to its end, which has the error.
+
+    Args:
+        channel: channel to the parent process.
+        text: traceback or message.
+    """
     channel.send(b"D", text.encode("utf-8", "replace")[-MAX_TEXT_BYTES // 2 :])
 
 

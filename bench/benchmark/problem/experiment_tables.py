@@ -81,6 +81,11 @@ def _parse_list_item(path: Path, key: str, item: Any) -> TunerEntry:
     """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
 
     The label, under which results are listed, is the key ``label``, or else the name of the tuner.
+
+    Args:
+        path: path of the experiment file, for messages.
+        key: key of the list.
+        item: the element.
     """
     if isinstance(item, str):
         return TunerEntry(item, item)
@@ -168,6 +173,11 @@ def _format_swept_value(path: Path, key: str, value: Any) -> str:
 
     Characters that do not fit into a folder name become hyphens.
 
+    Args:
+        path: path of the experiment file, for messages.
+        key: key of the sweep.
+        value: the value.
+
     Raises:
         InputError: the value is a table.
     """
@@ -184,6 +194,12 @@ def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) ->
     """Insert a value at the position that a key such as ``noise.q`` names; tables are created.
 
     Names that contain dots themselves are recognised if the table has them already.
+
+    Args:
+        path: path of the experiment file, for messages.
+        document: content of the file, changed in place.
+        key: key with dots.
+        value: the value.
     """
     table, remaining_key = document, key
     while (name := _get_first_key(table, remaining_key)) != remaining_key:

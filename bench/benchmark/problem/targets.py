@@ -163,8 +163,11 @@ def _make_divergence_error(experiment: Experiment, failed: int, draws: int) -> I
 def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> Target | None:
     """Make one draw of a target; None if its simulation diverges.
 
-    `kind` is the range of the target: ``wide`` draws from all bounds, others from the training
-    range. `number` is 0 for the first draw, and counts the repeated draws, each from new streams.
+    Args:
+        problem: the problem.
+        kind: range of the target: ``wide`` draws from all bounds, others from the training range.
+        index: index of the target in its range.
+        number: 0 for the first draw; counts the repeated draws, each from new streams.
     """
     # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
     experiment_name = problem.experiment.same_targets_as or problem.experiment.name
@@ -216,6 +219,10 @@ def _is_divergent(observed: Array, channels: Sequence[Channel]) -> bool:
 
     It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
     Single missing samples (NaN), as of a camera, are not a failure.
+
+    Args:
+        observed: (T, C) simulated channels.
+        channels: the channels, with their scales.
     """
     if not len(observed):
         return False

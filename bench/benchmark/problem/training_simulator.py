@@ -264,7 +264,17 @@ def _get_effect_name(name: str) -> str:
 def _order_bounds(
     location: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
-    """Return lower and upper bounds in the simulator's order; zero for coefficients not named."""
+    """Return lower and upper bounds in the simulator's order; zero for coefficients not named.
+
+    Args:
+        location: entry of the experiment file, for messages.
+        simulator: simulator whose parameters after the tuned ones are randomised.
+        tuned: number of tuned parameters, which come first.
+        ranges: lower and upper bound by name of the coefficient.
+
+    Raises:
+        InputError: a name is unknown.
+    """
     names = [parameter.name for parameter in simulator.parameters[tuned:]]
     for name in ranges:
         if name not in names:

@@ -117,6 +117,11 @@ class TuningProblem:
 
         It is called for the tuned simulator, and for the one that makes the targets if this is
         another.
+
+        Args:
+            kind: class of the simulator.
+            observe: names of the observed channels.
+            settings: further arguments of its constructor.
         """
         experiment = self.experiment
         try:

@@ -71,7 +71,12 @@ class DiagnoserStub(Diagnoser):
 
 
 def _make_stub(base: type, description: dict[str, Any]) -> Any:
-    """Make the stub class of a tuner or diagnoser from its description."""
+    """Make the stub class of a tuner or diagnoser from its description.
+
+    Args:
+        base: base class of the stub, `TunerStub` or `DiagnoserStub`.
+        description: description by the isolated process.
+    """
     fields: dict[str, Any] = {
         "name": str(description["name"]),
         "stochastic": description["stochastic"] is not False,
@@ -288,6 +293,12 @@ def _check_name_free(
 
     This is checked before the file's code is loaded, because the description may be wrong.
 
+    Args:
+        kind: kind of the part, such as ``tuner``.
+        name: its name.
+        path: path of the plugin file.
+        paths_by_name: file of each described part by kind and name, extended in place.
+
     Raises:
         InputError: the name is in use.
     """
@@ -380,7 +391,15 @@ def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
 
 
 def _validate_part(part: Any, file: str) -> dict[str, Any]:
-    """Validate a part of an answer, and convert it to plain values."""
+    """Validate a part of an answer, and convert it to plain values.
+
+    Args:
+        part: one element of the answer.
+        file: path of the plugin file; empty for an installed plugin.
+
+    Raises:
+        InputError: the element does not describe a part.
+    """
     kinds = [registry.kind for registry in REGISTRIES]
     if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
         raise InputError(f"plugin {file}: its process did not list what it contains")
@@ -451,9 +470,12 @@ _REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnose
 def _describe_class(kind: str, part: Any) -> dict[str, Any]:
     """Describe a registered class by plain values, for the harness.
 
-    `kind` is its kind, such as "tuner". The harness cannot load the code of a tuner or diagnoser,
-    so it needs its properties and the hash of its source from here. Other kinds have a name and a
-    first paragraph only.
+    The harness cannot load the code of a tuner or diagnoser, so it needs its properties and the
+    hash of its source from here. Other kinds have a name and a first paragraph only.
+
+    Args:
+        kind: kind of the class, such as ``tuner``.
+        part: the class.
     """
     description = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
     if kind not in _ISOLATED_REGISTRIES:

@@ -103,6 +103,12 @@ def _handle_message(
 ) -> None:
     """Handle one message of a tuner during its training.
 
+    Args:
+        child: process of the tuner.
+        message: its message.
+        simulators: training simulators that it may use.
+        callback: receives the progress; None for no progress.
+
     Raises:
         ProtocolError: the message is not valid here.
     """
@@ -165,6 +171,11 @@ def _serve_simulation(
 
 def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
     """Simulate the requested points.
+
+    Args:
+        message: message with the points of the unit cube and the state of the tuner's random
+            generator.
+        simulator: training simulator.
 
     Returns:
         The observations, and the state of the random generator after drawing the scenario.
@@ -456,7 +467,14 @@ def _train_isolated(
     stream: NDArray[np.uint32],
     callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
-    """Train a tuner in its isolated process, and return its weights; this process simulates."""
+    """Train a tuner in its isolated process, and return its weights; this process simulates.
+
+    Args:
+        request: tuner and seed of the training.
+        simulator: training simulator that counts its simulations.
+        stream: words of the seed of the random stream.
+        callback: receives the progress; None for no progress.
+    """
     assert request.tuned is not None
     with start_isolated_tuner(request.tuned, request.seed, "run", request.hidden) as tuner:
         state = train_remotely(tuner.child, simulator, stream, callback)

@@ -409,7 +409,14 @@ class LocalPool:
         calls: Sequence[Call],
         limit: float | None,
     ) -> None:
-        """Assign up to `depth` calls to every worker; all get a first before any gets a second."""
+        """Assign up to `depth` calls to every worker; all get a first before any gets a second.
+
+        Args:
+            waiting_calls: calls that are not assigned, removed in place.
+            depth: maximum number of calls that a worker has at a time.
+            calls: functions and arguments of all calls.
+            limit: time limit of each call in seconds; None for no limit.
+        """
         for _ in range(depth):
             for slot in self._slots:
                 if waiting_calls and len(slot.given) < depth:
@@ -552,6 +559,10 @@ def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
     """Return whether to repeat a call, because its end gives no information about it.
 
     It also counts the deaths of workers during the call.
+
+    Args:
+        call: the call, whose number of deaths is increased in place.
+        error: error with which it ended; None if it has a result.
     """
     code = _get_exit_code(error)
     # A broken pool has not begun the call, or has not reported its result.

@@ -302,6 +302,12 @@ def _summarise_over_targets(
 ) -> Array:
     """Compute median, mean, low and high over targets of the runs in `rows`.
 
+    Args:
+        curves: values of all runs.
+        rows: indices of the runs.
+        points: numbers of simulations.
+        names: names that determine the stream of the bootstrap.
+
     Returns:
         (4, len(points)) values.
     """
@@ -538,7 +544,13 @@ def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
 def _compute_median_with_interval(
     values: Array, tuner: str, group: int
 ) -> tuple[float, float, float]:
-    """Return the median of values (n,) with its interval; the interval of one value is NaN."""
+    """Return the median of values (n,) with its interval; the interval of one value is NaN.
+
+    Args:
+        values: (n,) values of the targets.
+        tuner: label of the tuner, which is part of the stream's name.
+        group: number of the group of targets.
+    """
     # The stream's name numbers the group inside the training range -1.
     names = ("distance", tuner, str(group - 1))
     low, high = compute_bootstrap_interval(

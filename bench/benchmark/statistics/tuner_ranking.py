@@ -145,6 +145,11 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
 
     Tuners are ordered by median log error, then mean, then earlier ranks; those whose runs all
     failed come last. Errors at or below `floor` count as equal.
+
+    Args:
+        curves: errors of all runs.
+        budget: largest number of simulations.
+        floor: error at or below which errors count as equal.
     """
     failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
@@ -382,6 +387,10 @@ def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> fl
     of the squared mean change. Exchanging the conditions of a target changes the signs of its rank
     changes. Tau itself is not a suitable statistic: mean ranks that are all reversed stay reversed,
     only less so, under any exchange.
+
+    Args:
+        changes: (targets, tuners) change of each rank.
+        rng: source of the permutations.
     """
     signs = rng.choice([-1.0, 1.0], size=(PERMUTATION_COUNT, len(changes)))
     sums = ((signs @ changes) ** 2).sum(axis=1)
@@ -395,6 +404,10 @@ def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> floa
 
     It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random
     one. `ranks` (targets, tuners) are the ranks on each target. NaN with fewer than two targets.
+
+    Args:
+        ranks: (targets, tuners) ranks on each target.
+        rng: source of the random halves.
     """
     half_count = len(ranks) // 2
     if not half_count:

@@ -322,6 +322,12 @@ def _convert_batch(
 ) -> pa.Table:
     """Convert a batch to its declared types and prepend the last row of the previous batch.
 
+    Args:
+        batch: rows as text.
+        columns: declarations of the columns.
+        last_row: last row of the previous batch; None for the first batch.
+        offset: number of rows before this batch.
+
     Raises:
         CellError: A cell violates its declaration, or a run is incomplete.
     """

@@ -153,7 +153,12 @@ def _write_private_file(path: Path, secret: str) -> None:
 
 
 def write_configuration(folder: Path, experiment: Experiment) -> None:
-    """Write experiment.toml completely or not at all."""
+    """Write experiment.toml completely or not at all.
+
+    Args:
+        folder: result folder.
+        experiment: configuration to write.
+    """
     import tomli_w
 
     write_atomically(

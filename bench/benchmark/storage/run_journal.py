@@ -208,7 +208,12 @@ def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunSta
 
 
 def write_plan(folder: Path, ids: Sequence[str]) -> None:
-    """Write the id of every run, in the order of the plan."""
+    """Write the id of every run, in the order of the plan.
+
+    Args:
+        folder: result folder.
+        ids: ids of all runs.
+    """
     write_atomically(folder / SEGMENTS_FOLDER / PLAN_FILE, "".join(f"{name}\n" for name in ids))
 
 

@@ -59,6 +59,10 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
 
     Problems of a suite that cannot run here are printed with what they need.
 
+    Args:
+        options: parsed command line.
+        print_line: prints one line of text.
+
     Raises:
         InputError: Options are given that would change a study to be resumed.
     """
@@ -124,11 +128,11 @@ def _run_study(
 ) -> CommandResult:
     """Run one study until it is complete or stopped, then write its report.
 
-    `pool` executes the runs on a cluster; None for worker processes on this machine.
-
-    Returns:
-        JSON document and exit code; not EXIT_OK if runs are missing, or if some failed and failures
-        are not allowed.
+    Args:
+        study: the study.
+        pool: executes the runs on a cluster; None for worker processes on this machine.
+        options: parsed command line.
+        print_line: prints one line of text.
     """
     from bench.cli.output import summarise_study
     from bench.cli.progress_display import ProgressBars

@@ -80,7 +80,10 @@ _BASH_COMPLETERS = {
 def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
     """Set how the shell completes an argument: known names (in bash only), or a file.
 
-    `shtab` is the library that builds the completion script.
+    Args:
+        command: name of the command.
+        action: its argument, changed in place.
+        shtab: library that builds the completion script.
     """
     known_words = _BASH_COMPLETERS.get((command, action.dest))
     if known_words:

@@ -86,7 +86,13 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
 
 
 def _download_data_set(data_set: DataSet, source: str, target_folder: Path | None) -> Path:
-    """Download one data set with a progress bar; return its folder."""
+    """Download one data set with a progress bar; return its folder.
+
+    Args:
+        data_set: the data set.
+        source: address of its files.
+        target_folder: folder below which it is stored; None for the usual one.
+    """
     import sys
 
     from tqdm import tqdm
@@ -113,7 +119,12 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
 
 
 def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path | None:
-    """Return the folder of a data set that is already present; None if it must be downloaded."""
+    """Return the folder of a data set that is already present; None if it must be downloaded.
+
+    Args:
+        data_set: the data set.
+        target_folder: folder below which it may be; None for the usual ones.
+    """
     if target_folder is None:
         return data_set.folder()
     folder = target_folder / data_set.name
@@ -121,7 +132,12 @@ def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path 
 
 
 def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
-    """Explain how experiments find a data set in a folder other than the default one."""
+    """Explain how experiments find a data set in a folder other than the default one.
+
+    Args:
+        data_set: the data set.
+        target_folder: folder below which it is stored.
+    """
     from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, list_search_folders
 
     if target_folder.resolve() in [

@@ -151,7 +151,12 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
 def _remove_inactive_drives(
     recording: Recording, kind: type[Simulator]
 ) -> tuple[Recording, list[QualityFinding]]:
-    """Return a robot's recording without samples in which drives do nothing, and where that is."""
+    """Return a robot's recording without samples in which drives do nothing, and where that is.
+
+    Args:
+        recording: the recording.
+        kind: simulator class.
+    """
     from bench.logs.quality.quality_finding import QualityFinding
 
     if not kind.has_model:

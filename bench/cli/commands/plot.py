@@ -127,7 +127,14 @@ def _draw_each_with_references(
     output_folder: Path,
     print_line: PrintLine,
 ) -> list[JsonDocument]:
-    """Draw each of several comparisons over the references that belong to its problem."""
+    """Draw each of several comparisons over the references that belong to its problem.
+
+    Args:
+        folders: folders of the comparisons.
+        references: reference results.
+        output_folder: folder for the figures.
+        print_line: prints one line of text.
+    """
     from sims.core.simulator import InputError
 
     documents = []
@@ -150,7 +157,15 @@ def _draw_with_references(
     print_line: PrintLine,
     name: str = "",
 ) -> list[JsonDocument]:
-    """Draw a comparison over references in grey; draw nothing without references."""
+    """Draw a comparison over references in grey; draw nothing without references.
+
+    Args:
+        folder: folder of the comparison.
+        references: reference results.
+        output_folder: folder for the figures.
+        print_line: prints one line of text.
+        name: beginning of the names of the figures' files.
+    """
     if not references:
         return []
     from bench.benchmark.reference_overlay import draw_with_references

@@ -101,7 +101,13 @@ def _format_isolation(isolation: JsonDocument) -> str:
 
 
 def _print_progress(study: Study, is_all: bool, print_line: PrintLine) -> JsonDocument:
-    """Print the progress of a study, and return it as a document."""
+    """Print the progress of a study, and return it as a document.
+
+    Args:
+        study: the study.
+        is_all: whether every run is listed, and not only notable ones.
+        print_line: prints one line of text.
+    """
     progress = study.status()
     planned, unit = len(progress.ends), progress.what
     isolation, groups = _describe_isolation(study), _count_endings(progress)

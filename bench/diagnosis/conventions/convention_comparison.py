@@ -236,7 +236,12 @@ class ConventionComparison:
         return after > before + LOG_LIKELIHOOD_MARGIN
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
-        """Return whether the corrections leave only a small part of the largest missing force."""
+        """Return whether the corrections leave only a small part of the largest missing force.
+
+        Args:
+            described: recording with the conventions of its description.
+            corrected: the same recording with the corrected conventions.
+        """
         before, after = map(self._compute_largest_missing_force, (described, corrected))
         return after <= MAX_REMAINING_FORCE * before
 
@@ -354,6 +359,11 @@ class ConventionComparison:
         """Return whether a hypothesis on units of inputs alone is better than no inputs at all.
 
         A factor that only switches an input off is not a unit.
+
+        Args:
+            score: log-likelihood with the hypothesis.
+            hypothesis: the hypothesis.
+            recording: short part of the recording.
         """
         inputs = recording.runs[0].inputs
         changes = hypothesis.changes
@@ -373,6 +383,15 @@ class ConventionComparison:
 
         The method is that of R. Hooke, T. A. Jeeves, J. ACM 8(2), 212, 1961,
         doi:10.1145/321062.321069.
+
+        Args:
+            score: log-likelihood with the hypothesis.
+            hypothesis: the hypothesis, with a first offset.
+            recording: short part of the recording.
+
+        Returns:
+            Log-likelihood and hypothesis with the best offset; minus infinity if the offset is
+            negligible.
         """
         if not hypothesis.has_free_offset:
             return score, hypothesis
@@ -532,6 +551,10 @@ def _compute_log_scale_correction(
 
     Added to the log-likelihood of converted signals, it gives that of the recorded values;
     otherwise a small factor would seem to fit better.
+
+    Args:
+        hypotheses: hypotheses that are applied together, with the factor of each changed signal.
+        recording: the recording, as described.
     """
     result = 0.0
     for name, change in (item for one in hypotheses for item in one.changes.items()):
@@ -569,7 +592,9 @@ def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
 def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) -> FollowedRuns:
     """Fit the coefficients of effects by maximum likelihood of a Kalman filter (Gauss-Newton).
 
-    `groups` names the effects; their present coefficients are those of the filter.
+    Args:
+        followed: the runs, followed by the filter with the present coefficients.
+        groups: the effects, one group of directions each.
     """
     evaluator = followed.evaluator
     return maximise_innovation_likelihood(

@@ -128,7 +128,12 @@ class ConventionHypothesis:
         earlier = {name: values[1] for name, values in run.before.items()}
 
         def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
-            """Return signals by name; a signal that differs is computed from `source`."""
+            """Return signals by name; a signal that differs is computed from `source`.
+
+            Args:
+                values: signals to convert, (T,) by name.
+                source: all signals of the run, from which a changed one may be computed.
+            """
             return {
                 name: self.changes[name].applied(source) if name in self.changes else unchanged
                 for name, unchanged in values.items()
@@ -354,7 +359,12 @@ def _generate_zero_offsets(
 def _generate_wrapped_angles(
     joints: Sequence[JointSignals], recording: Recording
 ) -> Iterator[ConventionHypothesis]:
-    """Yield hypotheses that recorded angles jump by whole turns, which have to be added again."""
+    """Yield hypotheses that recorded angles jump by whole turns, which have to be added again.
+
+    Args:
+        joints: joints with their recorded signals.
+        recording: the recording, whose training runs are examined.
+    """
     for joint in joints:
         name = joint.channels.get("q")
         if name is None or not joint.is_hinge:
@@ -443,6 +453,10 @@ def _generate_units(
     """Yield hypotheses of another unit for signals that share a unit.
 
     If all values of an angle are integers, encoder ticks are tried as well.
+
+    Args:
+        signals: signals with the same specified unit.
+        recording: the recording.
     """
     first = signals[0]
     names = [signal.name for signal in signals]
@@ -538,6 +552,10 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
 
     It is the column with the highest correlation that the description does not use. Return
     `UNKNOWN_COLUMN` if none correlates enough.
+
+    Args:
+        recording: the recording, with its description and logs.
+        channel: name of the channel with the position.
     """
     try:
         description, meta = read_meta(recording.path)

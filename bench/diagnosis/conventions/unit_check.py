@@ -462,7 +462,12 @@ def _rescale_run(run: Run, factors: Mapping[str, float]) -> Run:
 
 
 def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
-    """List the names of parameters whose value in the base fit is at a bound of their range."""
+    """List the names of parameters whose value in the base fit is at a bound of their range.
+
+    Args:
+        evaluator: the runs, with the bounds of the parameters.
+        fit: the base fit.
+    """
     names = []
     for index in fit.free_indices.tolist():
         parameter = evaluator.parameters[index]
@@ -519,6 +524,10 @@ def _generate_hypotheses(
 
     They concern single signals, all signals with one unit, logs in one system of units, and joints
     whose direction is reversed.
+
+    Args:
+        signals: recorded channels and inputs.
+        suspects: names of the joints and actuators to check; None for all.
     """
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
@@ -597,12 +606,20 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
     the whole runs.
+
+    Args:
+        subject: recording and simulator.
+        hypotheses: all hypotheses.
     """
 
     def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
         """Sort hypotheses by their misfit in the first `share` of each run, smallest first.
 
         The recording is simulated with the starting values of the base fit; nothing is fitted here.
+
+        Args:
+            those: the hypotheses.
+            share: simulated share of each run, from 0 to 1.
         """
         scores = []
         for one in those:

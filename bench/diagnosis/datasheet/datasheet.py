@@ -233,7 +233,12 @@ def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> I
 
 
 def _needs_drive(name: str, effect: Effect | type[Effect]) -> bool:
-    """Return whether an effect belongs to a drive or its transmission."""
+    """Return whether an effect belongs to a drive or its transmission.
+
+    Args:
+        name: name of the effect, with its place if it has one.
+        effect: the effect.
+    """
     return effect.at == "actuator" or name.partition("@")[0] in TRANSMISSION
 
 
@@ -243,6 +248,11 @@ def _is_stop(effect: Effect | type[Effect]) -> bool:
 
 
 def _is_recorded(evaluator: RunEvaluator, effect: str) -> bool:
-    """Return whether the signal that an effect acts on was recorded."""
+    """Return whether the signal that an effect acts on was recorded.
+
+    Args:
+        evaluator: the runs.
+        effect: name of the effect.
+    """
     run = evaluator.runs[0]
     return evaluator.available_effects[effect].signal in {*run.channels, *run.inputs}

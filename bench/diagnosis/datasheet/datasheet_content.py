@@ -212,6 +212,11 @@ class _Rows:
 
         It is known only if several runs or logs identify the value. For a number of the model file
         it is converted to the unit of that number.
+
+        Args:
+            row: the row.
+            effect: name of the effect.
+            parameter: name of its coefficient, by which the half widths are stored.
         """
         half_width, file_value = (
             self.detection_limits.prediction_half_widths.get(parameter),
@@ -222,7 +227,13 @@ class _Rows:
         return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
-        """Build the row of a cause at other places that is not shown here."""
+        """Build the row of a cause at other places that is not shown here.
+
+        Args:
+            row: row of the cause.
+            effect: name of the effect.
+            number: fitted coefficient, whose interval gives the detection limit.
+        """
         detection_limit = _make_limit_from_interval(
             number, self.subject.get_model_file_value(effect)
         )
@@ -327,7 +338,16 @@ def _make_fitted_row(
     number: FittedValue,
     file_value: Any,
 ) -> SheetRow:
-    """Build a row with a fitted value and, unless `file_value` is None, the model file's value."""
+    """Build a row with a fitted value and, if there is one, the value of the model file.
+
+    Args:
+        name: name of the number on the sheet.
+        description: the number in words.
+        part: ``joint``, ``actuator``, ``channel`` or ``system``.
+        state: whether the number is a cause, a parameter, or derived from others.
+        number: fitted value with its interval.
+        file_value: value in the model file; None if the file has none.
+    """
     nominal = None if file_value is None else file_value.value
     return SheetRow(name, description, part, state, number.unit, number, nominal)
 

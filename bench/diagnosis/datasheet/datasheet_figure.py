@@ -292,7 +292,14 @@ def _draw_effects_not_shown(
 
 
 def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
-    """Draw the description of the diagram next to it."""
+    """Draw the description of the diagram next to it.
+
+    Args:
+        figure: the page.
+        diagram: the diagram.
+        x: left edge of the text, as a share of the page width.
+        y: upper edge of the text, as a share of the page height.
+    """
     unit = diagram.unit
     lines = [
         f"starts to move without load at {append_unit(format_number(diagram.breakaway), unit)}"

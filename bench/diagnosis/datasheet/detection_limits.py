@@ -195,6 +195,11 @@ def _add_small_gaps(
 
     Otherwise the smallest direction may already be detectable, and the limit is not known.
     Each size is half the previous one, `GAP_HALVINGS` times.
+
+    Args:
+        evaluator: the runs.
+        fit: fit of the model.
+        directions: directions of all candidates.
     """
     smallest_probes: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:

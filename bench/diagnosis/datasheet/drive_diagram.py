@@ -171,7 +171,13 @@ def compute_drive_diagram(
 
 
 def _find_roots(function: Callable[[Array], Array], search_range: float, count: int) -> Array:
-    """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
+    """Find zeros (N,) of increasing functions by bisection; infinite outside the range.
+
+    Args:
+        function: values (N,) of N increasing functions at points (N,).
+        search_range: largest absolute value of a zero.
+        count: number N of functions.
+    """
     low, high = np.full(count, -search_range), np.full(count, search_range)
     is_below_zero, is_above_zero = function(high) <= 0, function(low) > 0
     for _ in range(BISECTION_STEPS):

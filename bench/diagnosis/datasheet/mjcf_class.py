@@ -83,6 +83,13 @@ def describe_log_for_model(
     """Yield a description of the log for the model, in which its runs are marked held out.
 
     Nothing is yielded for a log of several files.
+
+    Args:
+        sheet: content of the data sheet, with the recording.
+        group: runs with equal constants, for which the model is made.
+        model: the MJCF model, with the names of its signals.
+        stem: name of the model file without suffix.
+        folder: folder of the sheet, to which paths are relative.
     """
     import tomli_w
 
@@ -147,7 +154,15 @@ def _compute_friction_limits(
     effect: type[Friction],
     numbers: Mapping[str, FittedValue],
 ) -> Array:
-    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
+    """Compute the limit (T,) of a friction law at each sample of a run, as one batch.
+
+    Args:
+        sheet: content of the data sheet.
+        group: runs with equal constants.
+        run: one of these runs.
+        effect: class of the friction law.
+        numbers: its fitted coefficients by name; others are zero.
+    """
     kind = sheet.subject.kind
     system = kind.system()
     (coordinate,) = system.coordinates
@@ -262,6 +277,10 @@ def _render_model_file(sheet: SheetContent, group: ConstantsGroup) -> RenderedMo
     """Render the system with the constants of one group of runs as an MJCF model.
 
     Return None if the constants give no valid model, or if the system has no form in MJCF.
+
+    Args:
+        sheet: content of the data sheet.
+        group: runs with equal constants.
     """
     try:
         return sheet.subject.kind.system.model_file(group.numbers)
@@ -315,7 +334,12 @@ def make_class_name(name: str) -> str:
 
 
 def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
-    """Format the classes as a file that MuJoCo loads and that others can include."""
+    """Format the classes as a file that MuJoCo loads and that others can include.
+
+    Args:
+        sheet: content of the data sheet.
+        classes: the default classes.
+    """
     title = sheet.recording.title or sheet.recording.path.stem
     heading = f"{make_class_name(sheet.name)}: data sheet from {title}; written by simgap datasheet"
     escaped_heading = re.sub(r"-(?=-)", "- ", heading)
@@ -333,6 +357,14 @@ def _map_effects_to_model(
 
     A friction law that MuJoCo does not have becomes a constant dry friction (its mean over the
     runs), with a note.
+
+    Args:
+        sheet: content of the data sheet, with the fitted effects.
+        group: runs with equal constants.
+        model: the MJCF model.
+
+    Returns:
+        Coefficients by effect and place, and the notes.
     """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 

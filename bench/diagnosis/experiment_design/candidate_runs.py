@@ -92,6 +92,10 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
     """Compute the range of an actuator's control that respects all limits of actuator and joint.
 
     It is in the unit of the control: a force for a motor, a position or velocity for a servo.
+
+    Args:
+        robot: model of the robot.
+        actuator: the actuator.
     """
     interval = actuator.range or UNLIMITED
     if actuator.joint is None:
@@ -118,7 +122,12 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
 
 
 def _get_effort_limit(robot: Any, joint: Any) -> Interval:
-    """Return the interval of the total actuator force on a joint."""
+    """Return the interval of the total actuator force on a joint, in N or N·m.
+
+    Args:
+        robot: model of the robot.
+        joint: the joint.
+    """
     if joint.effort is None:
         return UNLIMITED
     low, high = robot.compiled.jnt_actfrcrange[joint.id].tolist()
@@ -126,7 +135,12 @@ def _get_effort_limit(robot: Any, joint: Any) -> Interval:
 
 
 def _intersect(first: Interval, second: Interval) -> Interval:
-    """Intersect two intervals; return the first if they are disjoint."""
+    """Intersect two intervals; return the first if they are disjoint.
+
+    Args:
+        first: an interval.
+        second: another one.
+    """
     low, high = max(first[0], second[0]), min(first[1], second[1])
     return (low, high) if low <= high else first
 
@@ -423,8 +437,13 @@ An empty one is computed by `_compute_command`.
 def _compute_command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
     """Compute the command signal (T,) of a form, such as a chirp or steps, with magnitude one.
 
-    It is scaled to the size of the recorded commands later. `step` is the sampling interval in
-    seconds.
+    It is scaled to the size of the recorded commands later.
+
+    Args:
+        form: name of the form.
+        times: (T,) sample times from zero, s.
+        step: sampling interval, s.
+        rng: random numbers of forms with random phases or levels.
     """
     share = times / (times[-1] or 1.0)
     if form == "ramps up and down":

@@ -209,6 +209,10 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
 
     A robot starts at rest, because it cannot be started in motion, and with commands and positions
     within their limits.
+
+    Args:
+        evaluator: the fitted runs.
+        limits: limits of the model file; empty for a system.
     """
     run_data = evaluator.prepared_runs[0]
     if not evaluator.kind.has_model:
@@ -258,6 +262,11 @@ def _change_initial_states(
     """Yield runs that differ from the first one in one initial state.
 
     The initial velocities of a robot are not changed, because it starts at rest.
+
+    Args:
+        evaluator: the fitted runs.
+        first: the first fitted run.
+        limits: limits of the model file; empty for a system.
     """
     system = evaluator.simulator.system
     height_index = len(system.coordinates) - 1

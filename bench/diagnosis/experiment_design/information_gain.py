@@ -185,6 +185,10 @@ class RunRanker:
 
         With several models the value is the discrimination T of eq. (1), for each pair of a true
         and a competing model; with one model it is the information gain D of eq. (2).
+
+        Args:
+            run: the candidate run.
+            slopes: its linearisation with each model of the ranker.
         """
         if not self.pairs:
             value = _compute_information_gain(slopes[0], self.information[0])
@@ -252,6 +256,12 @@ class RunRanker:
         states: Array | None = None,
     ) -> _LinearisedRun | None:
         """Linearise a run at a parameter vector and an initial state.
+
+        Args:
+            run: the candidate run.
+            information: model with its free parameters and the steps of their differences.
+            theta: (P,) parameters.
+            states: (s,) initial state; None for that of the run.
 
         Returns:
             The linearisation; None if the simulation fails, or if the run amplifies differences of
@@ -406,7 +416,12 @@ def _compute_remaining_difference(
 
 
 def _compute_information_gain(slopes: _LinearisedRun, information: _ParameterInformation) -> float:
-    """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty."""
+    """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty.
+
+    Args:
+        slopes: the run, linearised by parameters and initial states.
+        information: information of the present runs on the parameters.
+    """
     basis, _ = np.linalg.qr(slopes.states)
     projected_slopes = slopes.numbers - basis @ (basis.T @ slopes.numbers)
     covariance = np.linalg.pinv(information.inverse, hermitian=True)

@@ -146,7 +146,12 @@ def design_next_run(
 
 
 def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
-    """Return whether a longer run may distinguish models that the best run does not."""
+    """Return whether a longer run may distinguish models that the best run does not.
+
+    Args:
+        best: the best run, with the discrimination of each pair of models.
+        length_factor: duration of the longest allowed run, in durations of this run.
+    """
     discrimination = np.minimum(best.values, best.values.T)
     undistinguished = discrimination[
         (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
@@ -162,6 +167,10 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     """Sort runs by value, after exact evaluation of the first ones.
 
     Linearised values tend to be too high.
+
+    Args:
+        ranker: evaluates runs exactly, by fits of the competing models.
+        runs: runs with their linearised values.
     """
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
@@ -231,7 +240,12 @@ def _list_other_effects(model: FittedModel, other_model: FittedModel) -> str:
 def _iterate_connected_groups(
     names: Sequence[str], discrimination: Array
 ) -> Iterator[tuple[str, ...]]:
-    """Yield connected groups of names that are linked by pairs that are not distinguished."""
+    """Yield connected groups of names that are linked by pairs that are not distinguished.
+
+    Args:
+        names: names of N models.
+        discrimination: (N, N) discrimination of each pair.
+    """
     remaining = list(range(len(names)))
     while remaining:
         group, newly_connected = [], [remaining[0]]

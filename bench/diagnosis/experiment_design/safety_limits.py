@@ -112,7 +112,13 @@ class RigLimits:
     def _simulate_monitored_channels(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
-        """Simulate runs with a model, and return the monitored channels of each, (T,) by name."""
+        """Simulate runs with a model, and return the monitored channels of each, (T,) by name.
+
+        Args:
+            model: the model.
+            scenarios: R runs.
+            states: (R, s) their initial states.
+        """
         evaluator = self.evaluator
         values = {
             p.name: float(v) for p, v in zip(evaluator.parameters, model.fit.theta, strict=True)
@@ -210,7 +216,13 @@ class RigLimits:
 
 
 def _widen_by_stop(stated_range: Interval, recorded_range: Interval, is_position: bool) -> Interval:
-    """Return the specified limits; a position range is widened a little if stops were pressed."""
+    """Return the specified limits; a position range is widened a little if stops were pressed.
+
+    Args:
+        stated_range: lower and upper limit of the model file.
+        recorded_range: smallest and largest recorded value.
+        is_position: whether the channel is a position.
+    """
     low, high = stated_range
     if not is_position:
         return stated_range

@@ -232,7 +232,12 @@ def _format_joint_zero(place_text: str, values: Sequence[FittedValue]) -> str:
 
 
 def _format_tilted_axis(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say by how many degrees the axis of a joint is tilted; `values` has the angles in rad."""
+    """Say by how many degrees the axis of a joint is tilted.
+
+    Args:
+        place_text: the joint in words, such as ``of joint elbow``.
+        values: fitted angles about the axes of the frame, rad.
+    """
     angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
     return (
         f"the axis {place_text} is tilted by {format_number(float(angle), 2)}° from the model file"
@@ -338,6 +343,11 @@ def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list
     """List the places at which an effect acts, for marks on the drawing of the robot.
 
     An effect at all places has those of its coefficients, or all places of its kind.
+
+    Args:
+        report: content of the report, with the robot.
+        effect: name of the effect, with its place.
+        cause: the cause, whose coefficients may be named by places.
     """
     _, place = split_effect_name(effect)
     if place != ALL_PLACES:

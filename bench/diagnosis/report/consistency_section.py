@@ -197,7 +197,11 @@ def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) 
     """Say that a parameter differs between runs, how uncertain it is for a new run, and why.
 
     If the parameter has a trend with a covariate, such as a load, the sentence names the kind of
-    effect that could explain it. `effects` are the effects of the model.
+    effect that could explain it.
+
+    Args:
+        spread: estimates of the parameter from each group of runs.
+        effects: names of the effects of the model.
     """
     text = (
         f"{_get_number_name(spread)} differs between {_pluralise_group(spread.by)}, "

@@ -161,7 +161,12 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
 
 
 def append_unit(text: str, unit: str) -> str:
-    """Append a unit to a number."""
+    """Append a unit to a number.
+
+    Args:
+        text: the number.
+        unit: its unit, which may come from a user's file.
+    """
     return plain_values.append_unit(text, sanitise(unit, 60))
 
 

@@ -172,7 +172,12 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
 
 
 def _format_candidate_name(report: DiagnosisReportData, candidate: Candidate) -> str:
-    """Format a candidate's name in as many lines as needed; its place is never cut off."""
+    """Format a candidate's name in as many lines as needed; its place is never cut off.
+
+    Args:
+        report: content of the report, with the status of the candidate.
+        candidate: the candidate.
+    """
     text = sanitise(shorten_effect_name(candidate.effect), 160)
     if get_candidate_status(report, candidate.effect) != NOT_NEEDED:
         text = POINTER + text
@@ -258,8 +263,13 @@ def _draw_scores(
 ) -> None:
     """Draw the score of each candidate as a bar, which is twice the gain in log-likelihood.
 
-    Small vertical lines are the scores of the same effect at other places. `thickness` is the
-    height of a bar in rows.
+    Small vertical lines are the scores of the same effect at other places.
+
+    Args:
+        axis: axes to draw on.
+        report: content of the report.
+        candidates: candidates that the figure shows, the first at the top.
+        thickness: height of a bar in rows.
     """
     other_places = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
     longest_bar = 1e-9
@@ -298,7 +308,12 @@ def _draw_scores(
 
 
 def _is_insignificant(report: DiagnosisReportData, candidate: Candidate) -> bool:
-    """Return whether the score of a candidate that is not a cause is insignificant."""
+    """Return whether the score of a candidate that is not a cause is insignificant.
+
+    Args:
+        report: content of the report, with the status of the candidate.
+        candidate: the candidate.
+    """
     return (
         candidate.p_value > SIGNIFICANCE_LEVEL
         and get_candidate_status(report, candidate.effect) == NOT_NEEDED

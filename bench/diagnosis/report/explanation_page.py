@@ -378,7 +378,12 @@ def _format_cause(cause: Cause) -> str:
 
 
 def _format_set(report: DiagnosisReportData, cause: Cause) -> str:
-    """Format the members of a set of indistinguishable causes, with scores and held-out gains."""
+    """Format the members of a set of indistinguishable causes, with scores and held-out gains.
+
+    Args:
+        report: content of the report, with the scores.
+        cause: the cause and its alternatives.
+    """
     names = [cause.effect, *cause.alternatives]
     # The members of a large set have their scores in the table of candidates.
     if any("@" in name for name in names):

@@ -157,7 +157,12 @@ def place_names(places: Sequence[GapLocation]) -> list[str]:
 
 
 def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
-    """Return the vertical position of each row, and write a heading above each kind of place."""
+    """Return the vertical position of each row, and write a heading above each kind of place.
+
+    Args:
+        axis: axes to draw on.
+        places: places of the gap, sorted by kind.
+    """
     rows: list[float] = []
     for i, place in enumerate(places):
         is_new_kind = i == 0 or places[i - 1].kind != place.kind

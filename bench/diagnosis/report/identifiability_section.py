@@ -229,7 +229,12 @@ def _get_place(row: _Row) -> str:
 
 
 def _build_matrix(rows: Sequence[_Row], kind: str) -> Matrix:
-    """Build the matrix of effects by places of one kind."""
+    """Build the matrix of effects by places of one kind.
+
+    Args:
+        rows: causes at places of this kind.
+        kind: kind of the places: ``joint``, ``actuator``, ``body`` or ``channel``.
+    """
     places = list(dict.fromkeys(_get_place(row) for row in rows))
     by_effect: dict[str, dict[str, _Row]] = {}
     for row in rows:

@@ -212,7 +212,12 @@ def _draw_motion(
 ) -> None:
     """Draw the measured and simulated motion of a joint, with its name at the left.
 
-    The name is highlighted if the diagnosis names the joint (`is_named`).
+    Args:
+        panel: axes to draw on.
+        report: content of the report.
+        view: the run to show.
+        row: the joint.
+        is_named: whether the diagnosis names the joint; its name is then highlighted.
     """
     channel, split = report.channels[row.motion_channel], view.data_split
     times = split.times[view.row]
@@ -273,7 +278,14 @@ def _format_row_name(row: JointRow, is_named: bool) -> str:
 
 
 def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
-    """Draw the residuals of channel number c in units of its noise, with the RMS above."""
+    """Draw the residuals of a channel in units of its noise, with the RMS above.
+
+    Args:
+        panel: axes to draw on.
+        report: content of the report.
+        view: the run to show.
+        c: index of the channel.
+    """
     times = view.data_split.times[view.row]
     panel.axhspan(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
@@ -314,7 +326,15 @@ def _unify_scale(
     rows: Sequence[JointRow],
     quantity: str,
 ) -> None:
-    """Give the residuals of one quantity (a column) the same scale, to compare joints."""
+    """Give the residuals of one quantity (a column) the same scale, to compare joints.
+
+    Args:
+        panels: axes of the column.
+        report: content of the report.
+        view: the run to show.
+        rows: joints and sensors of the figure.
+        quantity: the quantity, such as ``q``.
+    """
     limit = MIN_RESIDUAL_AXIS_SIGMAS
     for row in rows:
         if quantity in row.channels:
@@ -370,7 +390,13 @@ def _add_title_and_legend(
 ) -> None:
     """Add title, legend and margins to the figure of joints.
 
-    `names_width` is the width of the names at the left of the panels, in inches.
+    Args:
+        figure: the figure.
+        axes: array of its axes: motion, then residuals of each quantity.
+        report: content of the report.
+        view: the run that is shown.
+        rows: joints and sensors of the figure.
+        names_width: width of the names at the left of the panels, in inches.
     """
     width, height = figure.get_size_inches().tolist()
     total = len(list_joint_rows(report))

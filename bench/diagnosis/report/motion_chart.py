@@ -176,6 +176,12 @@ def _format_rows(
     """Format the samples of a channel of a run as columns of text for the chart's table.
 
     If there are more than `max_rows` samples, only the extremes of short parts are kept.
+
+    Args:
+        report: content of the report.
+        run: the run.
+        c: index of the channel.
+        max_rows: maximum number of samples.
     """
     split, channel = run.data_split, report.channels[c]
     times = split.times[run.row]
@@ -202,7 +208,12 @@ def _format_rows(
 
 
 def _format_numbers(values: Array, digits: int) -> list[str]:
-    """Format numbers with at most this many decimals; empty for missing values."""
+    """Format numbers with at most this many decimals; empty for missing values.
+
+    Args:
+        values: (T,) numbers, NaN where missing.
+        digits: maximum number of decimals.
+    """
     texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
     return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
 
@@ -264,7 +275,12 @@ def _list_hidden(
 ) -> tuple[str, ...]:
     """Return the channels or joints that are hidden at first, if there are many.
 
-    Those with the largest residuals stay visible. `toggle` is the switch that hides them.
+    Those with the largest residuals stay visible.
+
+    Args:
+        report: content of the report, with the residual of each channel.
+        places: facets of each panel, and the index of its channel.
+        toggle: facet whose values are hidden.
     """
     if len(places) <= MAX_INITIAL_CHANNELS:
         return ()
@@ -361,6 +377,11 @@ def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[Toolti
     """Return the values that the chart shows at the cursor.
 
     They are the signals in `unit`, and the residuals both in that unit and in units of the noise.
+
+    Args:
+        unit: unit of the channel.
+        sigma: standard deviation of its noise.
+        extended: whether there is an extended model.
     """
 
     def residual(label: str, y: str, style: MarkStyle) -> TooltipLine:

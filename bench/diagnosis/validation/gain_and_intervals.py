@@ -130,6 +130,11 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
 
     The first axis is the lower and the upper side. Row j of the first n parameters and states has
     number j moved by its step.
+
+    Args:
+        fit: the fit, with q free parameters.
+        steps: (n,) steps of the q parameters, then of the s initial states.
+        bounds: (q, 2) bounds of the parameters.
     """
     q = fit.free_indices.size
     theta = np.tile(fit.theta, (2, len(steps), 1))
@@ -149,6 +154,10 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     """Return the bounds (q, 2) of the fitted parameters, widened to contain the fit.
 
     Coefficients may be outside their plausible range.
+
+    Args:
+        evaluator: the runs, with the bounds of all parameters.
+        fit: the fit, with q free parameters.
     """
     values = fit.theta[fit.free_indices]
     bounds = [evaluator.parameters[i].bounds for i in fit.free_indices]
@@ -409,6 +418,10 @@ def _list_resampled_parts(
     """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
 
     Each is the index of the run and the slice of its samples.
+
+    Args:
+        evaluator: the predicted runs.
+        resamples_segments: whether the parts are segments even if there are several runs.
     """
     count = len(evaluator.prepared_runs)
     if count > 1 and not resamples_segments:
@@ -425,6 +438,10 @@ def _compute_closed_share(sums: Array, floor: float) -> Array:
     """Compute the share of the gap closed, eq. (1), for each row of sums (n, 3); 0 without a gap.
 
     A row has the squared errors before and after, and the number of samples.
+
+    Args:
+        sums: (n, 3) sum of squared errors before and after, and number of samples, of n resamples.
+        floor: RMS of the noise.
     """
     before, after, counts = sums.T
     base = np.sqrt(before / counts)

@@ -172,7 +172,9 @@ class HeldOutRuns:
     ) -> list[TrajectoryFit]:
         """Fit only the initial states of the runs, first to their beginning, then to longer parts.
 
-        Each of the `stages` is the share of the runs and the maximum number of iterations.
+        Args:
+            starts: model, parameters and first initial states of each fit.
+            stages: share of the runs and maximum number of iterations, one after another.
         """
         fits: list[TrajectoryFit] = []
         if not starts:
@@ -240,7 +242,12 @@ class HeldOutRuns:
     def _continue_about_best(
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
-        """Continue the fits with derivatives by initial states about the best of them."""
+        """Continue the fits with derivatives by initial states about the best of them.
+
+        Args:
+            fits: fit of each model.
+            stages: share of the runs and maximum number of iterations, one after another.
+        """
         # This import is needed for robots only.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
@@ -288,7 +295,12 @@ def _find_lowest_cost_fit(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
 def _select_nearer_fits(
     fits: Sequence[TrajectoryFit], other_fits: Sequence[TrajectoryFit]
 ) -> list[TrajectoryFit]:
-    """Return the better of two fits of each model."""
+    """Return the better of two fits of each model.
+
+    Args:
+        fits: fit of each model.
+        other_fits: another fit of each model, in the same order.
+    """
     return [_find_lowest_cost_fit(pair) for pair in zip(fits, other_fits, strict=True)]
 
 

@@ -158,7 +158,14 @@ def count_held_out_runs(case: BenchmarkCase) -> int:
 def _draw_conditions(
     name: str, system: str, hidden: tuple[str, ...], requested: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
-    """Draw the recording conditions of a case from its name, and cache them."""
+    """Draw the recording conditions of a case from its name, and cache them.
+
+    Args:
+        name: name of the case, from which its random numbers follow.
+        system: name of the system.
+        hidden: names of the hidden effects.
+        requested: conditions that are not drawn.
+    """
     return draw_conditions(system, make_case_rng(name, "setting"), hidden, requested=requested)
 
 
@@ -209,6 +216,13 @@ def _draw_clean(
 
     The parameters are those of the functions for the other kinds of cases, among which `draw_case`
     chooses.
+
+    Args:
+        case: the case.
+        setting: unused.
+        hidden: unused.
+        target_size: unused.
+        rng: unused.
     """
     return case
 

@@ -404,6 +404,12 @@ def _estimate_linear_step(
 
     Shape parameters that the system does not have are omitted.
 
+    Args:
+        fit: fits parameters, coefficients and initial states.
+        observed: noise-free observations, (R, T, C).
+        shape: shape parameters of the effect.
+        base_fit: fit without the effect.
+
     Returns:
         RMS residual of the linear model, and theta after the step.
     """

@@ -292,6 +292,12 @@ class BacklashReferenceLoad(ReferenceLoad):
         velocity w in the direction of contact and k = 150 rad/s, the acceleration is
 
             (1 - share) (k^2 d + 4 k w d / (d + gap / 100)), but never a pull.
+
+        Args:
+            x: position of the drive side, rad or m.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
         """
         excess = abs(x - y) - self.gap / 2
         if excess <= 0:

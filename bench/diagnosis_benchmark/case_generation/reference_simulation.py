@@ -160,6 +160,10 @@ def _get_read_column(system: str, channels: Sequence[str]) -> int:
     """Return the index of the channel on which sensor effects act: the height, angle or position.
 
     If that channel is not recorded, it is the first recorded one of the others.
+
+    Args:
+        system: name of the system.
+        channels: names of the recorded channels.
     """
     preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
     return next(channels.index(name) for name in preferred if name in channels)

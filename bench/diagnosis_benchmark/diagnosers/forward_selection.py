@@ -206,7 +206,12 @@ class ForwardBIC(_ForwardSelection):
         return float(samples * np.log(model.squares / samples) + model.numbers * np.log(samples))
 
     def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
-        """Return False: BIC only compares models; the search continues while a model is better."""
+        """Return False: BIC only compares models; the search continues while a model is better.
+
+        Args:
+            model: unused.
+            samples: unused.
+        """
         return False
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
@@ -265,7 +270,12 @@ class ForwardChi2(_ForwardSelection):
         return model.squares
 
     def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
-        """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`."""
+        """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`.
+
+        Args:
+            model: the fitted model.
+            samples: number of samples.
+        """
         return self._compute_p_value(model, samples) > FALSE_ALARM_RATE
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
@@ -351,6 +361,10 @@ def _replace_base_model(
 
     Directions of further effects must be computed at the current model. Cached properties are not
     copied, because they belong to the old model.
+
+    Args:
+        evidence: evidence about the base model.
+        current_fit: fit of the other model.
     """
     copied = object.__new__(RegressionEvidence)
     copied_attributes = ("evaluator", "noise", "stated", "base", "fitted", "held_out")

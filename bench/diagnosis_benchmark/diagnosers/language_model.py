@@ -113,6 +113,10 @@ def _round_value(value: float) -> float:
 def _run_command(prompt: str, seconds: float) -> str:
     """Run the user's command on a prompt.
 
+    Args:
+        prompt: text on the command's standard input.
+        seconds: time limit.
+
     Raises:
         InputError: there is no command, it fails, or it takes too long.
     """

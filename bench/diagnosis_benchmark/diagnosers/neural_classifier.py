@@ -230,6 +230,10 @@ def _compute_network_input(
 ) -> tuple[Array, float]:
     """Compute the network's input from a recording.
 
+    Args:
+        kind: simulator class.
+        recording: the recording.
+
     Returns:
         Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
         POINTS); and the RMS of the residuals.

@@ -201,10 +201,15 @@ class MachineDynamics(ABC):
         elif effect == "mass.scale":
             self._scale_mass(self.bodies.index(place), 1.0 + c[0])
 
-    def _scale_mass(self, body: int, times: float) -> None:
-        """Multiply the mass and inertia of a body by a factor."""
+    def _scale_mass(self, body: int, factor: float) -> None:
+        """Multiply the mass and inertia of a body by a factor.
+
+        Args:
+            body: index of the body.
+            factor: the factor.
+        """
         for name in (f"mass{body + 1}", f"inertia{body + 1}"):
-            self.numbers[name] = times * self.numbers[name]
+            self.numbers[name] = factor * self.numbers[name]
 
     def _add_unmodelled_cause(self, cause: str, place: str, c: list[float]) -> None:
         """Add a cause that the library does not contain.
@@ -224,7 +229,14 @@ class MachineDynamics(ABC):
             push, start, duration = c
 
             def compute_gust_force(t: float, q: Array, v: Array, u: Array) -> Array:
-                """Return the generalised forces (L, N) of the gust at time t."""
+                """Return the generalised forces (L, N) of the gust at time t.
+
+                Args:
+                    t: time, s.
+                    q: (L, N) positions; only the shape counts.
+                    v: unused.
+                    u: unused.
+                """
                 pushed = np.zeros_like(q)
                 pushed[:, joint] = push * (start <= t < start + duration)
                 return pushed

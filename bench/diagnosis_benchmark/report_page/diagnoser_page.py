@@ -129,6 +129,11 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
 def _format_significance(data: DiagnoserReportData, best: str, other_names: list[str]) -> str:
     """Say whether simgap as the best diagnoser differs significantly from the others.
 
+    Args:
+        data: tables of the comparison.
+        best: name of the best diagnoser.
+        other_names: names of the others.
+
     Returns:
         One sentence, or an empty text if there are no others or if simgap is not the best: only
         pairs with simgap are tested.

@@ -311,7 +311,12 @@ def is_constant(values: Array) -> bool:
 
 
 def _is_increasing(values: Array, repeated: float) -> bool:
-    """Return whether a column increases from row to row, except for a share of repeated rows."""
+    """Return whether a column increases from row to row, except for a share of repeated rows.
+
+    Args:
+        values: (T,) numbers of the column.
+        repeated: largest share of rows that repeat the one before.
+    """
     if values.size < 2 or not np.isfinite(values).all():
         return False
     steps = np.diff(values)

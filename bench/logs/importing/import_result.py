@@ -52,7 +52,12 @@ class ImportResult:
     _left_out: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def leave_out(self, column: LogColumn, reason: str) -> None:
-        """Report a column that is left out."""
+        """Report a column that is left out.
+
+        Args:
+            column: the column.
+            reason: why it is left out, in words.
+        """
         self._left_out.add((column.file, column.name))
         self.untold.append(f"{column.file}, column {column.name}: {reason}; left out")
 

@@ -164,7 +164,12 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
 
 
 def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool:
-    """Return whether a description's runs are episodes of a dataset."""
+    """Return whether a description's runs are episodes of a dataset.
+
+    Args:
+        description: path of the description.
+        meta: its content.
+    """
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
     folders = [table.get("folder") for table in tables if isinstance(table, dict)]

@@ -254,6 +254,11 @@ class RunLogs:
     def _leave_out_file(self, file: str, error: InputError, path: Path) -> None:
         """Leave out a file of a folder with a message.
 
+        Args:
+            file: name of the file in messages.
+            error: why it cannot be read.
+            path: its path, which is removed from the message.
+
         Raises:
             InputError: The user named the file.
         """
@@ -379,7 +384,12 @@ def hold_signal(stamps: Array, values: Array, times: Array) -> Array:
 
 
 def _list_all_columns(file: str, log: LogFile) -> list[LogColumn]:
-    """Return all numeric columns of a log."""
+    """Return all numeric columns of a log.
+
+    Args:
+        file: name of the log's file.
+        log: its content.
+    """
     columns = []
     for name in log.list_columns():
         values = log.get_column(name)

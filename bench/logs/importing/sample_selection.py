@@ -74,10 +74,14 @@ def _compute_sampling_rate(run: Run) -> float:
 
 
 def _preserves_motion(recording: Recording, stride: int) -> bool:
-    """Return whether every k-th sample still shows the whole motion; k is `stride`.
+    """Return whether every k-th sample still shows the whole motion.
 
     The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
     than if every second sample is kept, which is noise.
+
+    Args:
+        recording: the recording.
+        stride: the number k.
     """
     for run in recording.runs:
         if run.times.size < MIN_RUN_SAMPLES * stride:
@@ -117,7 +121,12 @@ def _compute_interpolation_error(times: Array, values: Array, stride: int) -> fl
 
 
 def _thin_run(run: Run, stride: int) -> Run:
-    """Keep every k-th sample of a run, and average its inputs from each one to the next."""
+    """Keep every k-th sample of a run, and average its inputs from each one to the next.
+
+    Args:
+        run: the run.
+        stride: the number k.
+    """
     part = run.part(slice(None, None, stride))
     first = np.arange(0, run.times.size, stride)
     spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))

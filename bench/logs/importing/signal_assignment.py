@@ -176,7 +176,12 @@ class SignalAssignment:
 
 
 def is_convertible(unit: str, target: str) -> bool:
-    """Return whether a unit converts to another one."""
+    """Return whether a unit converts to another one.
+
+    Args:
+        unit: name of the unit; an empty one does not convert.
+        target: name of the other unit.
+    """
     try:
         compute_unit_scale(unit, target)
     except InputError:
@@ -297,8 +302,13 @@ def _assign_kind(
 ) -> None:
     """Assign velocity columns that agree with the derivative of their position.
 
-    `candidates` are the columns of one kind, which share a unit and a filter. All are left out if
-    the velocities lag behind the positions. A joint that hardly moves gets the unit of the others.
+    All are left out if the velocities lag behind the positions. A joint that hardly moves gets the
+    unit of the others.
+
+    Args:
+        candidates: columns of one kind, which share a unit and a filter.
+        signals: assignment to which they are added.
+        result: result of the import, to which messages are added.
     """
     confirmed = [candidate for candidate in candidates if candidate.unit]
     units = [candidate.unit for candidate in confirmed]
@@ -477,7 +487,14 @@ class ColumnAssigner:
     def _add_signal(
         self, table: dict[str, Signal], name: str, column: LogColumn, signal: Signal | None
     ) -> bool:
-        """Add a signal unless one with this name exists; return whether it was added."""
+        """Add a signal unless one with this name exists; return whether it was added.
+
+        Args:
+            table: channels or inputs of the assignment, extended in place.
+            name: name of the signal.
+            column: its column.
+            signal: the signal; None to report only that the name is in use.
+        """
         if name in table:
             self._result.leave_out(column, f"{name} is {table[name].column.name} already")
             return False
@@ -589,7 +606,15 @@ class ColumnAssigner:
     def _assign_force(
         self, column: LogColumn, joint: Joint, name: str, placement: Placement, origin: str = ""
     ) -> None:
-        """Assign the torque of a motor, or a force along a joint."""
+        """Assign the torque of a motor, or a force along a joint.
+
+        Args:
+            column: column of the log.
+            joint: joint along which the force acts.
+            name: name of the input.
+            placement: reason for the joint.
+            origin: reason for the meaning, in words.
+        """
         unit = column.unit or joint.force_unit
         if not is_convertible(unit, joint.force_unit):
             self._result.leave_out(column, f"is in {unit}, expected {joint.force_unit}")

@@ -94,6 +94,11 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     """Compute differences of the given order, eq. (1): smooth motion cancels, noise stays.
 
     They are scaled so that white noise keeps its variance. Differences across a gap are left out.
+
+    Args:
+        times: (T,) times, s.
+        values: (T,) signal without missing samples.
+        order: order of the differences.
     """
     t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
     # Motion across a gap is no longer close to a polynomial.

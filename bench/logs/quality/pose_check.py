@@ -138,7 +138,11 @@ def iterate_poses(
     """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
 
     The same object is yielded each time, with up to `CHECKED_INSTANTS` poses one after another.
-    Commands and forces that `inputs` lacks are zero.
+
+    Args:
+        kind: simulator class of the robot.
+        positions: (T,) positions by channel ``q.JOINT``, rad or m.
+        inputs: (T,) inputs by name; those that are missing are zero.
     """
     import mujoco
 
@@ -210,6 +214,10 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
     """Find positions far beyond the limits of a joint, which a wrong unit would explain.
 
     Only the first run with such positions is reported.
+
+    Args:
+        recording: recording of the robot.
+        joint: joint of its model, with the range of its position.
     """
     column = f"q.{joint.name}"
     unit, (smaller_unit, name) = joint.unit, _SMALLER_UNITS[joint.unit]
@@ -343,7 +351,9 @@ def _check_exchanged(
 ) -> Iterator[Anomaly]:
     """Find pairs of joints that follow each other's command instead of their own.
 
-    `pairs` has slope and correlation for each pair of a command and a position.
+    Args:
+        servo_signals: names of command and position of each servo.
+        pairs: slope and correlation of each pair of a command and a position.
     """
     for i, (command, position) in enumerate(servo_signals):
         for other_command, other_position in servo_signals[i + 1 :]:

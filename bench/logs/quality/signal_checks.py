@@ -178,7 +178,12 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
 def _iterate_channels(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[tuple[Channel, list[tuple[Array, Array]]]]:
-    """Yield each recorded channel with its times and values in every run."""
+    """Yield each recorded channel with its times and values in every run.
+
+    Args:
+        recording: the recording.
+        kind: simulator class, which declares the channels.
+    """
     for channel in kind.channels:
         signals = [
             (run.times, run.channels[channel.name]) for run in _select_runs(recording, channel)
@@ -196,6 +201,11 @@ def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> 
 
     The signal must jump into or out of a stretch: a quantised signal that reverses at its end
     changes by one step only.
+
+    Args:
+        values: (T,) signal.
+        extreme: its smallest or largest value.
+        min_jump: smallest change into or out of a saturated stretch, in the unit of the signal.
     """
     is_at_end = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
     edges = np.flatnonzero(np.diff(is_at_end))

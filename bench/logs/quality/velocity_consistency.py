@@ -211,7 +211,12 @@ class _Series(NamedTuple):
         return _Series(run.times[is_recorded], q[is_recorded], v[is_recorded])
 
     def integrate(self, length: int, max_gap: float) -> tuple[Array, Array, Array]:
-        """Return dq, s and dv of intervals of `length` samples; s is NaN across a gap in time."""
+        """Return dq, s and dv of intervals of `length` samples; s is NaN across a gap in time.
+
+        Args:
+            length: number of samples of an interval.
+            max_gap: longest step within an interval, s.
+        """
         steps = np.diff(self.times)
         areas = 0.5 * (self.velocity[1:] + self.velocity[:-1]) * steps
         areas[steps > max_gap] = np.nan
