@@ -394,7 +394,13 @@ def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
 def _make_subclass(
     extended: ExtendedSimulator, kind: type[SystemSimulator], parameters: tuple[Parameter, ...]
 ) -> type[SystemSimulator]:
-    """Make a subclass of `kind` with all fitted values as defaults."""
+    """Make a subclass of `kind` with all fitted values as defaults.
+
+    Args:
+        extended: the extended simulator.
+        kind: simulator class of its system.
+        parameters: parameters with the fitted values as nominal ones.
+    """
     effects, observed = list(extended.effects), list(extended.observe)
 
     def __init__(  # noqa: N807

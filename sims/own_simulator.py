@@ -96,7 +96,14 @@ class OwnSimulatorSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Return the channels, which are the motion that a user-defined simulator returns."""
+        """Return the channels, which are the motion that a user-defined simulator returns.
+
+        Args:
+            x: (L, T, C) values of the channels.
+            v: unused.
+            a: unused.
+            constants: unused.
+        """
         return {c.name: x[:, :, i] for i, c in enumerate(self.channels)}
 
 
@@ -251,6 +258,10 @@ class OwnSimulator(SystemSimulator):
 
     def _make_engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         """Return the engine that calls the user's `step`, with the given or declared time step.
+
+        Args:
+            name: name of an engine; only None is possible.
+            settings: settings by name; ``time_step`` in seconds is the only one.
 
         Raises:
             InputError: an engine is named, or a setting is unknown or not positive.

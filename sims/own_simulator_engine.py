@@ -52,7 +52,13 @@ class SteppableSimulator(Protocol):
         constants: Mapping[str, float],
         initial: Mapping[str, float],
     ) -> None:
-        """Start a run in the given initial state; see `own_simulator.OwnSimulator.reset`."""
+        """Start a run in the given initial state; see `own_simulator.OwnSimulator.reset`.
+
+        Args:
+            theta: parameters by name.
+            constants: constants by name.
+            initial: initial states by name.
+        """
         ...
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None: ...
@@ -160,7 +166,12 @@ class OwnSimulatorEngine:
 
 
 def _make_simulator_error(world: SteppableSimulator, error: Exception) -> InputError:
-    """Make the error for an exception in the simulator's code, with its line."""
+    """Make the error for an exception in the simulator's code, with its line.
+
+    Args:
+        world: the user's simulator.
+        error: the exception.
+    """
     frames = traceback.extract_tb(error.__traceback__)
     module = sys.modules.get(type(world).__module__)
     module_frames = [
@@ -186,7 +197,7 @@ def observed(world: SteppableSimulator, observation: Mapping[str, float], name: 
     try:
         value = observation[name]
     except (KeyError, TypeError, IndexError):
-        raise _unobserved(world, observation, name) from None
+        raise _make_unobserved_error(world, observation, name) from None
     if isinstance(value, float):  # shortcut (NumPy floats, too), because the general test is slow
         return float(value)
     if shape := np.shape(value):
@@ -201,8 +212,14 @@ def observed(world: SteppableSimulator, observation: Mapping[str, float], name: 
         ) from None
 
 
-def _unobserved(world: SteppableSimulator, observation: object, name: str) -> InputError:
-    """Make the error for a value that `observe` did not return."""
+def _make_unobserved_error(world: SteppableSimulator, observation: object, name: str) -> InputError:
+    """Make the error for a value that `observe` did not return.
+
+    Args:
+        world: the user's simulator.
+        observation: what `observe` returned.
+        name: name of the value.
+    """
     if not isinstance(observation, Mapping):
         type_name = type(observation).__name__
         return InputError(
@@ -305,8 +322,8 @@ class _Forces:
             seconds: Length of the step, s.
         """
         observation = self.world.observe()
-        x = self._state(observation, self.world.coordinates)
-        v = self._state(observation, self.world.rates)
+        x = self._read_state(observation, self.world.coordinates)
+        v = self._read_state(observation, self.world.rates)
         applied_inputs = {name: np.array([[value]]) for name, value in inputs.items()}
         time = np.array([[t]])
         moment = StateSnapshot(self.system, self.theta, self.constants, time, x, v, applied_inputs)
@@ -314,13 +331,18 @@ class _Forces:
         for effect, c in self.forces:
             force = force + effect.force(c, moment)[0]
         if self.frictions:
-            force = force + self._friction(moment, force, seconds)
+            force = force + self._compute_friction(moment, force, seconds)
         return force
 
-    def _friction(self, moment: StateSnapshot, force: Array, seconds: float) -> Array:
+    def _compute_friction(self, moment: StateSnapshot, force: Array, seconds: float) -> Array:
         """Return the force (D,) that stops the motion within the step, up to the limit.
 
         The simulator's own force is estimated from the last step.
+
+        Args:
+            moment: state of the simulator.
+            force: (D,) sum of the other effects' forces.
+            seconds: length of the step.
         """
         inertia = inertia_of(self.world)
         v = moment.v[0]
@@ -335,8 +357,13 @@ class _Forces:
         self._last = v, force + friction, seconds
         return friction
 
-    def _state(self, observation: Mapping[str, float], names: Sequence[str]) -> Array:
-        """Return the named numbers in the observation `observation` as an array (1, D)."""
+    def _read_state(self, observation: Mapping[str, float], names: Sequence[str]) -> Array:
+        """Return numbers of an observation as an array (1, D).
+
+        Args:
+            observation: what `observe` returned.
+            names: names of the numbers.
+        """
         values = [observed(self.world, observation, name) for name in names]
         state: Array = np.array([values])
         return state
@@ -358,7 +385,9 @@ def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[
             "name": f"{effect.name}@{channel.name}" if has_several_levels else effect.name,
             "of": effect.name,
             "place": channel.name if has_several_levels else "",
-            "coefficients": [_sized(c, channel.unit, channel.scale) for c in effect.coefficients],
+            "coefficients": [
+                _convert_to_level_size(c, channel.unit, channel.scale) for c in effect.coefficients
+            ],
             "__module__": __name__,
             "__doc__": effect.__doc__,
         }
@@ -366,8 +395,14 @@ def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[
     return tuple(effects)
 
 
-def _sized(c: Coefficient, unit: str, scale: float) -> Coefficient:
-    """Convert a coefficient to the unit and size of a level."""
+def _convert_to_level_size(c: Coefficient, unit: str, scale: float) -> Coefficient:
+    """Convert a coefficient to the unit and size of a level.
+
+    Args:
+        c: the coefficient.
+        unit: unit of the level.
+        scale: typical size of the level, in this unit.
+    """
     low, high = c.plausible[0]
     return replace(c, units=(unit,) * 3, plausible=((low * scale, high * scale),) * 3)
 

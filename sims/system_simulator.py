@@ -223,7 +223,7 @@ class SystemSimulator(Simulator):
             filtered = any(_filters(effect) for effect, _ in sensors)
             steps_per_state = 1 if filtered else plan.steps_per_sample
             base_theta = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
-            constants, x, v = self._known(scenarios, initial)
+            constants, x, v = self._collect_known_values(scenarios, initial)
             forces = _select_effects(
                 active_effects, (Force, Friction, Contact, HiddenStateEffect, Level)
             )
@@ -307,18 +307,23 @@ class SystemSimulator(Simulator):
         for effect in self.effects:
             count = len(effect.on(self.system))
             rows = theta[:, place : place + count].T
-            active_effects.append((effect, _coefficients(effect, rows)))
+            active_effects.append((effect, _expand_coefficients(effect, rows)))
             place += count
         for effect, values in self.fixed:
             column = np.array(values)[:, None]
             rows = np.repeat(column, len(theta), axis=1)
-            active_effects.append((effect, _coefficients(effect, rows)))
+            active_effects.append((effect, _expand_coefficients(effect, rows)))
         return tuple(active_effects)
 
-    def _known(
+    def _collect_known_values(
         self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> tuple[dict[str, Array], Array, Array]:
-        """Return constants (L, 1) by name, and initial positions and velocities (L, D)."""
+        """Return constants (L, 1) by name, and initial positions and velocities (L, D).
+
+        Args:
+            scenarios: scenario of each of L batch elements.
+            initial: initial states (L,) by name, in place of those of the scenarios.
+        """
         # Check each scenario object once, not each of hundreds of batch elements.
         distinct, object_index = group_by_identity(scenarios)
         run_constants = _expand_rows([self.run_constants(s) for s in distinct], object_index)
@@ -520,8 +525,13 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
             )
 
 
-def _coefficients(effect: Effect, rows: Array) -> Array:
-    """Extend coefficients `rows` (k, L) to (K, L, 1) with zeros."""
+def _expand_coefficients(effect: Effect, rows: Array) -> Array:
+    """Extend coefficients to (K, L, 1) with zeros.
+
+    Args:
+        effect: the effect, with K coefficients.
+        rows: (k, L) its first coefficients.
+    """
     result = np.zeros((len(effect.coefficients), rows.shape[1], 1))
     result[: len(rows), :, 0] = rows
     return result

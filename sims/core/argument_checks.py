@@ -214,7 +214,13 @@ _NO_MATCH = object()
 
 
 def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value annotated with `Expected`, whose words replace the default ones."""
+    """Convert a value annotated with `Expected`, whose words replace the default ones.
+
+    Args:
+        place: the argument and the position in it, for messages.
+        value: value of the argument.
+        hint: annotation, ``Annotated[TYPE, Expected(...)]``.
+    """
     annotated_type, expected = get_args(hint)[:2]
     try:
         converted = _convert_value(place, value, annotated_type)
@@ -229,6 +235,11 @@ def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
 
 def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the first of several types that accepts it.
+
+    Args:
+        place: the argument and the position in it, for messages.
+        value: value of the argument.
+        hint: annotation, a union of types.
 
     Raises:
         _MismatchError: no type accepts it; the error names a wrong entry of a list or dict.
@@ -247,7 +258,13 @@ def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
 
 
 def _convert_to_type(value: Any, hint: Any, arguments: tuple[Any, ...]) -> Any:
-    """Convert a value to a single type; `_NO_MATCH` if it does not match."""
+    """Convert a value to a single type; `_NO_MATCH` if it does not match.
+
+    Args:
+        value: value of the argument.
+        hint: annotation, a single type.
+        arguments: arguments of this type, as of ``type[Effect]``.
+    """
     if hint is NoneType:
         return None if value is None else _NO_MATCH
     if get_origin(hint) is type:
@@ -276,7 +293,13 @@ def _is_whole(value: Any) -> bool:
 
 
 def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a list; a single entry becomes a list of one."""
+    """Convert a value to a list; a single entry becomes a list of one.
+
+    Args:
+        place: the argument and the position in it, for messages.
+        value: value of the argument; a text is split at commas.
+        hint: annotation, a list type.
+    """
     (entry,) = get_args(hint)
     if isinstance(value, str):
         # Paths may contain commas, names may not.
@@ -294,7 +317,12 @@ def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
 
 
 def _is_convertible(value: Any, hint: Any) -> bool:
-    """Return whether a value has the annotated type, or can be converted to it."""
+    """Return whether a value has the annotated type, or can be converted to it.
+
+    Args:
+        value: value of the argument.
+        hint: its annotation.
+    """
     try:
         _convert_value("", value, hint)
     except _MismatchError:
@@ -303,7 +331,13 @@ def _is_convertible(value: Any, hint: Any) -> bool:
 
 
 def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a dict with texts as keys."""
+    """Convert a value to a dict with texts as keys.
+
+    Args:
+        place: the argument and the position in it, for messages.
+        value: value of the argument.
+        hint: annotation, a mapping type.
+    """
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         return _NO_MATCH
     return {
@@ -313,7 +347,13 @@ def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
 
 
 def _convert_to_tuple(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a tuple of the annotated length."""
+    """Convert a value to a tuple of the annotated length.
+
+    Args:
+        place: the argument and the position in it, for messages.
+        value: value of the argument.
+        hint: annotation, a tuple type of fixed length.
+    """
     entry_types = get_args(hint)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(entry_types):
         return _NO_MATCH

@@ -53,7 +53,12 @@ def format_unit(unit: str) -> str:
 
 
 def append_unit(text: str, unit: str) -> str:
-    """Append a unit to a number; a pure number has none."""
+    """Append a unit to a number; a pure number has none.
+
+    Args:
+        text: the number.
+        unit: its unit.
+    """
     unit_text = format_unit(unit)
     return f"{text} {unit_text}" if unit_text else text
 

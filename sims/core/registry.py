@@ -128,6 +128,13 @@ class Registry(Generic[T]):
         """Raise an error if a part of simgap itself is no longer where the installation says.
 
         Without the part, a search for causes would be silently incomplete.
+
+        Args:
+            name: name of the part.
+            error: error of its import.
+
+        Raises:
+            InputError: the installation names a module or class that has moved.
         """
         module = self._entry_points[name].module
         # A module that fails during its import, as with another version of a library, is removed.
@@ -211,7 +218,12 @@ class Registry(Generic[T]):
         return registered.path if registered else None
 
     def _is_registered(self, name: str, part: type[T]) -> bool:
-        """Return whether this class is registered under the name."""
+        """Return whether this class is registered under the name.
+
+        Args:
+            name: name of the part.
+            part: the class.
+        """
         if name in self._added:
             return self._added[name].part is part
         return name in self._entry_points and self._entry_points[name].value == ":".join(

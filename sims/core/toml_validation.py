@@ -354,7 +354,12 @@ def get_type_hints_of(kind: type) -> dict[str, Any]:
 
 
 def _choose_union_member(value: Any, members: Sequence[Any]) -> Any:
-    """Return the type of a union to check a value against: a tuple for a list, else the first."""
+    """Return the type of a union to check a value against: a tuple for a list, else the first.
+
+    Args:
+        value: the value.
+        members: types of the union.
+    """
     # TOML has no null: entries that may be None are left out.
     kinds = [kind for kind in members if kind is not NoneType]
     lists = [kind for kind in kinds if get_origin(kind) is tuple]

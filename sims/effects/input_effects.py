@@ -319,7 +319,12 @@ class InputRateLimit(Input):
 
 
 def _apply_lag(signal: Signal, lag: Array) -> Array:
-    """Return means (L, S) of the lagged input (4) over each step; `lag` (L, 1) is in seconds."""
+    """Return means (L, S) of the lagged input (4) over each step.
+
+    Args:
+        signal: the input before the effect.
+        lag: (L, 1) time constants in seconds.
+    """
     # the command is constant over a step, so (2) of sims.effects.input_effects gives the value at
     # its end
     decay, mean = compute_lag_response(signal.steps, lag)
@@ -329,10 +334,14 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
 
 
 def _apply_play(signal: Signal, half: Array) -> Array:
-    """Return the input (L, S) after backlash (7), with clearance `half` (L, 1) to either side.
+    """Return the input (L, S) after backlash (7).
 
     The output is constant while it is within the clearance of the input; otherwise the nearer flank
     pushes it.
+
+    Args:
+        signal: the input before the effect.
+        half: (L, 1) clearance to either side, in the unit of the input.
     """
     # The loop runs over contiguous rows, one per step.
     low = np.ascontiguousarray((signal.values - half).T)
@@ -352,7 +361,9 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
 
     With the command u and a step h, dw/dt = clip((u - w) / h, -limit, limit).
 
-    `limit` (L, 1) is the largest rate, infinite for no limit.
+    Args:
+        signal: the input before the effect.
+        limit: (L, 1) largest rate, infinite for no limit.
     """
     commands = np.ascontiguousarray(signal.values.T)
     # An infinite limit times a step of zero length counts as zero.

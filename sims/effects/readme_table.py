@@ -42,9 +42,12 @@ def _format_effect_rows(effect: type[Effect]) -> list[str]:
 def _format_range(c: Coefficient, kind_index: int) -> str:
     """Format the plausible range of a coefficient for one kind of system.
 
-    `kind_index` is the index of the kind in `SYSTEM_KINDS`. A dash means that the effect does not
-    exist on this kind of system, and (*) that the unit is that of another quantity, such as an
-    input.
+    A dash means that the effect does not exist on this kind of system, and (*) that the unit is
+    that of another quantity, such as an input.
+
+    Args:
+        c: the coefficient.
+        kind_index: index of the kind in `SYSTEM_KINDS`.
     """
     unit = c.units[kind_index]
     if unit is None:

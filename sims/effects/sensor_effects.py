@@ -225,7 +225,12 @@ class ClockSkew(Sensor):
 
 
 def _smooth_step(instant: Array, times: Array) -> Array:
-    """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between."""
+    """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between.
+
+    Args:
+        instant: (L, 1) time of the slip, s.
+        times: (L, S) time stamps, s.
+    """
     intervals = np.maximum(np.diff(times, axis=1, prepend=times[:, :1]), _MIN_SAMPLE_INTERVAL)
     share: Array = np.clip((times - instant) / intervals + 0.5, 0.0, 1.0)
     return share

@@ -127,10 +127,12 @@ class ServoMotionProfile(Input):
 def _apply_acceleration_limit(signal: Signal, max_acceleration: Array) -> Array:
     """Return the set point limited in acceleration (3), as means (L, S) over each step.
 
-    `max_acceleration` (L,) is the limit c of the acceleration, in units of the set point per s^2.
-
     The speed w at the end of a step is chosen such that the remaining distance is sufficient for
     stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
+
+    Args:
+        signal: the set point before the effect.
+        max_acceleration: (L,) limit c of the acceleration, in units of the set point per s².
     """
     commands, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
     means = np.empty_like(commands)

@@ -248,7 +248,12 @@ class JointBacklash(DrivenLoad):
 
 
 def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:
-    """Return the acceleration (L, 1) by gravity alone at positions y (L, 1)."""
+    """Return the acceleration (L, 1) by gravity alone at positions y (L, 1).
+
+    Args:
+        moment: state of the batch.
+        y: (L, 1) positions of the primary coordinate.
+    """
     moment_at_y = replace(moment, x=moment.along_primary(y))
     weight = moment.system.weight(moment_at_y)[:, moment.system.primary, None]
     fall: Array = weight / moment.inertia

@@ -183,7 +183,13 @@ def build_time_grid(
 def _find_change_times(
     runs: ScenarioGroups, commands: Commands, shifting: Sequence[tuple[Effect, Array]]
 ) -> Array:
-    """Return the times (L, K) at which a changed command is applied; zero where there are fewer."""
+    """Return the times (L, K) at which a changed command is applied; zero where there are fewer.
+
+    Args:
+        runs: scenarios of the batch elements.
+        commands: values of each input, by name, of each distinct scenario.
+        shifting: effects that shift time, with their coefficients.
+    """
     columns = []
     for index, name in enumerate(commands[0]):
         change_times = []

@@ -186,7 +186,12 @@ class RecordingTable:
     def _convert_cells(
         self, header: list[str], records: Iterator[list[str]]
     ) -> tuple[list[str], dict[str, Array]]:
-        """Convert the rows below the header to run names and numeric columns (T,)."""
+        """Convert the rows below the header to run names and numeric columns (T,).
+
+        Args:
+            header: names of the columns.
+            records: cells of each row.
+        """
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _ROWS_PER_CHUNK)):
@@ -297,6 +302,11 @@ class RecordingTable:
 
     def _check_cell(self, name: str, cell: str, record: int) -> None:
         """Check that a cell holds a finite number.
+
+        Args:
+            name: name of the column.
+            cell: text of the cell.
+            record: number of the row, counted from 0 without the header.
 
         Raises:
             InputError: the cell does not; the message states its row and column.

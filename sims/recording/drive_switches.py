@@ -221,10 +221,14 @@ def spans(mask: Mask) -> list[tuple[int, int]]:
 
 
 def split_without_masked(run: Run, off: Mask) -> list[Run]:
-    """Return the parts of a run in which a mask (T,) is not set.
+    """Return the parts of a run in which a mask is not set.
 
     Parts of fewer than `MIN_PART_SAMPLES` samples are left out. If the mask is set nowhere, the run
     itself is returned.
+
+    Args:
+        run: the run.
+        off: (T,) the mask.
     """
     if not off.any():
         return [run]

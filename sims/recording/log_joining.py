@@ -194,6 +194,10 @@ class _FolderLogs:
         """Return the times (T,) of a run in seconds: all instants at which a signal has a sample.
 
         Instants of inputs before the first or after the last measurement are left out.
+
+        Args:
+            run: name of the run.
+            rows_of: stamps and rows of each log, by path.
         """
 
         def stamps_of(names: Sequence[str]) -> list[Array]:
@@ -264,6 +268,10 @@ class _FolderLogs:
 
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
+
+        Args:
+            log: the log.
+            run_rows: mask of the rows of one run; None for all.
 
         Raises:
             InputError: A stamp is missing or decreases, or many stamps repeat the previous one.

@@ -244,7 +244,15 @@ def _assemble_recording(
     description_path: Path,
     model: ModelFileReference | None,
 ) -> Recording:
-    """Make a recording in SI units from the tables of its runs and its description."""
+    """Make a recording in SI units from the tables of its runs and its description.
+
+    Args:
+        table: path of the table.
+        parts: rows of each run.
+        description: checked description.
+        description_path: its path, for messages.
+        model: model file of a robot; None for a system.
+    """
     check_run_names(description_path, description.runs, [part.name for part in parts])
     switched = apply_drive_switches(
         table, [_make_run(table, part, description) for part in parts], description.switches
@@ -414,7 +422,13 @@ def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> A
 
 
 def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
-    """Divide the runs into runs for fitting and held-out runs; see `split_held_out`."""
+    """Divide the runs into runs for fitting and held-out runs; see `split_held_out`.
+
+    Args:
+        path: path of the recording, for messages.
+        runs: all runs.
+        folds: whether few runs get folds of a cross-validation in place of held-out runs.
+    """
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
@@ -437,7 +451,15 @@ def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]
 
 
 def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
-    """Split a run into its first two thirds and its last third, which is held out."""
+    """Split a run into its first two thirds and its last third, which is held out.
+
+    Args:
+        path: path of the recording, for messages.
+        run: the run.
+
+    Raises:
+        InputError: a part would have too few samples.
+    """
     count = len(run.times)
     split_index = (2 * count) // _HELD_OUT_STRIDE
     parts = (

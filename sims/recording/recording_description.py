@@ -333,6 +333,12 @@ def _read_wrapped_channels(
     """Return the channels whose whole turns are restored.
 
     Each has the name of the input that determines the turn, or an empty name.
+
+    Args:
+        path: path of the description, for messages.
+        channels: columns of the channels.
+        inputs: columns of the inputs.
+        declared: signals that the system declares.
     """
     units = {channel.name: channel.unit for channel in declared.channels}
     result = {}
@@ -457,7 +463,14 @@ def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 def _read_columns(
     path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
 ) -> dict[str, _Column]:
-    """Return the conversion of each column of one kind ("channel" or "input")."""
+    """Return the conversion of each column of one kind ("channel" or "input").
+
+    Args:
+        path: path of the description, for messages.
+        kind: ``channel`` or ``input``.
+        meta: content of the description.
+        declared: signals of this kind that the system declares.
+    """
     units = {signal.name: signal.unit for signal in declared}
     tables = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
     check_known_names(f"{kind} in {path}", tables, units)
@@ -558,6 +571,11 @@ def _read_noises(
 
     The standard deviation is stated in the unit of the column. Values beyond plausible sizes
     are refused, since the unit is probably wrong.
+
+    Args:
+        path: path of the description, for messages.
+        channels: columns of the channels.
+        declared: signals that the system declares, with their scales.
     """
     sizes = {channel.name: channel.scale for channel in declared.channels}
     noises = {}
@@ -677,7 +695,14 @@ def _read_constants(
 def _read_numbers(
     path: Path, key: str, value: Any, allowed_names: Collection[str]
 ) -> dict[str, float]:
-    """Check a table of finite numbers, whose names must be among the allowed ones."""
+    """Check a table of finite numbers, whose names must be among the allowed ones.
+
+    Args:
+        path: path of the description, for messages.
+        key: key of the table.
+        value: the table.
+        allowed_names: names that may occur in it.
+    """
     entries = dotted(check_table(path, key, value), allowed_names)
     _check_known_names(path, key, entries, allowed_names)
     return {name: check_finite(path, f"{key}.{name}", number) for name, number in entries.items()}
@@ -686,7 +711,17 @@ def _read_numbers(
 def _check_constants_possible(
     path: Path, key: str, constants: Mapping[str, float], declared: DeclaredSignals
 ) -> None:
-    """Check that constants are physically possible, such as a positive mass."""
+    """Check that constants are physically possible, such as a positive mass.
+
+    Args:
+        path: path of the description, for messages.
+        key: key of their table.
+        constants: constants by name.
+        declared: constants that the system declares.
+
+    Raises:
+        InputError: a constant is impossible.
+    """
     for c in declared.constants:
         if c.name in constants and (expected := c.wanted(constants[c.name])):
             value = constants[c.name]

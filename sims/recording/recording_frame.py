@@ -265,7 +265,13 @@ class _FrameTable(RecordingTable):
         return [f"{cell:g}" if is_float else str(cell).strip() for cell in cells]
 
     def _get_values(self, name: str, frame: Any, column: str) -> Array:
-        """Return a column as numbers (T,); NaN where a cell is missing."""
+        """Return a column as numbers (T,); NaN where a cell is missing.
+
+        Args:
+            name: name of the signal; ``t`` for the times.
+            frame: the data frame.
+            column: name of the column.
+        """
         cells = frame[column]
         if name == "t" and cells.dtype.kind == "M":  # absolute time stamps
             cells = cells - cells.min()

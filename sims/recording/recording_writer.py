@@ -101,7 +101,14 @@ def _format_table(runs: Sequence[Run], digits: int) -> str:
 def _list_signals(
     run: Run, inputs: list[str], channels: list[str], extra: list[str]
 ) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
-    """Return expected names, signals of the run, and a word for each kind of column."""
+    """Return expected names, signals of the run, and a word for each kind of column.
+
+    Args:
+        run: the run.
+        inputs: names of the inputs of all runs.
+        channels: names of the channels of all runs.
+        extra: names of further columns of all runs.
+    """
     return (
         (inputs, run.inputs, "input"),
         (channels, run.channels, "channel"),

@@ -39,7 +39,12 @@ class ContactParameters(NamedTuple):
 
 
 def get_geom_name(model: Any, geom: int) -> str:
-    """Return the name of a geom; such as ``geom3`` if it has none."""
+    """Return the name of a geom; such as ``geom3`` if it has none.
+
+    Args:
+        model: compiled model.
+        geom: number of the geom.
+    """
     return str(model.geom(geom).name).removeprefix(UNNAMED_PREFIX) or f"geom{geom}"
 
 
@@ -50,6 +55,10 @@ def make_pair_name(model: Any, geoms: Collection[int]) -> str:
 
 def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
     """Return the numbers of the two geoms of a pair.
+
+    Args:
+        robot: the robot.
+        pair: names of both geoms, joined by `PAIR_SEPARATOR`.
 
     Raises:
         InputError: there are no such geoms; the message lists the existing ones.
@@ -68,7 +77,12 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
 
 
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
-    """Return the parameters that MuJoCo gives to a contact of two geoms."""
+    """Return the parameters that MuJoCo gives to a contact of two geoms.
+
+    Args:
+        model: compiled model.
+        geoms: numbers of the two geoms.
+    """
     geom_rows = np.array(geoms)
     margin, gap = float(model.geom_margin[geom_rows].sum()), float(model.geom_gap[geom_rows].sum())
     priority = model.geom_priority[geom_rows]
@@ -108,14 +122,24 @@ def find_pair(robot: RobotModel, pair: str) -> int:
 
 
 def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
-    """Return whether the model has an element `<pair>` of two geoms."""
+    """Return whether the model has an element `<pair>` of two geoms.
+
+    Args:
+        robot: the robot.
+        geoms: numbers of the two geoms.
+    """
     model = robot.compiled
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     return set(geoms) in [set(one) for one in pairs]
 
 
 def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]:
-    """Return the sliding friction coefficient and `solref` of a pair in the model file."""
+    """Return the sliding friction coefficient and `solref` of a pair in the model file.
+
+    Args:
+        robot: the robot.
+        pair: names of both geoms, joined by `PAIR_SEPARATOR`.
+    """
     geoms = find_pair_geoms(robot, pair)
     if has_pair(robot, geoms):
         pair_index = find_pair(robot, pair)

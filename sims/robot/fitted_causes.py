@@ -152,7 +152,12 @@ def _list_family_causes(
 
 
 def _list_places(robot: RobotModel, effect: str) -> list[str]:
-    """List the places of an effect family that has one number for all places."""
+    """List the places of an effect family that has one number for all places.
+
+    Args:
+        robot: the robot.
+        effect: name of the effect without its place.
+    """
     if effect.startswith("input."):
         return [actuator.name for actuator in robot.actuators if actuator.motion is not None]
     if effect.startswith("sensor."):

@@ -113,7 +113,12 @@ def parse_option(name: str, value: float | str) -> float:
 
 
 def read_option(robot: RobotModel, name: str) -> float:
-    """Return the number of an option in the robot's model file."""
+    """Return the number of an option in the robot's model file.
+
+    Args:
+        robot: the robot.
+        name: name of the option, such as ``impratio``.
+    """
     return cast(float, getattr(robot.compiled.opt, name))
 
 

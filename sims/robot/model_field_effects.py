@@ -69,7 +69,12 @@ class ModelFieldEffect:
 
 
 def add_to_file_value(file_value: Any, c: Any) -> Any:
-    """Add a coefficient to a value by eq. (1), at least zero; a negative file value may remain."""
+    """Add a coefficient to a value by eq. (1), at least zero; a negative file value may remain.
+
+    Args:
+        file_value: value in the model file, number or array.
+        c: the coefficient, of the same shape.
+    """
     return np.maximum(file_value + c, np.minimum(file_value, 0.0))
 
 
@@ -238,21 +243,42 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed."""
+    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed.
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot.
+        place: name of the body.
+        c: (1, L) coefficient.
+    """
     number = robot.body(place).id
     fields["body_mass"][:, number] *= compute_factor(c[0])
     fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
 
 
 def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity."""
+    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity.
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot, with the gravity of the file.
+        place: unused.
+        c: (1, L) coefficient.
+    """
     gravity = fields["opt.gravity"]
     # The tilt that another effect added is not scaled.
     gravity += c[0][:, None] * robot.compiled.opt.gravity
 
 
 def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g."""
+    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g.
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot, with the gravity of the file.
+        place: unused.
+        c: (2, L) coefficients c_x and c_y, rad.
+    """
     size = float(np.linalg.norm(robot.compiled.opt.gravity))
     fields["opt.gravity"][:, :2] += size * c.T  # (4)
 
@@ -306,7 +332,14 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
 
 def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero."""
+    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero.
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot.
+        place: name of the body.
+        c: (1, L) coefficient.
+    """
     column = fields["body_gravcomp"]
     number = robot.body(place).id
     column[:, number] = np.where(
@@ -370,7 +403,14 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the sliding friction coefficients of a pair of geoms by (1)."""
+    """Add c to the sliding friction coefficients of a pair of geoms by (1).
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot.
+        place: name of the pair.
+        c: (1, L) coefficient.
+    """
     sliding = fields["pair_friction"][:, find_pair(robot, place), :2]
     sliding[:] = add_to_file_value(sliding, c[0][:, None])
 

@@ -419,7 +419,13 @@ def cache_per_robot(
 
     @wraps(function)
     def cached_function(robot: RobotModel, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        """Return the result stored in the robot, or call the function and store its result."""
+        """Return the result stored in the robot, or call the function and store its result.
+
+        Args:
+            robot: the robot with the cache.
+            *args: further arguments.
+            **kwargs: further arguments with names.
+        """
         key = (function, *args, *kwargs.items())
         if key not in robot.function_cache:
             robot.function_cache[key] = function(robot, *args, **kwargs)

@@ -149,7 +149,15 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
 
 
 def _check_friction_form(source: Source, value: Any) -> FrictionForm:
-    """Check the value of ``friction_form``."""
+    """Check the value of ``friction_form``.
+
+    Args:
+        source: beginning of error messages.
+        value: the value.
+
+    Raises:
+        InputError: it is not one of `FRICTION_FORMS`.
+    """
     for form in FRICTION_FORMS:
         if value == form:
             return form

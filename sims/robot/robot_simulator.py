@@ -125,6 +125,10 @@ class RobotSimulator(SystemSimulator):
         """Return MuJoCo as the engine, with checked settings of the time step and the integrator.
 
         Other engines are refused, since a model file describes a robot for MuJoCo.
+
+        Args:
+            name: name of the engine; None for MuJoCo.
+            settings: settings by name, such as ``timestep``.
         """
         if name not in (None, "mujoco"):
             raise InputError(f"robot {self.name} steps in MuJoCo; it has no engine '{name}'")
@@ -214,7 +218,7 @@ class RobotSimulator(SystemSimulator):
         acting = self._make_active_effects(theta)
         runs = group_scenarios(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
-        _, x, v = self._known(scenarios, initial)
+        _, x, v = self._collect_known_values(scenarios, initial)
         return self._simulate_elements(acting, runs, commands, x, v)
 
     def simulate_observations(self, batch: RobotRunBatch) -> Array:
@@ -230,7 +234,15 @@ class RobotSimulator(SystemSimulator):
         x: Array,
         v: Array,
     ) -> Array:
-        """Simulate observations (L, T, C) of batch elements that begin at x and v (L, D)."""
+        """Simulate observations (L, T, C) of batch elements.
+
+        Args:
+            acting: effects with coefficients (K, L, 1).
+            runs: scenarios of the elements.
+            commands: values of each input, by name, of each distinct scenario.
+            x: (L, D) initial positions.
+            v: (L, D) initial velocities.
+        """
         max_samples = max(s.times.size for s in runs.unique_scenarios)
         result = np.full((len(x), max_samples, len(self.channels)), np.nan)
         derived = find_active_elements(acting, len(x), changes_derived_constants)
@@ -662,7 +674,13 @@ class RobotSimulator(SystemSimulator):
     def _get_channel_values(
         self, result: BatchResult, name: str, steps: int
     ) -> tuple[Array, Array | None]:
-        """Return the values (n, S + 1) of a channel at all steps, and their slopes if known."""
+        """Return the values (n, S + 1) of a channel at all steps, and their slopes if known.
+
+        Args:
+            result: motion and recorded fields of n batch elements.
+            name: name of the channel.
+            steps: number S of steps.
+        """
         kind, _, element_name = name.partition(".")
         steps_of_run = slice(steps + 1)
         if kind in ("q", "qd"):

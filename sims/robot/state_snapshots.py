@@ -38,7 +38,14 @@ class SingleJointSystem(System):
         raise NotImplementedError
 
     def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Raise an error: a joint alone has no channels."""
+        """Raise an error: a joint alone has no channels.
+
+        Args:
+            x: unused.
+            v: unused.
+            a: unused.
+            constants: unused.
+        """
         raise NotImplementedError
 
 

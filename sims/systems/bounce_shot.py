@@ -129,7 +129,12 @@ class ShotSystem(System):
         return moment.gravity * down  # (1)
 
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
-        """Return a horizontal unit vector along `axis` in the incline's frame (L, 3)."""
+        """Return a horizontal unit vector in the incline's frame (L, 3).
+
+        Args:
+            moment: state of the batch, with the angle of the incline.
+            axis: direction of the vector in the world.
+        """
         angle = moment.constants["incline_angle"]
         zeros = np.zeros_like(angle)
         if axis == "y":

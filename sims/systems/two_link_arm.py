@@ -55,7 +55,16 @@ def _make_link_parameters(
     training: tuple[float, float],
     description: str,
 ) -> tuple[Parameter, Parameter]:
-    """Return a parameter of each of the two links, with the link's number in its name."""
+    """Return a parameter of each of the two links, with the link's number in its name.
+
+    Args:
+        name: name without the number.
+        unit: unit of the values.
+        nominal: nominal value.
+        bounds: lower and upper bound.
+        training: range of the training.
+        description: the quantity in words.
+    """
 
     def of(link: int) -> Parameter:
         return Parameter(
@@ -211,6 +220,10 @@ class TwoLinkArm(OwnSimulator):
 
         The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
         these means are of second order.
+
+        Args:
+            torques: torques at both joints, N·m.
+            seconds: length of the step, s.
 
         Returns:
             Whether a joint with dry friction came to rest or changed its direction.

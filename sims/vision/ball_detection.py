@@ -210,7 +210,12 @@ class BallDetector:
         )
 
     def _add_colour(self, detection: BallDetection, picture: RgbImage) -> BallDetection:
-        """Add to a detection its colour, its contrast, and whether it is a background artefact."""
+        """Add to a detection its colour, its contrast, and whether it is a background artefact.
+
+        Args:
+            detection: the detection.
+            picture: the picture.
+        """
         centre_colour = _compute_centre_colour(picture, detection)
         background_colour = _compute_centre_colour(self.background, detection)
         surrounding_colour = _compute_surrounding_colour(picture, detection)
@@ -278,6 +283,10 @@ class BallDetector:
         """Return the factor between picture and background where it is the same in all colours.
 
         The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
+
+        Args:
+            picture: the picture.
+            mask: (height, width) pixels that differ from the background.
         """
         result = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
@@ -464,7 +473,19 @@ class BallDetector:
         u0: int,
         v0: int,
     ) -> BallDetection | None:
-        """Measure a ball of a few pixels: centroid of the difference, and radius from its sum."""
+        """Measure a ball of a few pixels: centroid of the difference, and radius from its sum.
+
+        Args:
+            window: (height, width) differences from the background, grey levels.
+            u: horizontal position of the centre in the window, pixels.
+            v: vertical position of the centre in the window, pixels.
+            radius: approximate radius, pixels.
+            u0: left edge of the window in the picture.
+            v0: upper edge of the window in the picture.
+
+        Returns:
+            The detection in the picture; None if the difference is too small.
+        """
         height, width = window.shape
         rows, columns = np.mgrid[:height, :width]
         is_near = np.hypot(columns - u, rows - v) <= radius + _SMALL_BALL_MARGIN
@@ -487,14 +508,25 @@ class BallDetector:
 def _compute_median_colours(
     picture: RgbImage, object_mask: Mask, surroundings: Mask
 ) -> tuple[Array, Array]:
-    """Return the median colours (3,) of two parts of a picture."""
+    """Return the median colours (3,) of two parts of a picture.
+
+    Args:
+        picture: the picture.
+        object_mask: (height, width) pixels of the object.
+        surroundings: (height, width) pixels around it.
+    """
     inside_colour: Array = np.median(picture[object_mask], axis=0)
     outside_colour: Array = np.median(picture[surroundings], axis=0)
     return inside_colour, outside_colour
 
 
 def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array:
-    """Return the mean colour (3,) at a detection's centre."""
+    """Return the mean colour (3,) at a detection's centre.
+
+    Args:
+        picture: the picture.
+        detection: centre and radius of the ball.
+    """
     side = 2 * max(1, int(_CENTRE_PATCH_SHARE * detection.radius)) + 1
     patch = import_package("cv2").getRectSubPix(picture, (side, side), (detection.u, detection.v))
     colour: Array = patch.reshape(-1, 3).mean(axis=0)
@@ -502,7 +534,12 @@ def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array
 
 
 def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> Array:
-    """Return the median colour (3,) on a circle around a detection, in grey levels."""
+    """Return the median colour (3,) on a circle around a detection, in grey levels.
+
+    Args:
+        picture: the picture.
+        detection: centre and radius of the ball.
+    """
     cos, sin = _compute_ray_directions()
     height, width = picture.shape[:2]
     circle_radius = _SURROUNDINGS_RADII * detection.radius
@@ -518,7 +555,13 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
 
 
 def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
-    """Interpolate a window at subpixel positions; `_PADDING_VALUE` outside it."""
+    """Interpolate a window at subpixel positions; `_PADDING_VALUE` outside it.
+
+    Args:
+        window: (height, width) grey levels.
+        u: horizontal positions, any shape, pixels.
+        v: vertical positions of the same shape.
+    """
     cv2 = import_package("cv2")
     result: GreyLevels = cv2.remap(
         window,

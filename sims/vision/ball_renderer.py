@@ -334,7 +334,12 @@ class BallScene:
         picture[window_slice] *= brightness[..., None].astype(np.float32)
 
     def _draw_ball(self, picture: ColourArray, position: Array) -> None:
-        """Blend the ball into the picture, weighted by its coverage of each pixel."""
+        """Blend the ball into the picture, weighted by its coverage of each pixel.
+
+        Args:
+            picture: (height, width, 3) linear colours, changed in place.
+            position: (3,) centre of the ball in the world, m.
+        """
         centre, (semi_major_axis, _) = self.camera.project_sphere(position, self.radius)
         half_size = semi_major_axis + _OUTLINE_MARGIN_PIXELS
         if not np.isfinite(half_size):
@@ -409,7 +414,12 @@ class BallScene:
 
 
 def _find_window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:
-    """Return the window of the picture that contains `pixels` (n, 2); None if they are outside."""
+    """Return the window of the picture that contains some pixels; None if they are outside.
+
+    Args:
+        pixels: (n, 2) positions of the pixels.
+        size: width and height of the picture.
+    """
     if not np.isfinite(pixels).all():
         return None
     left, top = (max(0, math.floor(x)) for x in pixels.min(axis=0))

@@ -529,6 +529,10 @@ def _is_same_object(a: Circle, b: Circle) -> bool:
     """Return whether two circles are the same object at rest.
 
     Their centres may differ by `_SAME_CENTRE_SHARE` of the radius and half a pixel.
+
+    Args:
+        a: centre and radius of one circle, pixels.
+        b: centre and radius of the other one.
     """
     distance = abs(a[0] - b[0]) + abs(a[1] - b[1])
     smallest, largest = _SAME_RADIUS_RATIOS
@@ -542,6 +546,11 @@ def _note_other_objects(
 
     It must appear in at least 8 frames and a quarter of the ball's frames, and travel more than its
     diameter. The user then knows that the tracker may have chosen the wrong object.
+
+    Args:
+        path: path of the ball.
+        other_paths: paths of all other objects.
+        notes: remarks for the user, extended in place.
     """
     frames = set(path.frames)
     for other_path in other_paths:

@@ -98,7 +98,15 @@ class FilmedBall(Simulator):
         self.parameters = self._ball.parameters
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""
+        """Simulate the film of each parameter vector; see `Simulator.simulate`.
+
+        Args:
+            theta: (n, 1) parameters.
+            scenario: times, initial state and constants of the run.
+
+        Returns:
+            Pixel rows (n, T, C).
+        """
         constants = self.run_constants(scenario)
         self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
         fall = Scenario(
@@ -138,9 +146,15 @@ def _make_camera(constants: Mapping[str, float]) -> PinholeCamera:
 
 
 def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
-    """Return the pixel rows (T,) that the tracker finds in a film of a ball at `places` (T, 3).
+    """Return the pixel rows (T,) that the tracker finds in a film of a ball.
 
     NaN stands where it finds none.
+
+    Args:
+        camera: the camera.
+        radius: radius of the ball, m.
+        places: (T, 3) centre of the ball, m.
+        times: (T,) times of the frames, s.
     """
     from sims.vision.ball_renderer import BallScene, SceneAppearance
     from sims.vision.ball_tracker import track_ball

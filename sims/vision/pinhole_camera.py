@@ -322,7 +322,14 @@ def read_camera_file(path: Path) -> FilmDescription:
 def _read_section(
     path: Path, section: str, meta: Mapping[str, Any], counts: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Read all entries of a section, each a number or a tuple of the required length."""
+    """Read all entries of a section, each a number or a tuple of the required length.
+
+    Args:
+        path: path of the camera file, for messages.
+        section: name of the section.
+        meta: content of the file.
+        counts: number of values of each entry.
+    """
     table = check_table(path, section, meta.get(section))
     check_known_names(f"entry in [{section}] of {path}", table, counts)
     values: dict[str, Any] = {}

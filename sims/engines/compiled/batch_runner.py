@@ -57,8 +57,12 @@ def integrate_batch(
 def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> BatchArrays:
     """Convert a batch to the contiguous arrays that the kernel reads, without selected elements.
 
-    If all elements have the same steps, one row of steps is stored for all of them. `spans` (L,) is
-    the longest step of each element in seconds.
+    If all elements have the same steps, one row of steps is stored for all of them.
+
+    Args:
+        batch: the batch.
+        max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
     """
     count, dimensions = batch.x.shape
     shared = batch.steps.strides[0] == 0
@@ -91,7 +95,11 @@ def _integrate_group(
 ) -> None:
     """Integrate elements with equal effects, on several threads if there are enough of them.
 
-    `function` is the function of the kernel.
+    Args:
+        function: address of the function of the kernel.
+        program: force program of the effects.
+        arrays: arrays of the batch, with the selected elements.
+        jobs: maximum number of threads.
     """
     count = len(arrays.order)
     threads = min(jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))

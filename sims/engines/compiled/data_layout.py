@@ -233,7 +233,12 @@ def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> 
 
 
 def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
-    """Allocate the buffers of a block with these numbers of registers and slots."""
+    """Allocate the buffers of a block.
+
+    Args:
+        registers: number of registers.
+        width: number of slots.
+    """
     return BlockBuffers(
         np.zeros((registers, width)),
         np.zeros((NUMBER_ROW_COUNT, width)),
@@ -307,6 +312,11 @@ def check_array_layout(
 
 
 def uses_registers(code: IntTable, count: int) -> bool:
-    """Return whether the instructions (n, 5) use only the first `count` registers."""
+    """Return whether the instructions (n, 5) use only the first `count` registers.
+
+    Args:
+        code: (n, 5) instructions.
+        count: number of registers.
+    """
     is_external = code[:, 0] == EXTERNAL
     return bool(code.min(initial=0) >= 0 and code[~is_external, 1:].max(initial=-1) < count)

@@ -187,7 +187,12 @@ def resolve_initial_ground_contact(block: Block) -> None:
 
 
 def is_newly_loaded(block: Block, i: int) -> bool:
-    """Return whether an element has just been loaded into slot `i`."""
+    """Return whether an element has just been loaded into a slot.
+
+    Args:
+        block: buffers of the elements that are integrated together.
+        i: index of the slot.
+    """
     n = block.n
     return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 

@@ -277,7 +277,12 @@ class SystemTracer:
         )
 
     def _broadcast_result(self, values: Any, shape: tuple[int, int]) -> TracedArray:
-        """Return the result of an array function, broadcast to its expected shape."""
+        """Return the result of an array function, broadcast to its expected shape.
+
+        Args:
+            values: traced array, or numbers.
+            shape: expected shape.
+        """
         if not isinstance(values, TracedArray):
             values = TracedArray(self.graph, make_constant_nodes(self.graph, values))
         return TracedArray(self.graph, np.broadcast_to(values.nodes, shape))
@@ -432,6 +437,11 @@ def _get_tracer(
     """Return the tracer of a system, or None if the system cannot be traced.
 
     The system is traced once for each set of input names, checked against NumPy, and cached.
+
+    Args:
+        batch: batch of the system, from which states for the check are taken.
+        elements: indices of its elements with this system.
+        names: names and sizes of its inputs.
     """
     key = type(batch.system), names
     if key not in _tracers:
@@ -456,6 +466,13 @@ def _is_traceable(
     """Return whether an effect can be traced and then gives the same numbers as with NumPy.
 
     The answer is cached; a failure is reported once.
+
+    Args:
+        tracer: tracer of the system.
+        effect: the effect.
+        batch: batch in which the effect acts, from which states for the check are taken.
+        elements: indices of the elements on which it acts.
+        names: names and sizes of the inputs.
     """
     key = type(batch.system), names, type(effect)
     if key not in _effects:

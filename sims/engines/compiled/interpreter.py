@@ -83,12 +83,22 @@ COPYSIGN = OPERATION_CODES["copysign"]
 
 
 def nan_maximum(a: float, b: float) -> float:
-    """Return the maximum as `numpy.maximum`: NaN if an argument is NaN."""
+    """Return the maximum as `numpy.maximum`: NaN if an argument is NaN.
+
+    Args:
+        a: first number.
+        b: second number.
+    """
     return a if a >= b or a != a else b
 
 
 def nan_minimum(a: float, b: float) -> float:
-    """Return the minimum as `numpy.minimum`: NaN if an argument is NaN."""
+    """Return the minimum as `numpy.minimum`: NaN if an argument is NaN.
+
+    Args:
+        a: first number.
+        b: second number.
+    """
     return a if a <= b or a != a else b
 
 

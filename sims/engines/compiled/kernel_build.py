@@ -71,7 +71,14 @@ def build_module(module: str, entry: str, pointers: int, constants: Mapping[str,
 
 
 def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -> None:
-    """Write the machine code to the standard output, where `build_module` reads it."""
+    """Write the machine code to the standard output, where `build_module` reads it.
+
+    Args:
+        module: name of the module.
+        entry: name of the function.
+        pointers: number of its arguments, which are pointers.
+        constants: further global names and their numbers.
+    """
     import numba as typed
 
     # numba is only partly typed, and its untyped functions would fail the type check.
@@ -167,6 +174,12 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
         """Call the function at an address with two integers, from compiled code (numba intrinsic).
 
         It returns the types for numba, and a function that generates the LLVM code.
+
+        Args:
+            context: typing context of numba.
+            address: type of the address.
+            part: type of the first integer.
+            w: type of the second integer.
         """
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001

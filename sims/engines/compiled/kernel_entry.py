@@ -27,31 +27,56 @@ ARGUMENT_COUNT = HEADER_WORDS + ARRAY_WORDS * ARRAY_COUNT
 
 
 def get_ints(words: Any, k: int) -> Any:
-    """Return array k of the argument, integers with one dimension."""
+    """Return array k of the argument, integers with one dimension.
+
+    Args:
+        words: the argument as 64-bit words: header, then address and lengths of each array.
+        k: number of the array.
+    """
     at = HEADER_WORDS + ARRAY_WORDS * k
     return carray(to_int_pointer(words[at]), (words[at + 1],))
 
 
 def get_int_table(words: Any, k: int) -> Any:
-    """Return array k of the argument, integers with two dimensions."""
+    """Return array k of the argument, integers with two dimensions.
+
+    Args:
+        words: the argument as 64-bit words, see `get_ints`.
+        k: number of the array.
+    """
     at = HEADER_WORDS + ARRAY_WORDS * k
     return carray(to_int_pointer(words[at]), (words[at + 1], words[at + 2]))
 
 
 def get_numbers(words: Any, k: int) -> Any:
-    """Return array k of the argument, floating-point numbers with one dimension."""
+    """Return array k of the argument, floating-point numbers with one dimension.
+
+    Args:
+        words: the argument as 64-bit words, see `get_ints`.
+        k: number of the array.
+    """
     at = HEADER_WORDS + ARRAY_WORDS * k
     return carray(to_real_pointer(words[at]), (words[at + 1],))
 
 
 def get_table(words: Any, k: int) -> Any:
-    """Return array k of the argument, floating-point numbers with two dimensions."""
+    """Return array k of the argument, floating-point numbers with two dimensions.
+
+    Args:
+        words: the argument as 64-bit words, see `get_ints`.
+        k: number of the array.
+    """
     at = HEADER_WORDS + ARRAY_WORDS * k
     return carray(to_real_pointer(words[at]), (words[at + 1], words[at + 2]))
 
 
 def get_box(words: Any, k: int) -> Any:
-    """Return array k of the argument, floating-point numbers with three dimensions."""
+    """Return array k of the argument, floating-point numbers with three dimensions.
+
+    Args:
+        words: the argument as 64-bit words, see `get_ints`.
+        k: number of the array.
+    """
     at = HEADER_WORDS + ARRAY_WORDS * k
     return carray(to_real_pointer(words[at]), (words[at + 1], words[at + 2], words[at + 3]))
 

@@ -184,7 +184,12 @@ def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[],
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file atomically, with the hash of its content."""
+    """Write a file atomically, with the hash of its content.
+
+    Args:
+        path: path of the file.
+        content: its bytes.
+    """
     # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
     partial = path.with_suffix(".part")
     try:
@@ -198,8 +203,11 @@ def _write_atomically(path: Path, content: bytes) -> None:
 def _hold_lock(path: Path, report_wait: Callable[[], None]) -> Iterator[None]:
     """Hold an exclusive lock between processes, so that only one of them compiles.
 
-    If another process has the lock, `report_wait` is called before waiting. Without fcntl
-    (Windows) there is no lock, and several processes may compile.
+    Without fcntl (Windows) there is no lock, and several processes may compile.
+
+    Args:
+        path: path of the lock file.
+        report_wait: called before waiting, if another process has the lock.
     """
     with path.open("w") as lock:
         try:

@@ -159,7 +159,13 @@ class NumpyForces:
         return self._snapshots[width]
 
     def _view_registers(self, row: int, count: int, width: int) -> Array:
-        """Return a view (W, count) of input registers."""
+        """Return a view (W, count) of input registers.
+
+        Args:
+            row: number of the group of inputs.
+            count: number of registers.
+            width: number W of slots in use.
+        """
         first = self._rows[row]
         values: Array = self._r[first : first + count, :width].T
         return values

@@ -90,14 +90,24 @@ class ExpressionGraph:
     def _get_or_make(
         self, key: tuple[object, ...], make_node: Callable[[], ExpressionNode]
     ) -> ExpressionNode:
-        """Return the node with this key, so that equal expressions share one node."""
+        """Return the node with this key, so that equal expressions share one node.
+
+        Args:
+            key: operation and arguments of the expression.
+            make_node: makes its node.
+        """
         if key not in self._nodes:
             self._nodes[key] = make_node()
         return self._nodes[key]
 
 
 def _compute_constant(operation: str, values: list[float]) -> float:
-    """Apply an operation to constants, with NumPy's result for overflow and division by zero."""
+    """Apply an operation to constants, with NumPy's result for overflow and division by zero.
+
+    Args:
+        operation: name of the operation.
+        values: its arguments.
+    """
     with np.errstate(all="ignore"):
         if operation == "where":
             return values[1] if values[0] else values[2]
@@ -418,7 +428,13 @@ def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -
 
 
 def _simplify_power(graph: ExpressionGraph, base: Any, exponent: float) -> TracedArray | None:
-    """Return a power that NumPy computes as a simpler operation; None for other exponents."""
+    """Return a power that NumPy computes as a simpler operation; None for other exponents.
+
+    Args:
+        graph: graph to which nodes are added.
+        base: traced array.
+        exponent: the exponent.
+    """
     if exponent == 2.0:
         return _apply_elementwise(graph, "multiply", (base, base))
     if exponent == 0.5:
@@ -464,7 +480,12 @@ def _find_graph(*args: Any) -> ExpressionGraph:
 
 
 def _trace_where(condition: Any, *values: Any) -> TracedArray:
-    """Trace numpy.where(condition, x, y), a choice between two numbers for each element."""
+    """Trace numpy.where(condition, x, y), a choice between two numbers for each element.
+
+    Args:
+        condition: traced array of Booleans.
+        *values: x and y.
+    """
     if len(values) != 2:
         raise NotTraceableError("numpy.where with a condition alone is not traced")
     graph = _find_graph(condition, *values)
@@ -491,7 +512,12 @@ def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
 
 
 def _fill_like(x: TracedArray, value: float) -> TracedArray:
-    """Return a traced array of the same shape as x, with one constant in every place."""
+    """Return a traced array of the same shape as x, with one constant in every place.
+
+    Args:
+        x: traced array.
+        value: the constant.
+    """
     nodes = np.empty(x.shape, dtype=object)
     nodes[...] = x.graph.make_constant(value)
     return TracedArray(x.graph, nodes)

@@ -269,6 +269,12 @@ def _integrate_open_loop(
     """Integrate without feedback except viscous damping.
 
     The engine runs on its own while the input is constant.
+
+    Args:
+        joint: the body in the engine.
+        element: batch element with its input and steps.
+        inertia: generalised inertia, kg m² or kg.
+        damping: viscous damping, N m s/rad or N s/m.
     """
     drive = _compute_drive_forces(element)
     forces = drive.tolist()

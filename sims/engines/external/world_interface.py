@@ -43,7 +43,12 @@ class BulletWorldModule(Protocol):
     """Module ``<system>_bullet_world`` of a system."""
 
     def build(self, client: int, constants: Constants, /) -> int:
-        """Build the world in an empty client; return the id of the moving body."""
+        """Build the world in an empty client; return the id of the moving body.
+
+        Args:
+            client: id of the world.
+            constants: constants of the system by name.
+        """
         ...
 
 

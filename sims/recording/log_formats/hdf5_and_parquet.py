@@ -40,7 +40,12 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
 
 
 def make_unreadable_error(path: Path, error: Exception) -> InputError:
-    """Make the error for a file that pyarrow cannot read."""
+    """Make the error for a file that pyarrow cannot read.
+
+    Args:
+        path: path of the file.
+        error: error of pyarrow.
+    """
     reason = " ".join(str(error).split()) or type(error).__name__
     return InputError(f"{path}: not a Parquet file: {reason[:300]}")
 

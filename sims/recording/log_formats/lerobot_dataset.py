@@ -130,7 +130,12 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
 
 
 def _list_feature_names(info_file: Path, feature: str) -> list[str]:
-    """Return the names of the entries of a feature; empty where the dataset states none."""
+    """Return the names of the entries of a feature; empty where the dataset states none.
+
+    Args:
+        info_file: path of ``meta/info.json``.
+        feature: name of the feature, such as ``observation.state``.
+    """
     try:
         entry_names = json.loads(info_file.read_text(encoding="utf-8"))["features"][feature][
             "names"

@@ -75,6 +75,11 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
 def _make_decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
     """Return the function that decodes the messages of a channel, JSON or Protobuf.
 
+    Args:
+        path: path of the bag, for messages.
+        encoding: encoding of the messages, ``json`` or ``protobuf``.
+        schema: schema of the channel.
+
     Raises:
         InputError: the package for Protobuf is not installed, or the channel has no schema.
     """
@@ -280,7 +285,12 @@ def _iterate_message_numbers(
 
 
 def _is_named(values: Any, names: Any) -> bool:
-    """Return whether a list has a name for each of its numbers."""
+    """Return whether a list has a name for each of its numbers.
+
+    Args:
+        values: list or array of numbers in a message.
+        names: list of texts in the same message.
+    """
     if isinstance(names, str) or not _is_list(names) or not all(isinstance(n, str) for n in names):
         return False
     if isinstance(values, np.ndarray):

@@ -151,7 +151,12 @@ def _detect_encoding(path: Path, head: bytes) -> str:
 
 
 def _split_line(line: str, separator: str) -> list[str]:
-    """Split a line into its cells."""
+    """Split a line into its cells.
+
+    Args:
+        line: text of the line.
+        separator: one of `SEPARATORS`; a space stands for any white space.
+    """
     if separator == " ":
         return line.split()
     try:
@@ -208,7 +213,13 @@ def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int
 
 
 def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
-    """Return whether a row contains numbers rather than names, notes or units."""
+    """Return whether a row contains numbers rather than names, notes or units.
+
+    Args:
+        row: cells of the row.
+        width: number of cells in a data row.
+        columns: positions of the columns that hold numbers.
+    """
     if len(row) != width:
         return False
     cells = [row[place].strip() for place in columns]
@@ -260,7 +271,12 @@ def _parse_header(
 
 
 def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
-    """Return the units by position if a row contains units only; otherwise nothing."""
+    """Return the units by position if a row contains units only; otherwise nothing.
+
+    Args:
+        row: cells of the row below the header.
+        columns: positions of the columns that hold numbers.
+    """
     units_by_place = {}
     for column in columns:
         text = row[column].strip("[](){}<> ") if row[column] else ""
@@ -428,7 +444,13 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
 
 
 def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputError:
-    """Make the error for a file whose rows pandas cannot split."""
+    """Make the error for a file whose rows pandas cannot split.
+
+    Args:
+        path: path of the file.
+        layout: layout of the table.
+        error: error of pandas.
+    """
     quote_match = re.search(r"EOF inside string starting at row (\d+)", str(error))
     if quote_match:
         row = layout.first + int(quote_match[1])

@@ -139,6 +139,10 @@ def _read_tensors(
 ) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read all tensors of one or two dimensions in an archive, and its lists of texts, by name.
 
+    Args:
+        path: path of the file, for messages.
+        archive: the open archive.
+
     Raises:
         InputError: the archive has no single pickle program, or one that is too large.
     """
@@ -164,6 +168,11 @@ def _read_tensors(
 def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
     """Flatten nested containers to named entries; lists of numbers and texts stay whole.
 
+    Args:
+        name: name of the container, the beginning of the names of its entries.
+        value: the container, or an entry.
+        depth: number of containers around it.
+
     Raises:
         ValueError: There are more than `MAX_COLUMNS` entries, as where containers hold each other.
     """
@@ -188,6 +197,12 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
     """Read the numbers of a tensor from its storage in the archive.
 
     Element (i, j) is the number at offset + i stride_0 + j stride_1 of the storage.
+
+    Args:
+        path: path of the file, for messages.
+        archive: the open archive.
+        folder: folder of the program in the archive.
+        tensor: storage, offset, size and strides of the tensor.
 
     Raises:
         InputError: the tensor holds no numbers, is too large, or exceeds its storage.

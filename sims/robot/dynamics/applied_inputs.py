@@ -259,6 +259,10 @@ def _group_by_active_effects(
 
     Yields: Indices of a group's elements, and the effects with the coefficients of these
     elements.
+
+    Args:
+        input_effects: effects with coefficients (K, n, 1).
+        n: number of batch elements.
     """
     is_active = np.array([(c != 0).any(axis=(0, 2)) for _, c in input_effects], dtype=bool).reshape(
         -1, n

@@ -384,6 +384,11 @@ def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> boo
 
     Each class of effects is tested once; a failure is reported on standard error, unless the effect
     declares that it cannot be traced.
+
+    Args:
+        tracing: traced state of the robot.
+        forces: effects of the batch, evaluated by NumPy.
+        effect: the effect.
     """
     if not effect.is_traceable:
         return False

@@ -197,7 +197,12 @@ def _compute_jump(model: Any, dof: int, force: float, gains: Array) -> Array:
 
 
 def _find_dof(model: Any, actuator: int) -> int | None:
-    """Return the degree of freedom of an actuator's joint; None if it drives no hinge or slide."""
+    """Return the degree of freedom of an actuator's joint; None if it drives no hinge or slide.
+
+    Args:
+        model: compiled model.
+        actuator: number of the actuator.
+    """
     import mujoco
 
     joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

@@ -197,7 +197,12 @@ class EffectForces:
         return force, compute_friction_limits(self.frictions, midpoint)
 
     def make_step_snapshot(self, k: int, joint_states: JointStates) -> RobotSnapshot:
-        """Return the snapshot at the beginning of step k."""
+        """Return the snapshot at the beginning of step k.
+
+        Args:
+            k: number of the step.
+            joint_states: states of the joints at its beginning.
+        """
         return self._make_snapshot(
             k, k, (joint_states.x, joint_states.v, *joint_states.transmission_loads)
         )
@@ -251,6 +256,10 @@ def compute_friction_limits(
     """Add up the limits of dry friction of all effects, (L, D) in N or N m.
 
     MuJoCo's solver then finds the friction force within these limits.
+
+    Args:
+        frictions: friction effects with their coefficients (K, L, 1).
+        snapshot: state of the batch.
     """
     limit = np.zeros_like(snapshot.x)
     for effect, c in frictions:

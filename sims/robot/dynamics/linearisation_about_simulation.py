@@ -302,7 +302,13 @@ class RunLinearisation:
         return np.concatenate([result[:joints], result[velocity_column : velocity_column + joints]])
 
     def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
-        """Return the perturbations by an effect that acts on neither inputs nor sensors."""
+        """Return the perturbations by an effect that acts on neither inputs nor sensors.
+
+        Args:
+            owner: number of the candidate.
+            effect: the effect.
+            c: (K, 1, 1) its coefficients.
+        """
         name = effect.of or effect.name
         joint = effect.coordinate
         if name == "inertia.armature" and joint is not None:
@@ -330,6 +336,10 @@ class RunLinearisation:
         In MuJoCo a joint stiffness acts about the rest position qpos_spring. Only where
         this is zero can the change be computed from the effect's force, which is cheaper
         than a changed model.
+
+        Args:
+            name: name of the effect.
+            joint: index of its joint; None if it acts elsewhere.
         """
         if name not in SPRING_EFFECTS or joint is None:
             return False

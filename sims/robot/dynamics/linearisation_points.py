@@ -551,7 +551,12 @@ class LinearisationPoints:
         return force
 
     def integrate_hidden_state(self, effect: Effect, c: Array) -> HiddenState:
-        """Integrate an effect's hidden state (S + 1, 1) along the motion; empty if it has none."""
+        """Integrate an effect's hidden state (S + 1, 1) along the motion; empty if it has none.
+
+        Args:
+            effect: the effect.
+            c: (K, 1, 1) its coefficients.
+        """
         if not isinstance(effect, HiddenStateEffect):
             return HiddenState(np.zeros((0, 1)), np.zeros((0, 1)))
         return integrate_state(effect, c, self.snapshot, self.motion.step)

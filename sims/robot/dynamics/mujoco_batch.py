@@ -96,7 +96,12 @@ class StepwiseForces(Protocol):
     loaded: Mask
 
     def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
-        """Compute forces and limits of dry friction over step k."""
+        """Compute forces and limits of dry friction over step k.
+
+        Args:
+            k: number of the step.
+            joint_states: states of the joints at its beginning.
+        """
         ...
 
 
@@ -151,7 +156,12 @@ def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
 
 
 def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
-    """Return the addresses of actuator forces in the sensor data of a batch model, by joint."""
+    """Return the addresses of actuator forces in the sensor data of a batch model, by joint.
+
+    Args:
+        model: batch model, to which the sensors were added.
+        robot: the robot.
+    """
     one_coordinate_joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     file_joints = [name for name in one_coordinate_joints if name not in robot.series]
     return {name: int(model.sensor(DRIVE_SENSOR_PREFIX + name).adr[0]) for name in file_joints}
@@ -549,7 +559,13 @@ class MujocoBatch:
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
     def _allocate_records(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
-        """Allocate arrays for recorded fields."""
+        """Allocate arrays for recorded fields.
+
+        Args:
+            n: number of batch elements.
+            steps: number of recorded steps.
+            record: names of the fields of MuJoCo's data.
+        """
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
     def _get_element_ids(self, n: int) -> IndexArray | None:
@@ -561,7 +577,12 @@ class MujocoBatch:
 
     @staticmethod
     def _split_for_interrupts(batch_size: int, steps: int) -> Iterator[slice]:
-        """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between."""
+        """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between.
+
+        Args:
+            batch_size: number of batch elements.
+            steps: number of steps.
+        """
         steps_per_part = max(MAX_UNINTERRUPTED_STEPS // max(batch_size, 1), 1)
         for begin in range(0, steps, steps_per_part):
             yield slice(begin, min(begin + steps_per_part, steps))

@@ -100,7 +100,12 @@ def make_series_joint_name(joint: str, effects: Collection[str]) -> str:
 
 
 def find_series_joint(robot: RobotModel, joint: str) -> str:
-    """Return the name of the joint in series with a joint; empty if there is none."""
+    """Return the name of the joint in series with a joint; empty if there is none.
+
+    Args:
+        robot: the robot with its added joints.
+        joint: name of the joint.
+    """
     return next((name for name in robot.series if name.rpartition("_")[0] == joint), "")
 
 

@@ -232,9 +232,14 @@ def _write_cause(
 ) -> str | None:
     """Write a cause into the model fields; return None or a reason.
 
-    A reason that begins with + is a note about a cause that was written; otherwise the cause
-    cannot be stated in a model file. `series` are the elements in series, by place, that are
-    not yet written.
+    A reason that begins with + is a note about a cause that was written; otherwise the cause cannot
+    be stated in a model file.
+
+    Args:
+        target_values: fields of the model, changed in place.
+        robot: the robot.
+        cause: the cause.
+        series: elements in series, by place, that are not yet written.
     """
     # A coupling is an element of the robot, which has been added before.
     if cause.effect == COUPLING_EFFECT:
@@ -276,6 +281,10 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
     """Change a copy of the robot's spec until it compiles to the wanted fields.
 
     Several rounds are needed, because a change may also modify values that should stay.
+
+    Args:
+        robot: the robot.
+        target_values: wanted fields of the compiled model.
 
     Returns:
         The changed mujoco.MjSpec, and the compiled model.
@@ -391,6 +400,12 @@ def _convert_to_attribute(element: Any, name: str, attribute: str, values: Seque
     """Convert values to the form of a spec attribute: a number, or an array padded with zeros.
 
     Angles of a hinge are converted to degrees if the spec's compiler uses degrees.
+
+    Args:
+        element: element of the spec.
+        name: name of the attribute in an MJCF.
+        attribute: its name in the spec.
+        values: its numbers, angles in rad.
     """
     import mujoco
 

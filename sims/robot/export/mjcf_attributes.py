@@ -87,7 +87,13 @@ def _make_reader(name: str, address: str = "id") -> Callable[[Fields, Any], Any]
 
 
 def _read_option(name: str, fields: Fields, field_address: Any) -> Any:  # noqa: ARG001
-    """Read an option of the model from its fields."""
+    """Read an option of the model from its fields.
+
+    Args:
+        name: name of the option.
+        fields: fields of the model.
+        field_address: unused; all readers have the same arguments.
+    """
     return fields[f"opt.{name}"][0]
 
 
@@ -323,7 +329,13 @@ def list_all_attributes(
 
 
 def _is_equal(first: Any, second: Any, tolerance: float) -> bool:
-    """Return whether two arrays are equal to within `tolerance` times the largest entry."""
+    """Return whether two arrays are equal to within `tolerance` times the largest entry.
+
+    Args:
+        first: array or number.
+        second: another one.
+        tolerance: largest difference, relative to the largest entry.
+    """
     first, second = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     if first.shape != second.shape:
         return False

@@ -163,7 +163,10 @@ class XmlText:
     def _render_range(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
         """Return the text between two byte positions, with changed elements replaced.
 
-        `tags` are the elements directly within this range, in document order.
+        Args:
+            begin: offset of the first byte.
+            end: offset after the last byte.
+            tags: elements directly within this range, in document order.
         """
         parts, offset = [], begin
         for tag in tags:
@@ -499,7 +502,16 @@ class MjcfDocument:
 def _compare_with_model(
     tags_by_element: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
 ) -> None:
-    """Raise an error if elements differ from those of the compiled model."""
+    """Raise an error if elements differ from those of the compiled model.
+
+    Args:
+        tags_by_element: element of the text for each body, joint and actuator of the model.
+        model: compiled model.
+        counts: numbers of bodies, joints and actuators in the text.
+
+    Raises:
+        NotEditableError: they differ.
+    """
     compiled_counts = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
     if counts != compiled_counts:
         raise NotEditableError("the compiled model has other elements")

@@ -177,6 +177,10 @@ class MjcfWriter:
         Names such as position or motor are shortcuts for a general actuator. If the
         shortcut cannot state the wanted values, the element becomes ``general`` with all
         the attributes that it needs.
+
+        Args:
+            tag: element of the actuator; its name may be changed.
+            statement: values to write.
         """
         changed = statement.values
         before = {} if statement.insisted else self._list_attributes_before(statement.element)

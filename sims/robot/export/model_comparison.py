@@ -89,8 +89,12 @@ def find_first_difference(first_model: Any, second_model: Any, tolerance: float)
 def _fields_differ(first: Any, second: Any, tolerance: float) -> bool:
     """Return whether two fields of compiled models differ in shape or in value.
 
-    Floating-point numbers may differ by `tolerance` times the largest entry of both arrays;
-    infinities of equal sign are equal. All other types must be identical.
+    Infinities of equal sign are equal. Numbers that are not floating-point must be identical.
+
+    Args:
+        first: array or number of one model.
+        second: the same field of the other model.
+        tolerance: largest difference of floating-point numbers, relative to the largest entry.
     """
     first, second = np.asarray(first), np.asarray(second)
     if first.shape != second.shape:

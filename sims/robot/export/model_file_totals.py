@@ -147,7 +147,13 @@ def _get_effect_name(effect: type[Effect]) -> str:
 
 
 def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Sequence[float]:
-    """Return the numbers that an effect's coefficients change; empty if the file has none."""
+    """Return the numbers that an effect's coefficients change; empty if the file has none.
+
+    Args:
+        fields: fields of the model.
+        robot: the robot.
+        effect: class of the effect at its place.
+    """
     name, place = _get_effect_name(effect), effect.place
     if name in _READERS:
         return _READERS[name](fields, robot, place)
@@ -189,7 +195,12 @@ def _list_totals(
 
 
 def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:
-    """Return whether an effect acts at an actuator of a slide joint."""
+    """Return whether an effect acts at an actuator of a slide joint.
+
+    Args:
+        robot: the robot.
+        effect: class of the effect at its place.
+    """
     if effect.at != "actuator":
         return False
     joint = robot.actuator(effect.place).joint

@@ -91,6 +91,11 @@ def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
     """Check that a written URDF loads as the model with all causes that a URDF can express.
 
+    Args:
+        robot: the robot as read from its URDF.
+        causes: coefficients of all causes.
+        path: path of the written URDF.
+
     Raises:
         RuntimeError: fields, inertia tensors or the motion differ.
     """
@@ -143,6 +148,11 @@ def _disable_contacts(model: Any) -> None:
 
 def _compare_models(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that a reloaded model equals the wanted one in its fields and in its motion.
+
+    Args:
+        reloaded_model: model compiled from the written file.
+        target_model: intended model.
+        name: name of the file in messages.
 
     Raises:
         RuntimeError: a field or the motion differs, so the written file would mislead the user.

@@ -92,6 +92,10 @@ class UrdfWriter:
 
         A missing element is added. The result is None, or the reason why the URDF cannot
         state the cause.
+
+        Args:
+            cause: the cause.
+            attribute: ``damping`` or ``friction``.
         """
         joint = self.joints.get(cause.place)
         if joint is None:
@@ -295,12 +299,24 @@ def _get_joint_axis(joint: XmlElement) -> Array:
 
 
 def _set_vector(tag: XmlElement, name: str, attribute: str, vector: Array) -> None:
-    """Set a vector of a child element, which is added if there is none."""
+    """Set a vector of a child element, which is added if there is none.
+
+    Args:
+        tag: parent element.
+        name: name of the child element.
+        attribute: name of its attribute.
+        vector: the numbers.
+    """
     _get_or_add_child(tag, name).new[attribute] = format_numbers(tuple(vector.tolist()))
 
 
 def _get_or_add_child(tag: XmlElement, name: str) -> XmlElement:
-    """Return the child element with a name, which is added if there is none."""
+    """Return the child element with a name, which is added if there is none.
+
+    Args:
+        tag: parent element.
+        name: name of the child element.
+    """
     child = _find_child(tag, name)
     if child is None:
         child = XmlElement(name, {}, tag.inside)

@@ -183,6 +183,10 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
 def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
     """Write the elements `<pair>` of a robot that the text lacks.
 
+    Args:
+        document: the MJCF, changed in place.
+        robot: the robot with its pairs.
+
     Raises:
         NotEditableError: a geom has no name in the text.
     """
@@ -230,7 +234,14 @@ def _render_series_joint(second: Any) -> str:
 def _render_urdf(
     robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
 ) -> str | None:
-    """Render the URDF with the causes that it can express, and add notes about all others."""
+    """Render the URDF with the causes that it can express, and add notes about all others.
+
+    Args:
+        robot: the robot as read from its URDF.
+        causes: coefficients of all causes.
+        recording: title of the recording, for comments.
+        notes: notes for the user, extended in place.
+    """
     # Importing scipy.spatial takes 0.1 s, and only robots from a URDF need it.
     from sims.robot.export.urdf_writer import UrdfWriter
 
@@ -384,7 +395,12 @@ def render_default_class(
 def _format_default_element(
     element: ModelElement, values: Mapping[str, Values]
 ) -> tuple[str, dict[str, str]]:
-    """Return the tag of an element in a default class, and its attributes as text."""
+    """Return the tag of an element in a default class, and its attributes as text.
+
+    Args:
+        element: the joint or actuator.
+        values: its values by MJCF attribute.
+    """
     class_values = {
         name: value
         for name, value in values.items()

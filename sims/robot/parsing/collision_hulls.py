@@ -326,7 +326,13 @@ def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
 
 
 def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) -> Lists:
-    """Copy lists of the given begins and sizes out of a flat array."""
+    """Copy lists of the given begins and sizes out of a flat array.
+
+    Args:
+        values: flat array.
+        first_indices: index of the first entry of each list.
+        sizes: number of its entries.
+    """
     list_ends = np.cumsum(sizes)
     indices = np.repeat(first_indices - list_ends + sizes, sizes) + np.arange(
         list_ends[-1] if list_ends.size else 0
@@ -337,7 +343,15 @@ def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) ->
 def _write_lists(
     values: Integers, first_indices: Integers, sizes: Integers, lists: Lists, first: int
 ) -> int:
-    """Write lists into an array from index `first` on; return the end index."""
+    """Write lists into an array from index `first` on; return the end index.
+
+    Args:
+        values: flat array, changed in place.
+        first_indices: index of the first entry of each list, set in place.
+        sizes: number of its entries, set in place.
+        lists: the lists.
+        first: index of the first entry of the first list.
+    """
     list_ends = first + np.cumsum(lists.sizes)
     first_indices[:], sizes[:] = list_ends - lists.sizes, lists.sizes
     values[first : first + lists.values.size] = lists.values

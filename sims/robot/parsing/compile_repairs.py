@@ -143,6 +143,10 @@ class CompileRepairs:
 
         The message is the only information about the reason, so its text is searched. False
         means that it fits no known repair, and that the user must change the file.
+
+        Args:
+            spec: the model as an `MjSpec`, changed in place.
+            message: message of MuJoCo's compiler.
         """
         name_match = re.search(r"Element name '(.*?)', id", message)
         name = name_match[1] if name_match else ""

@@ -152,6 +152,10 @@ def _make_robot(
 def _check_model(files: ModelFileReader, model: Any) -> None:
     """Check that a compiled model can be simulated: it moves, its time step and numbers are sane.
 
+    Args:
+        files: reader of the files of the model, for messages.
+        model: compiled model.
+
     Raises:
         InputError: nothing moves, the time step is out of range, or a number is huge or not finite.
     """
@@ -175,7 +179,15 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
 
 
 def _parse_repaired_file(files: ModelFileReader, root: Element) -> Any:
-    """Parse the repaired file into a mujoco.MjSpec."""
+    """Parse the repaired file into a mujoco.MjSpec.
+
+    Args:
+        files: reader of the files of the model, which finds the lines of errors.
+        root: root element of the repaired file.
+
+    Raises:
+        InputError: MuJoCo cannot parse it.
+    """
     import mujoco
 
     text, files.given = format_tree(root)

@@ -170,7 +170,15 @@ def remove_unusable_shapes(
 def _resolve_collision_shape(
     files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, has_mass: bool
 ) -> bool:
-    """Return whether a collision shape can be read, and set the path of its mesh."""
+    """Return whether a collision shape can be read, and set the path of its mesh.
+
+    Args:
+        files: reader of the files of the model.
+        name: name of the link.
+        shape: its collision element, in which the path is set.
+        meshes: finds the files of meshes.
+        has_mass: whether the mass of the link is specified, so that a missing mesh is not an error.
+    """
     for mesh in find_children(shape, "geometry", "mesh"):
         file = mesh.get("filename") or ""
         path, reason = meshes.find(file)
@@ -243,7 +251,15 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
 
 
 def _reject_macros(files: ModelFileReader, root: Element) -> None:
-    """Reject a file with unexpanded xacro macros, and tell the user how to expand them."""
+    """Reject a file with unexpanded xacro macros, and tell the user how to expand them.
+
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF.
+
+    Raises:
+        InputError: the file has a macro.
+    """
     for element in root.iter():
         macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
         if element.tag.startswith("xacro:") or macros:
@@ -301,7 +317,12 @@ def _add_world_link(
 
 
 def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
-    """Give each joint a unique name, which MuJoCo requires, and return notes about the changes."""
+    """Give each joint a unique name, which MuJoCo requires, and return notes about the changes.
+
+    Args:
+        files: reader of the files of the model.
+        joints: elements of the joints, changed in place.
+    """
     used_names: set[str] = set()
     notes = []
     for joint in joints:
@@ -370,7 +391,9 @@ def _find_parent_links(
 def _is_fixed_to_root(parents: Mapping[str, tuple[str, Element]], name: str) -> bool:
     """Return whether only fixed joints are between a link and the root, so that it never moves.
 
-    `parents` maps a link to its parent link and the joint between them.
+    Args:
+        parents: parent link of each link, and the joint between them.
+        name: name of the link.
     """
     while name in parents:
         name, joint = parents[name]

@@ -50,7 +50,12 @@ class ModelFileReader:
     given: list[Element] = field(default_factory=list)
 
     def make_error(self, element: Element | None, message: str) -> InputError:
-        """Make the error for an element of the file, with file and line."""
+        """Make the error for an element of the file, with file and line.
+
+        Args:
+            element: the element; None for the file as a whole.
+            message: what is wrong.
+        """
         place = self.places.get(element) if element is not None else None
         return InputError(f"{place or self.path}: {message}")
 
@@ -195,6 +200,10 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
 
 def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
     """Return the children of an element, with include elements replaced by the included children.
+
+    Args:
+        files: reader of the files of the model.
+        parent: the element.
 
     Raises:
         InputError: an included file is not stated, absent, or included twice.

@@ -89,7 +89,12 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
 
 
 def _list_fixed_bodies(model: Any, number: int) -> list[int]:
-    """Return the numbers of a body and of all bodies that are rigidly attached below it."""
+    """Return the numbers of a body and of all bodies that are rigidly attached below it.
+
+    Args:
+        model: compiled model.
+        number: number of the body.
+    """
     bodies = [number]
     for child in range(number + 1, model.nbody):
         if model.body_parentid[child] in bodies and not model.body_jntnum[child]:
@@ -224,6 +229,10 @@ def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array
     """Return bias forces and inertia matrices in fixed random states, as one vector.
 
     If a change of the model changes none of these numbers, it changes no motion.
+
+    Args:
+        model: compiled model.
+        joints: joints that are moved.
     """
     import mujoco
 

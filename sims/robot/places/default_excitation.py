@@ -96,6 +96,10 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     """Make the commands of all actuators on the joints, or forces at the joints if there are none.
 
     Each command oscillates about a holding value that balances gravity in the reference pose.
+
+    Args:
+        robot: the robot.
+        joints: joints to excite.
     """
     holding, forces = _compute_reference_forces(robot, joints)
     joints_by_name = {joint.name: joint for joint in joints}
@@ -116,7 +120,15 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
 def _compute_reference_forces(
     robot: RobotModel, joints: Sequence[Joint]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the holding force of each joint in the reference pose, and a force amplitude."""
+    """Return the holding force of each joint in the reference pose, and a force amplitude.
+
+    Args:
+        robot: the robot.
+        joints: joints to excite.
+
+    Returns:
+        Both in N or N·m, by the name of the joint.
+    """
     import mujoco
 
     model = robot.compiled
@@ -185,7 +197,14 @@ def _make_command(
 def _stays_within_ranges(
     robot: RobotModel, joints: Sequence[Joint], commands: Sequence[ExcitationCommand], share: float
 ) -> bool:
-    """Return whether no joint leaves its range under commands of reduced amplitude in phase."""
+    """Return whether no joint leaves its range under commands of reduced amplitude in phase.
+
+    Args:
+        robot: the robot.
+        joints: joints to check.
+        commands: commands with full amplitude.
+        share: share of the amplitude, from 0 to 1.
+    """
     import mujoco
 
     model = robot.compiled

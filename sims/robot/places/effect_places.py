@@ -232,7 +232,14 @@ def _make_taking_method(
     """
 
     def taking(_: Effect, c: Array, simpler: str, armature: Array) -> Array:
-        """Convert the inertia of an armature effect to the rotor's share of the joint inertia."""
+        """Convert the inertia of an armature effect to the rotor's share of the joint inertia.
+
+        Args:
+            _: the armature effect; unused.
+            c: coefficients of the richer effect.
+            simpler: name of the simpler effect.
+            armature: coefficient of the armature effect, kg m² or kg.
+        """
         if simpler != drive:
             return c
         coefficients: Array = c.copy()
@@ -260,7 +267,14 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     def act(
         self: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState
     ) -> tuple[Array, Array]:
-        """Compute the force (L, D) along the effect's joint, and the rate of its hidden state."""
+        """Compute the force (L, D) along the effect's joint, and the rate of its hidden state.
+
+        Args:
+            self: the effect at its joint.
+            c: (K, L, 1) coefficients.
+            moment: state of the robot.
+            state: hidden state of the effect.
+        """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)

@@ -249,7 +249,12 @@ def _make_actuator_place(
 
 
 def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
-    """Return the servo gains of an actuator in the model file; zero if it is not a servo."""
+    """Return the servo gains of an actuator in the model file; zero if it is not a servo.
+
+    Args:
+        robot: the robot.
+        actuator: number of the actuator.
+    """
     bias = robot.compiled.actuator_biasprm[actuator]
     return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
 
@@ -328,7 +333,12 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
 
 
 def _list_ancestors(model: Any, body: int) -> list[int]:
-    """Return a body and all its ancestors, including the world."""
+    """Return a body and all its ancestors, including the world.
+
+    Args:
+        model: compiled model.
+        body: number of the body.
+    """
     bodies = [body]
     while body > 0:
         body = int(model.body_parentid[body])
@@ -337,6 +347,11 @@ def _list_ancestors(model: Any, body: int) -> list[int]:
 
 
 def _get_dofs(model: Any, body: int) -> range:
-    """Return the velocity addresses of a body's own joints; empty if it has none."""
+    """Return the velocity addresses of a body's own joints; empty if it has none.
+
+    Args:
+        model: compiled model.
+        body: number of the body.
+    """
     first = int(model.body_dofadr[body])
     return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)
