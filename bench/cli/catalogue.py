@@ -201,17 +201,17 @@ def list_experiments() -> list[JsonDocument]:
 
     documents = []
     for name in experiment.list_experiment_names():
-        each = experiment.load_experiment(name)
-        missing = availability(each)
+        listed = experiment.load_experiment(name)
+        missing = availability(listed)
         documents.append(
             {
-                **_pick(each, "name", "says"),
+                **_pick(listed, "name", "says"),
                 "skipped": missing.skipped or None,
                 "needs": missing.data_set.command if missing.data_set else None,
-                **_pick(each, "title", "tags", "simulator"),
-                "model": each.model or None,
-                **_pick(each, "ranges", "targets", "budget"),
-                "tuners": [asdict(entry)["label"] for entry in each.tuners],
+                **_pick(listed, "title", "tags", "simulator"),
+                "model": listed.model or None,
+                **_pick(listed, "ranges", "targets", "budget"),
+                "tuners": [asdict(entry)["label"] for entry in listed.tuners],
                 "tuners_skipped": dict(missing.tuners),
             }
         )
@@ -224,16 +224,16 @@ def list_references() -> list[JsonDocument]:
 
     return [
         {
-            "name": each.name,
-            "says": each.document.get("title") or each.document.get("says", ""),
-            "simgap": each.simgap,
-            "revision": each.revision or None,
-            "started": each.started,
-            "budget": each.document.get("budget"),
-            "targets": each.document.get("targets"),
-            "tuners": each.tuners,
+            "name": reference.name,
+            "says": reference.document.get("title") or reference.document.get("says", ""),
+            "simgap": reference.simgap,
+            "revision": reference.revision or None,
+            "started": reference.started,
+            "budget": reference.document.get("budget"),
+            "targets": reference.document.get("targets"),
+            "tuners": reference.tuners,
         }
-        for each in map(find_reference, list_reference_names())
+        for reference in map(find_reference, list_reference_names())
     ]
 
 

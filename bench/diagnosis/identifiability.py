@@ -180,7 +180,7 @@ class _IdentifiabilityAssessment:
         covariance[sensitive_block] = correlation_inverse / np.outer(
             scale[is_sensitive], scale[is_sensitive]
         )
-        numbers = []
+        assessments = []
         for i, index in enumerate(self.fit.free_indices.tolist()):
             parameter = self.evaluator.parameters[index]
             standard_error = np.sqrt(max(float(covariance[i, i]), 0.0))
@@ -192,7 +192,7 @@ class _IdentifiabilityAssessment:
                         (self.evaluator.parameters[other_index].name, float(abs(corr)))
                     )
             low, high = parameter.bounds
-            numbers.append(
+            assessments.append(
                 _classify_parameter(
                     parameter.name,
                     True,
@@ -207,12 +207,12 @@ class _IdentifiabilityAssessment:
             set(self.evaluator.base_indices.tolist()) - set(self.fit.free_indices.tolist())
         ):
             parameter = self.evaluator.parameters[index]
-            numbers.append(
+            assessments.append(
                 _classify_parameter(
                     parameter.name, True, parameter.unit, np.inf, parameter.bounds, ()
                 )
             )
-        return numbers
+        return assessments
 
     def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
@@ -251,7 +251,7 @@ class _IdentifiabilityAssessment:
         selected_columns = list(most_sensitive.values())
         unit_columns = columns[:, selected_columns] / np.maximum(norms[selected_columns], 1e-300)
         correlations = np.abs(unit_columns.T @ unit_columns)
-        numbers = []
+        assessments = []
         for row, ((name, coefficient_index), k) in zip(
             correlations, most_sensitive.items(), strict=True
         ):
@@ -275,18 +275,18 @@ class _IdentifiabilityAssessment:
                 identifiability = _classify_parameter(
                     label, False, parameter.unit, 0.0, parameter.bounds, confounders
                 )
-                numbers.append(
+                assessments.append(
                     replace(
                         identifiability, half=np.nan, word=_rate_switching_effect(float(norms[k]))
                     )
                 )
                 continue
-            numbers.append(
+            assessments.append(
                 _classify_parameter(
                     label, False, parameter.unit, half_width, parameter.bounds, confounders
                 )
             )
-        return numbers
+        return assessments
 
 
 def _rate_switching_effect(noises: float) -> IdentifiabilityLevel:
@@ -332,17 +332,17 @@ def _classify_parameter(
 
 
 def format_identifiability(
-    numbers: Sequence[ParameterIdentifiability], max_count: int = 8
+    assessments: Sequence[ParameterIdentifiability], max_count: int = 8
 ) -> list[str]:
     """Format the free parameters and the best identifiable causes as lines for the terminal.
 
     Args:
-        numbers: Result of `assess_identifiability`.
+        assessments: Result of `assess_identifiability`.
         max_count: Maximum number of causes with their own line, and of names in a list.
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
-    lines += [f"  {_format_parameter(number)}" for number in numbers if number.free]
-    causes = {level: [n for n in numbers if not n.free and n.word == level] for level in _WORDS}
+    lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
+    causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
     counts = [f"{len(members)} {level}" for level, members in causes.items()]
     lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
@@ -377,10 +377,10 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
     )
 
 
-def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
+def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
     """List the effects of causes once each, with the number of their places."""
     places: dict[str, set[str]] = {}
-    for number in numbers:
+    for number in assessments:
         effect, _, place = number.name.partition(" ")[0].partition("@")
         places.setdefault(effect, set()).add(place)
     place_counts = {name: len(effect_places) for name, effect_places in places.items()}

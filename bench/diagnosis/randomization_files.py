@@ -160,7 +160,7 @@ def render_isaac_lab_code(
         "ranges_isaac_lab.py",
         heading=list_heading(extended, "Isaac Lab", ranges.left_out),
         terms=list(zip(identifiers(term.name for term in terms), terms, strict=True)),
-        missing=[f"- {sentences[entry]}" for entry in missing],
+        missing=[f"- {sentences[number_range]}" for number_range in missing],
     )
 
 
@@ -172,54 +172,64 @@ def _build_terms(
     `sentences` has the comment for each range.
     """
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
-    for entry in ranges.ranges:
-        by_effect.setdefault(entry.effect, {}).setdefault(entry.name, []).append(entry)
+    for number_range in ranges.ranges:
+        by_effect.setdefault(number_range.effect, {}).setdefault(number_range.name, []).append(
+            number_range
+        )
     terms: list[Term] = []
     for effect, function, key in (
         ("friction.coulomb", "randomize_joint_parameters", "friction_distribution_params"),
         ("inertia.armature", "randomize_joint_parameters", "armature_distribution_params"),
     ):
-        for name, (entry,) in by_effect.pop(effect, {}).items():
+        for name, (number_range,) in by_effect.pop(effect, {}).items():
             notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
             terms.append(
                 _build_joint_term(
-                    entry.field, name, function, key, _get_ends(entry), [sentences[entry], *notes]
+                    number_range.field,
+                    name,
+                    function,
+                    key,
+                    _get_ends(number_range),
+                    [sentences[number_range], *notes],
                 )
             )
     terms += _make_gain_terms(by_effect, sentences, robot)
-    for name, (entry,) in by_effect.pop("mass.scale", {}).items():
-        params = {"mass_distribution_params": _format_pair(*_get_ends(entry)), "operation": '"abs"'}
+    for name, (number_range,) in by_effect.pop("mass.scale", {}).items():
+        params = {
+            "mass_distribution_params": _format_pair(*_get_ends(number_range)),
+            "operation": '"abs"',
+        }
         if name in by_effect.get("inertia.scale", {}):
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
         terms.append(
             _build_body_term(
-                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[entry]]
+                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[number_range]]
             )
         )
     for name, offsets in by_effect.pop("mass.offset", {}).items():
         pairs = [
-            f'"{entry.coefficient}": {_format_pair(entry.minimum, entry.maximum)}'
-            for entry in offsets
+            f'"{offset.coefficient}": {_format_pair(offset.minimum, offset.maximum)}'
+            for offset in offsets
         ]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
-        notes = [sentences[entry] for entry in offsets]
+        notes = [sentences[number_range] for number_range in offsets]
         terms.append(_build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
-    for name, (entry,) in by_effect.pop("inertia.scale", {}).items():
+    for name, (number_range,) in by_effect.pop("inertia.scale", {}).items():
         params = {
-            "inertia_distribution_params": _format_pair(entry.minimum, entry.maximum),
+            "inertia_distribution_params": _format_pair(number_range.minimum, number_range.maximum),
             "operation": '"scale"',
             "diagonal_only": "False",
         }
-        notes = [sentences[entry], "This term exists since Isaac Lab 3."]
+        notes = [sentences[number_range], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
         terms.append(_build_body_term("body_inertia", name, function, params, notes))
     terms += _make_gravity_term(by_effect, sentences, robot)
     return terms, [
-        entry
+        number_range
         for ranges_by_place in by_effect.values()
         for by_place in ranges_by_place.values()
-        for entry in by_place
+        for number_range in by_place
     ]
 
 
@@ -245,7 +255,11 @@ def _make_gain_terms(
         ends = _sum_ranges(
             [_convert_gain_to_joint(robot, stiffness, name, 1) for name in actuators]
         )
-        notes = [sentences[entry] for name in actuators for entry in stiffness.get(name, ())]
+        notes = [
+            sentences[number_range]
+            for name in actuators
+            for number_range in stiffness.get(name, ())
+        ]
         key = "stiffness_distribution_params"
         yield _build_joint_term("stiffness", joint, function, key, ends, notes)
     for joint in dict.fromkeys([*passive, *_group_by_joint(robot, damping)]):
@@ -258,9 +272,9 @@ def _make_gain_terms(
         )
         joint_ranges = [
             *(damping_ranges or ()),
-            *(entry for name in names for entry in damping.get(name, ())),
+            *(number_range for name in names for number_range in damping.get(name, ())),
         ]
-        notes = [*(sentences[entry] for entry in joint_ranges), DAMPING_NOTE]
+        notes = [*(sentences[number_range] for number_range in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
         yield _build_joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
 
@@ -313,24 +327,34 @@ def _make_gravity_term(
         sentences: comment for each range.
         robot: model of the robot.
     """
-    scale = [entry for ranges in by_effect.pop("gravity.scale", {}).values() for entry in ranges]
-    tilt = [entry for ranges in by_effect.pop("gravity.tilt", {}).values() for entry in ranges]
+    scale = [
+        number_range
+        for ranges in by_effect.pop("gravity.scale", {}).values()
+        for number_range in ranges
+    ]
+    tilt = [
+        number_range
+        for ranges in by_effect.pop("gravity.tilt", {}).values()
+        for number_range in ranges
+    ]
     if not scale and not tilt:
         return
     gravity_in_file = np.asarray(robot.compiled.opt.gravity, dtype=float)
     low, high = gravity_in_file.copy(), gravity_in_file.copy()
-    for entry in scale:
-        ends = np.stack([entry.minimum * gravity_in_file, entry.maximum * gravity_in_file])
+    for number_range in scale:
+        ends = np.stack(
+            [number_range.minimum * gravity_in_file, number_range.maximum * gravity_in_file]
+        )
         low, high = ends.min(axis=0), ends.max(axis=0)
-    for entry in tilt:
-        axis = AXES.index(entry.coefficient)
-        low[axis], high[axis] = entry.low, entry.high
+    for number_range in tilt:
+        axis = AXES.index(number_range.coefficient)
+        low[axis], high[axis] = number_range.low, number_range.high
     vectors = [f"[{', '.join(number(value) for value in end)}]" for end in (low, high)]
     params = {
         "gravity_distribution_params": f"({', '.join(vectors)})",
         "operation": '"abs"',
     }
-    notes = [sentences[entry] for entry in (*scale, *tilt)]
+    notes = [sentences[number_range] for number_range in (*scale, *tilt)]
     yield Term("gravity", "randomize_physics_scene_gravity", params, notes)
 
 
@@ -386,8 +410,8 @@ def _format_asset(key: str, name: str) -> str:
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 
-def _get_ends(entry: RandomizationRange) -> tuple[float, float]:
-    return entry.low, entry.high
+def _get_ends(number_range: RandomizationRange) -> tuple[float, float]:
+    return number_range.low, number_range.high
 
 
 def _sum_ranges(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -422,7 +446,9 @@ def render_mujoco_playground_code(
     # Setting the mass also scales the inertia, and setting the size of gravity its components, so
     # inertia and components are set afterwards.
     with_fields = sorted((r for r in ranges.ranges if r.fields), key=_is_last)
-    fields = dict.fromkeys(name for entry in with_fields for name in _list_fields(entry))
+    fields = dict.fromkeys(
+        name for number_range in with_fields for name in _list_fields(number_range)
+    )
     places = dict.fromkeys((r.kind, r.name) for r in with_fields if r.kind in OBJECTS)
     return render_code(
         "ranges_mujoco_playground.py",
@@ -439,27 +465,27 @@ def render_mujoco_playground_code(
     )
 
 
-def _is_last(entry: RandomizationRange) -> bool:
-    return entry.effect in ("inertia.scale", "gravity.tilt")
+def _is_last(number_range: RandomizationRange) -> bool:
+    return number_range.effect in ("inertia.scale", "gravity.tilt")
 
 
-def _list_fields(entry: RandomizationRange) -> list[str]:
+def _list_fields(number_range: RandomizationRange) -> list[str]:
     """List the names of the fields that a range sets."""
-    names = [field.name for field in entry.fields]
-    return [*names, "body_inertia"] if entry.effect == "mass.scale" else names
+    names = [field.name for field in number_range.fields]
+    return [*names, "body_inertia"] if number_range.effect == "mass.scale" else names
 
 
-def _format_index(entry: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
+def _format_index(number_range: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
     """Format the index of an element, based on the variable of its joint, body or actuator.
 
     Args:
-        entry: the range, with the field of the compiled model.
+        number_range: the range, with the field of the compiled model.
         place: variable with the id of the joint, body or actuator; empty if there is none.
         address: index of the element in the field; its first number is the place.
     """
     if not place:
         return ", ".join(str(k) for k in address)
-    first = f"model.jnt_dofadr[{place}]" if entry.field.startswith("dof_") else place
+    first = f"model.jnt_dofadr[{place}]" if number_range.field.startswith("dof_") else place
     return ", ".join([first, *(str(k) for k in address[1:])])
 
 
@@ -488,7 +514,7 @@ def build_range_files(
         return {}
     import tomli_w
 
-    rows = [entry.document() for entry in ranges.ranges]
+    rows = [number_range.document() for number_range in ranges.ranges]
     assert extended.robot is not None
     document: dict[str, Any] = {
         "format": FORMAT_VERSION,
@@ -499,7 +525,7 @@ def build_range_files(
     }
     table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
     tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": format_csv(COLUMNS, table)}
-    if not any(entry.fields for entry in ranges.ranges):
+    if not any(number_range.fields for number_range in ranges.ranges):
         return tables
     robot = getattr(extended.kind, "robot", None)
     return {

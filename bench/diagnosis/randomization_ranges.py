@@ -290,15 +290,23 @@ def describe_ranges(
     ranges: RandomizationRanges,
 ) -> Iterator[tuple[RandomizationRange, str]]:
     """Yield each range with a line of text: quantity, place, value, range, unit and cause."""
-    for entry in ranges.ranges:
-        place_text = f"{entry.kind} {entry.name}" if entry.name else "the world"
-        quantity = entry.field or f"effect {entry.effect}"
+    for number_range in ranges.ranges:
+        place_text = (
+            f"{number_range.kind} {number_range.name}" if number_range.name else "the world"
+        )
+        quantity = number_range.field or f"effect {number_range.effect}"
         # An effect with a single coefficient calls it "coefficient", which says nothing.
-        quantity += "" if entry.coefficient == "coefficient" else f" ({entry.coefficient})"
-        value_in_file = "" if entry.nominal is None else f"{entry.nominal:.4g} in the model file, "
-        unit = "" if entry.unit == "1" else f" {entry.unit}"
+        quantity += (
+            "" if number_range.coefficient == "coefficient" else f" ({number_range.coefficient})"
+        )
+        value_in_file = (
+            ""
+            if number_range.nominal is None
+            else f"{number_range.nominal:.4g} in the model file, "
+        )
+        unit = "" if number_range.unit == "1" else f" {number_range.unit}"
         yield (
-            entry,
-            f"{quantity} of {place_text}: {value_in_file}{entry.value:.4g} "
-            f"({entry.low:.4g} to {entry.high:.4g}){unit} with {entry.cause}",
+            number_range,
+            f"{quantity} of {place_text}: {value_in_file}{number_range.value:.4g} "
+            f"({number_range.low:.4g} to {number_range.high:.4g}){unit} with {number_range.cause}",
         )

@@ -69,27 +69,29 @@ def score_model(
                 model,
             )
     # All runs count by default, because only initial states are fitted here.
-    data = recording_in_memory or read_recording(path, kind, whole=True)
+    recording_used = recording_in_memory or read_recording(path, kind, whole=True)
     # Constants of the recording take precedence over those that the model was fitted with.
-    data = replace(data, constants={**extended.constants, **data.constants})
-    data, _ = leave_out_settling(data, kind)
-    runs = data.held_out() if held_out else data.runs
+    recording_used = replace(
+        recording_used, constants={**extended.constants, **recording_used.constants}
+    )
+    recording_used, _ = leave_out_settling(recording_used, kind)
+    runs = recording_used.held_out() if held_out else recording_used.runs
     if not runs:
         raise InputError(f"{path}: no run is marked held_out, and only such runs were to count")
     _check_channels(path, extended, list(runs[0].channels))
     engine = None if kind.own_engine else extended.engine
-    check_value_sizes(data)
-    check_recording_plausible(data, kind, force)
-    check_recording_size(data, kind(engine=engine), force)
+    check_value_sizes(recording_used)
+    check_recording_plausible(recording_used, kind, force)
+    check_recording_size(recording_used, kind(engine=engine), force)
     # Only the effects in the file are needed; the others are not part of the model.
     evaluator = RunEvaluator(
         kind,
-        data,
+        recording_used,
         runs,
         engine,
         candidates=list(extended.effects),
     )
-    sigma = compute_noise_floor(evaluator, data).sigma
+    sigma = compute_noise_floor(evaluator, recording_used).sigma
     squares = _compute_squared_errors(evaluator, _simulate_runs(evaluator, extended, sigma))
     evaluator.close()
     if not np.isfinite(squares).all():

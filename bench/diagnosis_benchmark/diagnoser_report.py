@@ -87,7 +87,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
     tables = build_all_tables(rows, order, training)
     for name, frame in {**tables, "failures": build_failure_table(rows, order)}.items():
         write_atomically(study.folder / f"{name}.csv", format_csv(frame))
-    data = DiagnoserReportData(
+    report_data = DiagnoserReportData(
         study.configuration.experiment,
         str(study.folder),
         order,
@@ -99,10 +99,10 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
         len(study.cases),
         left_out,
     )
-    data = replace(data, pictures=draw_figures(data))
-    for name, picture in data.pictures.items():
+    report_data = replace(report_data, pictures=draw_figures(report_data))
+    for name, picture in report_data.pictures.items():
         write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
-    write_atomically(study.folder / REPORT_FILE, render_page(data))
+    write_atomically(study.folder / REPORT_FILE, render_page(report_data))
     for line in format_summary(tables, order):
         print_line(line)
     for name, reason, count in summarise_unsupported(left_out):
@@ -117,7 +117,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
         f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, "
         f"{', '.join(f'{n}.csv' for n in tables)}"
     )
-    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(data.pictures))}")
+    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(report_data.pictures))}")
     print_line(f"report: {study.folder / REPORT_FILE}")
     failed = rows[rows["status"] != "done"]
     for _, row in failed.head(_MAX_LISTED_FAILURES).iterrows():

@@ -178,26 +178,27 @@ def _find_differing_numbers(
     verdict: Verdict, extended: ExtendedSimulator
 ) -> Iterator[VerificationFailure]:
     """Yield numbers of the verdict that are missing or different in the extended simulator."""
-    for name, number in verdict.parameters.items():
+    for name, fitted_value in verdict.parameters.items():
         model_value = extended.parameters.get(name)
         if model_value is not None and not math.isclose(
-            number.value, model_value.value, rel_tol=RELATIVE_TOLERANCE
+            fitted_value.value, model_value.value, rel_tol=RELATIVE_TOLERANCE
         ):
             yield VerificationFailure(
                 VERDICT_FILE,
                 0,
-                f"{name}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {model_value.value:.9g}",
+                f"{name}: {fitted_value.value:.9g}, "
+                f"in {EXTENDED_MODEL_FILE} {model_value.value:.9g}",
             )
     for cause in verdict.causes:
         coefficients: Mapping[str, Any] = extended.effects.get(cause.effect, {})
-        for name, number in cause.coefficients.items():
+        for name, fitted_value in cause.coefficients.items():
             value = coefficients[name].value if name in coefficients else math.nan
-            if not math.isclose(number.value, value, rel_tol=RELATIVE_TOLERANCE):
+            if not math.isclose(fitted_value.value, value, rel_tol=RELATIVE_TOLERANCE):
                 label = f"{cause.effect} {name}"
                 yield VerificationFailure(
                     VERDICT_FILE,
                     0,
-                    f"{label}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
+                    f"{label}: {fitted_value.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
                 )
 
 

@@ -201,9 +201,9 @@ class InContextTransformer(Tuner):
         Raises:
             ValueError: the budget is smaller than two scenarios.
         """
-        each = max(self.each, 2 * (simulator.dim + 1))
+        per_scenario = max(self.each, 2 * (simulator.dim + 1))
         data = generate_training_data(
-            simulator, rng, budget, self.scenarios, each, draw_binary_search
+            simulator, rng, budget, self.scenarios, per_scenario, draw_binary_search
         )
         callback = self.watch
         held_out_data = None
@@ -212,7 +212,7 @@ class InContextTransformer(Tuner):
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             held_out_data = generate_training_data(
-                ground, stream, ground.budget, self.scenarios, each, draw_binary_search
+                ground, stream, ground.budget, self.scenarios, per_scenario, draw_binary_search
             )
         box = np.array(simulator.training, dtype=np.float64)
 
@@ -236,7 +236,7 @@ class InContextTransformer(Tuner):
             design = self.make_network_design()
             material = _build_training_histories(features, noisy_data, box)
             weights = train_history_transformer(
-                material, partial(self._draw_histories, each), design, rng, monitor
+                material, partial(self._draw_histories, per_scenario), design, rng, monitor
             )
             return TrainedHistoryNetwork(design, features, weights, box)
 

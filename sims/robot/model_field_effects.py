@@ -139,8 +139,8 @@ def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelFi
         robot: the robot.
         place: name of the body.
     """
-    number = robot.body(place).id
-    return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
+    body_id = robot.body(place).id
+    return [[ModelField("body_ipos", (body_id, axis))] for axis in range(3)]
 
 
 def _make_servo_gain_finder(term: int) -> Find:
@@ -158,10 +158,10 @@ def _make_servo_gain_finder(term: int) -> Find:
             robot: the robot.
             place: name of the actuator.
         """
-        number = robot.actuator(place).id
-        servo_fields = [ModelField("actuator_biasprm", (number, term), -1)]
-        if gain_pulls(robot, number, term):
-            servo_fields.insert(0, ModelField("actuator_gainprm", (number, 0)))
+        actuator_id = robot.actuator(place).id
+        servo_fields = [ModelField("actuator_biasprm", (actuator_id, term), -1)]
+        if gain_pulls(robot, actuator_id, term):
+            servo_fields.insert(0, ModelField("actuator_gainprm", (actuator_id, 0)))
         return [servo_fields]
 
     return find
@@ -174,9 +174,9 @@ def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelFi
         robot: the robot.
         place: name of the actuator.
     """
-    number = robot.actuator(place).id
+    actuator_id = robot.actuator(place).id
     range_fields = [
-        ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)
+        ModelField("actuator_forcerange", (actuator_id, end), (-1, 1)[end]) for end in (1, 0)
     ]
     return [range_fields]
 
@@ -251,9 +251,9 @@ def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None
         place: name of the body.
         c: (1, L) coefficient.
     """
-    number = robot.body(place).id
-    fields["body_mass"][:, number] *= compute_factor(c[0])
-    fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
+    body_id = robot.body(place).id
+    fields["body_mass"][:, body_id] *= compute_factor(c[0])
+    fields["body_inertia"][:, body_id] *= compute_factor(c[0])[:, None]
 
 
 def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
@@ -310,9 +310,9 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         place: name of the joint.
         c: (K, L) coefficients of the effect.
     """
-    number = robot.joint(place).id
+    joint_id = robot.joint(place).id
     tilted_elements = np.flatnonzero(c.any(axis=0))
-    axis = fields["jnt_axis"][tilted_elements, number]
+    axis = fields["jnt_axis"][tilted_elements, joint_id]
     vector = np.zeros(axis.shape)
     # At a place, the effect has only the coefficients that the motion shows.
     vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[
@@ -326,7 +326,7 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         + np.sin(angle) * np.cross(unit_vector, axis)
         + (1.0 - np.cos(angle)) * along * unit_vector
     )  # (6)
-    fields["jnt_axis"][tilted_elements, number] = rotated / np.linalg.norm(
+    fields["jnt_axis"][tilted_elements, joint_id] = rotated / np.linalg.norm(
         rotated, axis=1, keepdims=True
     )
 
@@ -341,9 +341,9 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
         c: (1, L) coefficient.
     """
     column = fields["body_gravcomp"]
-    number = robot.body(place).id
-    column[:, number] = np.where(
-        c[0], add_to_file_value(column[:, number], c[0]), column[:, number]
+    body_id = robot.body(place).id
+    column[:, body_id] = np.where(
+        c[0], add_to_file_value(column[:, body_id], c[0]), column[:, body_id]
     )
 
 
@@ -360,24 +360,24 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
         place: name of the body.
         c: (K, L) coefficients of the effect.
     """
-    number = robot.body(place).id
+    body_id = robot.body(place).id
     loaded = np.flatnonzero(c[0])
-    point = robot.compiled.body_ipos[number] + c[1:, loaded].T
-    mass, centre = fields["body_mass"][loaded, number], fields["body_ipos"][loaded, number]
+    point = robot.compiled.body_ipos[body_id] + c[1:, loaded].T
+    mass, centre = fields["body_mass"][loaded, body_id], fields["body_ipos"][loaded, body_id]
     total = mass + c[0, loaded]
     middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
     tensor = compute_inertia_tensors(
-        fields["body_iquat"][loaded, number], fields["body_inertia"][loaded, number]
+        fields["body_iquat"][loaded, body_id], fields["body_inertia"][loaded, body_id]
     )
     tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
     tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
     moments, axes = np.linalg.eigh(tensor)
     # A rotation has no reflection.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    fields["body_mass"][loaded, number] = total
-    fields["body_ipos"][loaded, number] = middle
-    fields["body_inertia"][loaded, number] = moments
-    fields["body_iquat"][loaded, number] = compute_quaternions(axes)
+    fields["body_mass"][loaded, body_id] = total
+    fields["body_ipos"][loaded, body_id] = middle
+    fields["body_inertia"][loaded, body_id] = moments
+    fields["body_iquat"][loaded, body_id] = compute_quaternions(axes)
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -391,15 +391,15 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
         place: name of the actuator.
         c: (K, L) coefficients of the effect.
     """
-    number = robot.actuator(place).id
+    actuator_id = robot.actuator(place).id
     is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
     limits = c[0] > 0
-    free = limits & ~is_limited[:, number].astype(bool)
-    ranges[free, number] = (-np.inf, np.inf)
+    free = limits & ~is_limited[:, actuator_id].astype(bool)
+    ranges[free, actuator_id] = (-np.inf, np.inf)
     force_range = np.stack([-c[0], c[0]], axis=1)[limits]
-    low, high = ranges[limits, number].T
-    ranges[limits, number] = np.clip(force_range, low[:, None], high[:, None])  # (5)
-    is_limited[limits, number] = True
+    low, high = ranges[limits, actuator_id].T
+    ranges[limits, actuator_id] = np.clip(force_range, low[:, None], high[:, None])  # (5)
+    is_limited[limits, actuator_id] = True
 
 
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:

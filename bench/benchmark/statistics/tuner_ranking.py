@@ -403,7 +403,7 @@ def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> floa
     """Compute the mean Kendall tau between the rankings on two random halves of the targets.
 
     It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random
-    one. `ranks` (targets, tuners) are the ranks on each target. NaN with fewer than two targets.
+    one. NaN with fewer than two targets.
 
     Args:
         ranks: (targets, tuners) ranks on each target.

@@ -126,7 +126,7 @@ class _Rows:
     def derived(self) -> Iterator[SheetRow]:
         """Yield quantities derived from the system's parameters, by error propagation."""
         parameters = self.extended.parameters
-        values = {name: number.value for name, number in parameters.items()}
+        values = {name: fitted_value.value for name, fitted_value in parameters.items()}
         values_by_name = {**self.extended.constants, **values}
         free = [name for name in self.detection_limits.free if name in values]
         indices = [self.detection_limits.free.index(name) for name in free]
@@ -146,8 +146,10 @@ class _Rows:
                 )
             gradient = np.array(slopes)
             half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
-            number = FittedValue(value, derived.unit, value - half_width, value + half_width)
-            row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
+            fitted_value = FittedValue(value, derived.unit, value - half_width, value + half_width)
+            row = SheetRow(
+                derived.name, derived.says, "system", "derived", derived.unit, fitted_value
+            )
             yield replace(row, strongest=derived.strongest)
 
     def parameters(self) -> Iterator[SheetRow]:
@@ -156,10 +158,10 @@ class _Rows:
             for parameter in self.subject.kind.parameters:
                 nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
                 # A parameter that is not in the file has its nominal value.
-                number = self.extended.parameters.get(parameter.name, nominal)
+                fitted_value = self.extended.parameters.get(parameter.name, nominal)
                 description = parameter.says or parameter.name
                 row = _make_fitted_row(
-                    parameter.name, description, "system", "fitted", number, None
+                    parameter.name, description, "system", "fitted", fitted_value, None
                 )
                 yield replace(
                     row,
@@ -168,7 +170,7 @@ class _Rows:
                     ),
                 )
             return
-        for name, number in self.extended.parameters.items():
+        for name, fitted_value in self.extended.parameters.items():
             # The coefficient of an effect with several has its name after a point.
             effect, _, place_and_coefficient = name.partition("@")
             local_place = next(
@@ -181,15 +183,15 @@ class _Rows:
                 "",
             )
             if local_place:
-                row = self._make_effect_row(f"{effect}@{local_place}", name, number, "fitted")
+                row = self._make_effect_row(f"{effect}@{local_place}", name, fitted_value, "fitted")
                 yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
         """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
         for name, numbers in self.extended.effects.items():
             local_coefficients = list(self.subject.localise_effect(name, numbers))
-            for effect, coefficient, number in local_coefficients:
-                if number.value == 0:
+            for effect, coefficient, fitted_value in local_coefficients:
+                if fitted_value.value == 0:
                     # A coefficient of zero means that the effect is absent; its detection limit is
                     # computed.
                     continue
@@ -197,9 +199,11 @@ class _Rows:
                     sum(other_effect == effect for other_effect, _, _ in local_coefficients) > 1
                 )
                 label = f"{effect} {coefficient}" if has_several else effect
-                row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
-                if _may_be_zero(number):
-                    yield self._make_hidden_row(row, effect, number)
+                row = self._make_effect_row(
+                    effect, label, fitted_value, "found", self._find_cause(name)
+                )
+                if _may_be_zero(fitted_value):
+                    yield self._make_hidden_row(row, effect, fitted_value)
                     continue
                 place_suffix = (
                     "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"

@@ -242,34 +242,36 @@ class ForkedWorkerPool:
         while unprocessed or busy:
             while idle and unprocessed:
                 pipe = idle.pop()
-                number = unprocessed.pop()
-                if _send(pipe, (evaluator_index, task, items[number])):
-                    busy[pipe] = number
+                item_index = unprocessed.pop()
+                if _send(pipe, (evaluator_index, task, items[item_index])):
+                    busy[pipe] = item_index
                 else:
                     self._kill_worker(pipe)
-                    unprocessed.append(number)
+                    unprocessed.append(item_index)
             # All workers are gone, so the remaining items are processed here.
             if not busy:
-                yield from ((number, task(evaluator, *items[number])) for number in unprocessed)
+                yield from (
+                    (item_index, task(evaluator, *items[item_index])) for item_index in unprocessed
+                )
                 break
             for pipe in self._wait_for_replies(list(busy), evaluator):
-                number = busy.pop(pipe)
+                item_index = busy.pop(pipe)
                 reply = _receive(pipe)
                 if reply is None:
                     # The worker died, perhaps for lack of memory, so its item is processed again.
                     self._kill_worker(pipe)
-                    unprocessed.append(number)
+                    unprocessed.append(item_index)
                     continue
                 idle.append(pipe)
                 evaluator.simulation_count += reply.simulation_count
                 evaluator.search_control.record_abandoned_fit(reply.has_abandoned_fits)
                 if reply.error is not None:
-                    errors[number] = reply.error, reply.trace
+                    errors[item_index] = reply.error, reply.trace
                 else:
-                    yield number, reply.result
+                    yield item_index, reply.result
         # Raise the error of the first item in order, whichever error arrived first.
-        for number in sorted(errors):
-            error, trace = errors[number]
+        for item_index in sorted(errors):
+            error, trace = errors[item_index]
             raise error from _WorkerTracebackError(trace)
 
     def _wait_for_replies(self, pipes: list[Connection], evaluator: SharedState) -> list[Any]:

@@ -112,7 +112,7 @@ def design_next_run(
     rig = RigModel(models.evaluator, seconds)
     ranker = RunRanker(models, [model, *competing_models])
     ranked_runs = ranker.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
-    evaluated_plans = {entry.run.plan for entry in ranked_runs}
+    evaluated_plans = {run_value.run.plan for run_value in ranked_runs}
     for _ in range(MAX_VARIATION_ROUNDS):
         ranked_runs = _evaluate_fully(ranker, ranked_runs)
         if (
@@ -123,8 +123,8 @@ def design_next_run(
             break
         plans = [
             plan
-            for entry in ranked_runs[:PLANS_VARIED_PER_ROUND]
-            for plan in rig.list_variants(entry.run.plan)
+            for run_value in ranked_runs[:PLANS_VARIED_PER_ROUND]
+            for plan in rig.list_variants(run_value.run.plan)
         ]
         new_plans = [plan for plan in dict.fromkeys(plans) if plan not in evaluated_plans]
         evaluated_plans.update(new_plans)
@@ -133,7 +133,10 @@ def design_next_run(
     if ranked_runs and _may_longer_run_help(ranked_runs[0], max_seconds / seconds):
         longer_rig = RigModel(models.evaluator, max_seconds)
         longer_runs = ranker.rank_runs(
-            [longer_rig.make_run(entry.run.plan) for entry in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
+            [
+                longer_rig.make_run(run_value.run.plan)
+                for run_value in ranked_runs[:PLANS_TESTED_FOR_LENGTH]
+            ]
         )
         ranked_runs = sorted(
             [ranked_runs[0], *_evaluate_fully(ranker, longer_runs)[:1]], key=get_sort_key
@@ -175,7 +178,11 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
         first = next(
-            (k for k, entry in enumerate(ranked[:PLANS_VARIED_PER_ROUND]) if not entry.is_exact),
+            (
+                k
+                for k, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
+                if not run_value.is_exact
+            ),
             None,
         )
         if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_total_value):
@@ -183,11 +190,11 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
         ranked[first] = ranker.evaluate_exactly(ranked[first])
         ranked.sort(key=get_sort_key)
     # Runs that are evaluated exactly come before those that are only linearised.
-    return sorted(ranked, key=lambda entry: (not entry.is_exact, *get_sort_key(entry)))
+    return sorted(ranked, key=lambda run_value: (not run_value.is_exact, *get_sort_key(run_value)))
 
 
 def _describe_best_run(
-    models: ModelSet, models_compared: Sequence[FittedModel], rig: RigModel, entry: RunValue
+    models: ModelSet, models_compared: Sequence[FittedModel], rig: RigModel, run_value: RunValue
 ) -> NextRunDesign:
     """Describe the best run, and what it is expected to tell, for the report.
 
@@ -195,14 +202,14 @@ def _describe_best_run(
         models: Fitted models of the recording.
         models_compared: The present diagnosis, followed by the models that compete with it.
         rig: Experimental setup.
-        entry: Best run with its value.
+        run_value: Best run with its value.
     """
-    run, competing_models = entry.run, models_compared[1:]
+    run, competing_models = run_value.run, models_compared[1:]
     discrimination: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
-    effect, gain = "", float(entry.values[0]) if not competing_models else 0.0
+    effect, gain = "", float(run_value.values[0]) if not competing_models else 0.0
     if competing_models:
-        pair_discrimination = np.minimum(entry.values, entry.values.T)
+        pair_discrimination = np.minimum(run_value.values, run_value.values.T)
         diagnosed_model = models_compared[0]
         names = [
             _list_other_effects(competing_model, diagnosed_model)

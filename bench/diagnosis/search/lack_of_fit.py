@@ -402,8 +402,6 @@ def _iterate_hat_families(
 ) -> Iterator[tuple[str, float, float, HatFactory]]:
     """Yield each family of hats: label, lowest and highest centre, function that makes a hat.
 
-    `size` is the strength of a hat.
-
     Args:
         evaluator: the runs.
         size: strength of a hat, in the unit of the force.
@@ -441,9 +439,6 @@ def _make_hat_without_joint(
     family: _Family, size: float, reversal_speed: float, centre: float, width: float
 ) -> tuple[str, Array]:
     """Return effect name and coefficients of one hat force on a system without joints.
-
-    `size` is the strength of the hat, and `reversal_speed` the speed over which dry friction
-    reverses.
 
     Args:
         family: variable and direction of the hat.

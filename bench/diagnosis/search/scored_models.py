@@ -205,15 +205,15 @@ class ScoredModelSet(ModelSet):
                 f"testing {max_effects} effects{further_text}", len(calls)
             )
         scans = {}
-        for number, scan in self.evaluator.worker_pool.map_unordered(
+        for model_index, scan in self.evaluator.worker_pool.map_unordered(
             self.evaluator, _scan_model, calls
         ):
-            scans[number] = scan
+            scans[model_index] = scan
             self.evaluator.search_control.advance()
-        for number, key in enumerate(keys):
-            scores = self.scores_by_effects.get(key, scans[number].scores)
+        for model_index, key in enumerate(keys):
+            scores = self.scores_by_effects.get(key, scans[model_index].scores)
             # Scores that were kept when the directions were removed remain valid.
-            self._store_scores(key, scans[number]._replace(scores=scores))
+            self._store_scores(key, scans[model_index]._replace(scores=scores))
         self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
 
     def _report_scoring(self, model: FittedModel) -> None:

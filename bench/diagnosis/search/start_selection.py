@@ -208,23 +208,27 @@ def _predict_jacobian(
         for i in group.column_indices
         if not direction_set.candidates[i].is_single_size
     }
-    places = evaluator.get_coefficient_indices(name)
-    shaping = [i for i in range(len(places)) if evaluator.parameters[places[i]].bounds[0] > 0]
+    coefficient_indices = evaluator.get_coefficient_indices(name)
+    shaping = [
+        i
+        for i in range(len(coefficient_indices))
+        if evaluator.parameters[coefficient_indices[i]].bounds[0] > 0
+    ]
     if not columns or shaping:
         return None
-    jacobian = np.zeros((*direction_set.responses.shape[:3], len(places)))
-    for place, column in columns.items():
-        jacobian[..., place] = direction_set.responses[..., column]
+    jacobian = np.zeros((*direction_set.responses.shape[:3], len(coefficient_indices)))
+    for index, column in columns.items():
+        jacobian[..., index] = direction_set.responses[..., column]
     contained = [
         evaluator.get_coefficient_indices(n)
         for n in evaluator.available_effects[name].contains
         if n in model.effects
     ]
-    replaced_places = {place for span in contained for place in span}
+    replaced_places = {index for span in contained for index in span}
     return (
         model.fit.get_known_jacobian()
         .drop_parameters(replaced_places)
-        .add_parameters(places, jacobian)
+        .add_parameters(coefficient_indices, jacobian)
     )
 
 
@@ -256,15 +260,15 @@ def _list_start_sizes(
     for share in SIZE_SHARES:
         c = first.coefficients.copy()
         for column, size in zip(group.column_indices, estimate, strict=True):
-            place = direction_set.candidates[column].coefficient_index
-            c[place] = share * float(np.clip(size, *bounds[place]))
+            index = direction_set.candidates[column].coefficient_index
+            c[index] = share * float(np.clip(size, *bounds[index]))
         yield c
         yield from generate_event_times(evaluator, name, c)
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
-    place = evaluator.coefficient_slices[name].start + first.coefficient_index
-    _, upper_bound = evaluator.parameters[place].bounds
+    index = evaluator.coefficient_slices[name].start + first.coefficient_index
+    _, upper_bound = evaluator.parameters[index].bounds
     shares = list(RANGE_SHARES)
     if first.can_be_negative:
         shares += [-share for share in RANGE_SHARES]

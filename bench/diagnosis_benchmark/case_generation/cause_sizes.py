@@ -63,32 +63,32 @@ def fit_coefficients(
     Returns:
         The fitted coefficients, (P,).
     """
-    numbers, residual, damping = start, compute_residual(start), FIRST_DAMPING
+    coefficients, residual, damping = start, compute_residual(start), FIRST_DAMPING
     for _ in range(steps):
         columns = [
-            (compute_residual(numbers + FINITE_DIFFERENCE_STEP * unit) - residual)
+            (compute_residual(coefficients + FINITE_DIFFERENCE_STEP * unit) - residual)
             / FINITE_DIFFERENCE_STEP
-            for unit in np.eye(numbers.size)
+            for unit in np.eye(coefficients.size)
         ]
         jacobian = np.stack(columns, axis=1)
         normal_matrix, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         scaling = np.diag(np.diag(normal_matrix) + 1e-12)
         for _ in range(MAX_DAMPING_TRIALS):
             step = np.linalg.solve(normal_matrix + damping * scaling, gradient)
-            trial = np.clip(numbers - step, low, high)
+            trial = np.clip(coefficients - step, low, high)
             trial_residual = compute_residual(trial)
             # The comparison is false for values that are not finite.
             if trial_residual @ trial_residual <= residual @ residual:
                 break
             damping *= 8
         else:
-            return numbers
+            return coefficients
         damping /= 5
-        has_converged = np.abs(trial - numbers).max() < CONVERGED_STEP
-        numbers, residual = trial, trial_residual
+        has_converged = np.abs(trial - coefficients).max() < CONVERGED_STEP
+        coefficients, residual = trial, trial_residual
         if has_converged:
             break
-    return numbers
+    return coefficients
 
 
 def find_strength_for_size(

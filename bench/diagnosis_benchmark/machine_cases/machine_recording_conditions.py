@@ -219,7 +219,7 @@ def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
     # Lengths of upper arm and forearm in m, and their masses in kg.
     length, outer = rng.uniform(0.25, 0.45), rng.uniform(0.2, 0.35)
     mass1, mass2 = rng.uniform(0.8, 2.0), rng.uniform(0.4, 1.0)
-    numbers = {
+    parameters = {
         "mass1": mass1,
         "centre1": length * rng.uniform(0.4, 0.55),
         "inertia1": mass1 * length**2 * rng.uniform(0.08, 0.11),
@@ -235,7 +235,7 @@ def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
         "armature2": rng.uniform(0.002, 0.01),
     }
     # Rounded as the model file states them.
-    return {name: float(f"{value:.4g}") for name, value in numbers.items()}
+    return {name: float(f"{value:.4g}") for name, value in parameters.items()}
 
 
 def _draw_runs(

@@ -57,9 +57,9 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
         robot: the robot.
         place: name of the actuator.
     """
-    number = robot.actuator(place).id
-    is_limited = f["actuator_forcelimited"][0, number]
-    return [f["actuator_forcerange"][0, number, 1]] if is_limited else [np.inf]
+    actuator_id = robot.actuator(place).id
+    is_limited = f["actuator_forcelimited"][0, actuator_id]
+    return [f["actuator_forcerange"][0, actuator_id, 1]] if is_limited else [np.inf]
 
 
 def _make_solref_reader(index: int) -> Read:

@@ -40,15 +40,15 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
         axes of the body's frame.
     """
     model, data = _get_reference_state(robot)
-    number = robot.body(body).id
-    points = np.array(list(_iterate_link_points(model, data, number)))
+    body_id = robot.body(body).id
+    points = np.array(list(_iterate_link_points(model, data, body_id)))
     low, high = points.min(axis=0), points.max(axis=0)
-    longest_side = float((high - low).max()) or _estimate_link_length(model, number)
+    longest_side = float((high - low).max()) or _estimate_link_length(model, body_id)
     half_sizes = (
         np.maximum(0.5 * (high - low), MIN_THICKNESS_SHARE * longest_side)
         + MARGIN_SHARE * longest_side
     )
-    middle, stated_centre = 0.5 * (low + high), model.body_ipos[number]
+    middle, stated_centre = 0.5 * (low + high), model.body_ipos[body_id]
     box: Array = np.stack(
         [middle - half_sizes - stated_centre, middle + half_sizes - stated_centre], axis=1
     )
