@@ -97,10 +97,15 @@ MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
 """Maximum excess over the noise, as a share of that of the base model, with right units."""
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
-MIN_CLEAR_RESIDUAL = 3.0
-"""Minimum residual of the base model, in units of the noise, to change options in advance."""
+MAX_LINEAR_RESIDUAL = 3.0
+"""Maximum residual of the base model, in units of the noise, at which effects act linearly."""
 MAX_COMPETING_SQUARES_RATIO = 2.0
 """Maximum sum of squares of an effect that competes with other options, relative to theirs."""
+MIN_COMPETING_GAIN_SHARE = 0.7
+"""Minimum gain of an effect that competes with other options, relative to theirs, near the noise.
+
+Gains are in twice the log-likelihood, and those of effects to first order.
+"""
 MAX_OPTION_ROUNDS = 3
 """Maximum number of options of the solver that are changed."""
 MAX_FITTED_OPTIONS = 3
@@ -878,9 +883,9 @@ class _ExplainRun:
     def _choose_options(self, base: BaseFit) -> BaseFit:
         """Choose the options of MuJoCo's solver of a robot with contacts: the file's, or others.
 
-        Other options are used before the search if they alone close a large gap down to the noise,
-        and if no effect at a contact does so with the file's options. Other options that are better
-        than the file's are compared with the result of the search.
+        Other options are used before the search if they alone close the gap down to the noise, and
+        if no effect comes near with the file's options. Other options that are better than the
+        file's are compared with the result of the search.
         """
         if (
             not self._has_contacts
@@ -889,9 +894,6 @@ class _ExplainRun:
             or not np.isfinite(base.fit.cost)
         ):
             return base
-        # This import is needed for robots only.
-        from bench.diagnosis.search.contact_search import find_lowest_scan
-
         file_options = self._rate_options(base)
         if file_options.is_noise_like:
             return base
@@ -899,14 +901,37 @@ class _ExplainRun:
         self._restore_evaluators(file_options.evaluators)
         if options is file_options:
             return base
-        if options.is_noise_like and file_options.residual > MIN_CLEAR_RESIDUAL:
-            limit = MAX_COMPETING_SQUARES_RATIO * options.base.fit.cost
-            search = self._create_search(base, self._make_rng())
-            if not find_lowest_scan(search) < limit:
-                self._use_options(options, file_options)
-                return options.base
+        if options.is_noise_like and not self._has_competing_effect(options, file_options):
+            self._use_options(options, file_options)
+            return options.base
         self.possible_options = options
         return base
+
+    def _has_competing_effect(self, options: RatedOptions, file_options: RatedOptions) -> bool:
+        """Return whether an effect may explain the recording as other options of the solver do.
+
+        Far from the noise, only effects at contacts are tried: others would not imitate an option.
+        Laws with many shapes are not tried, because an option is the simpler explanation.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.search.contact_search import (
+            exclude_laws_with_many_shapes,
+            find_lowest_scan,
+        )
+
+        search = self._create_search(file_options.base, self._make_rng())
+        lowest_squares = find_lowest_scan(search)
+        if file_options.residual > MAX_LINEAR_RESIDUAL:
+            return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.base.fit.cost
+        exclude_laws_with_many_shapes(search)
+        model = search.base_model
+        squares = np.square(search.compute_residual(model.fit) / self.noise.sigma).sum()
+        gains = (
+            float(search.observed_mask.sum()) * float(np.log(squares / lowest_squares)),
+            float(search.score_missing_effects(model).score.max(initial=0.0)),
+        )
+        option_gain = options.log_likelihood - file_options.log_likelihood
+        return max(gains) > MIN_COMPETING_GAIN_SHARE * option_gain
 
     def _rate_options(self, base: BaseFit) -> RatedOptions:
         """Rate a base model that was fitted with the present options."""

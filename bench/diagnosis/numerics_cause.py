@@ -154,9 +154,12 @@ class RatedOptions(NamedTuple):
         They must close half of the gap, and predict the held-out runs better. Only another value of
         an option that has been changed already needs no part of the gap.
         """
+        # This import is needed for robots only.
+        from sims.robot.integrator_settings import list_changed_options
+
+        kinds = (rated.evaluators.kind for rated in (self, other))
         options, other_options = (
-            {name for name, _ in rated.evaluators.kind.numerics.solver_options}
-            for rated in (self, other)
+            list_changed_options(kind.robot, kind.numerics).keys() for kind in kinds
         )
         gain = self.log_likelihood - other.log_likelihood
         if options == other_options:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 import simgap
-from tests.bench.diagnosis.block_recordings import write_block_recording
+from tests.bench.diagnosis.block_recordings import OPTIONS, write_block_recording
 
 MODEL_B = """<mujoco model="b">
   <compiler angle="radian" autolimits="true"/>
@@ -46,6 +46,9 @@ DIFFERENCES = {
 BLOCK_DIFFERENCES = {
     "cone": {"options": 'cone="elliptic"'},
     "impratio": {"options": 'impratio="20"'},
+    "noslip": {"options": 'noslip_iterations="5"'},
+    "integrator of the block": {"change": (OPTIONS, 'integrator="Euler"')},
+    "solver": {"options": 'solver="PGS" iterations="3"'},
     "friction": {"change": ('friction="0.6"', 'friction="0.7"')},
 }
 """Differences of the block on a plane, as arguments of `write_block_recording`."""

@@ -21,6 +21,7 @@ from sims.robot.integrator_settings import (
     INTEGRATOR_IDS,
     SOLVER_IDS,
     IntegratorSettings,
+    list_changed_options,
     read_option,
 )
 from sims.robot.robot_simulator import RobotSimulator
@@ -35,6 +36,12 @@ MIN_DISTINCT_CHANGE = 0.05
 """Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
 MIN_SQUARES_DECREASE = 20.0
 """Minimum decrease of the sum of squares by an alternative, in units of the noise."""
+MAX_EXCESS_RATIO = 0.6
+"""Maximum excess of the sum of squares over that of noise by another option, relative to without.
+
+The initial states belong to the options in use. An option is accepted only if it leaves at most a
+quarter of this excess with initial states of its own.
+"""
 
 
 class OptionAlternative(NamedTuple):
@@ -55,7 +62,8 @@ def rank_option_alternatives(
     """Simulate the runs with alternative options, and rank those that explain them better.
 
     An alternative is left out if the sum of squares does not decrease clearly, or if a better one
-    makes the same motion.
+    makes the same motion. Another value of an option that has been changed already needs no large
+    decrease.
 
     Args:
         evaluator: the runs of a robot.
@@ -77,13 +85,17 @@ def rank_option_alternatives(
 
     observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma
     samples = max(int(is_recorded.sum()), 1)
-    limit = float(np.square(simulate(kind.numerics) - observed).sum()) - MIN_SQUARES_DECREASE
+    present = float(np.square(simulate(kind.numerics) - observed).sum())
+    limit = present - MIN_SQUARES_DECREASE
+    limit_of_other_option = min(limit, samples + MAX_EXCESS_RATIO * max(present - samples, 0.0))
+    changed_options = list_changed_options(kind.robot, kind.numerics).keys()
     ranked: list[tuple[OptionAlternative, Array]] = []
     for numerics in _iterate_alternatives(kind):
         evaluator.search_control.check_not_stopped()
         motion = simulate(numerics)
         squares = float(np.square(motion - observed).sum())
-        if squares < limit:
+        options = list_changed_options(kind.robot, numerics).keys()
+        if squares < (limit if options == changed_options else limit_of_other_option):
             ranked.append((OptionAlternative(numerics, squares), motion))
     ranked.sort(key=lambda pair: pair[0].squares)
     distinct: list[tuple[OptionAlternative, Array]] = []

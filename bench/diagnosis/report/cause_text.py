@@ -274,7 +274,7 @@ _MODEL_FILE_ERROR_FORMATTERS: Mapping[str, Callable[[str, Sequence[FittedValue]]
 """Functions that format how wrong a value of the model file is, by effect."""
 _STEP_ERROR_TEXTS = {
     "numerics.step": "the time step of the model file is too long",
-    "numerics.integrator": "the integrator of the model file is not accurate enough",
+    "numerics.integrator": "the integrator of the model file does not reproduce the recording",
     "numerics.cone": "the model file has another friction cone",
     "numerics.impratio": "the model file has another impedance ratio of friction",
     "numerics.noslip": "the model file has another number of iterations without slip",

@@ -33,7 +33,7 @@ _AT = {
 """Preposition before a place of each kind, and the plural of the kind."""
 NUMERICS_NAMES = {
     "numerics.step": "too long a time step",
-    "numerics.integrator": "an inaccurate integrator",
+    "numerics.integrator": "an unsuitable integrator",
     "numerics.cone": "another friction cone",
     "numerics.impratio": "another impedance ratio of friction",
     "numerics.noslip": "another number of iterations without slip",

@@ -182,10 +182,22 @@ def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
     assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
     both = make_robot_report(causes=[OTHER, COULOMB])
     assert format_headline(both) == (
-        "The simulation lacks Coulomb friction at joint elbow, and has an inaccurate integrator."
+        "The simulation lacks Coulomb friction at joint elbow, and has an unsuitable integrator."
     )
     assert "(numerics.integrator): p = 1×10⁻⁹." in " ".join(format_summary(both))
     assert not list_place_marks(told)
+
+
+def test_another_integrator_is_not_called_inaccurate():
+    coarser = cause(
+        "numerics.integrator",
+        {"coefficient": {"value": 0.0, "unit": "1", "low": None, "high": None}},
+        description="integrator = Euler explains the recording, the model file has RK4",
+    )
+    assert format_headline(make_robot_report(causes=[coarser])) == (
+        "The integrator of the model file does not reproduce the recording: integrator = Euler "
+        "explains the recording, the model file has RK4."
+    )
 
 
 def test_unknown_and_adequate_count_causes_and_not_their_places():
