@@ -38,6 +38,7 @@ from sims.recording.recording_frame import (
     move_index_to_columns,
     read_frame,
 )
+from sims.recording.recorded_poses import convert_quaternions
 from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale, unwrapped
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
@@ -369,6 +370,9 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
     metadata = description.runs.get(part.name, _UNMARKED)
     channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
     inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}
+    for base, reference in description.orientations.items():
+        where = f"{table}: run {part.name!r}"
+        channels = convert_quaternions(channels, base, reference, where)
     for name, command in description.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.

@@ -295,6 +295,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
         "afloat": MappingProxyType(floating.units()),
+        "base_orientations": MappingProxyType(dict(robot.base_orientations)),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(
             SingleJointSystem() if j.kind == "hinge" else SingleSlideSystem() for j in joints
