@@ -35,7 +35,7 @@ MAX_NORM_ERROR = 0.1
 
 
 def find_recorded_bases(channels: Iterable[str]) -> list[str]:
-    """Find the floating bodies whose whole pose is among the channels, by the names of their joints.
+    """Find the floating joints of bodies whose whole pose is among the channels.
 
     A pose is a position, ``q.BASE.x``, y and z, unless BASE is a ball joint, and a quaternion,
     ``q.BASE.qw``, qx, qy and qz, or the three angles.
@@ -110,8 +110,8 @@ def convert_quaternions(
     wrong_rows = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > MAX_NORM_ERROR)
     if wrong_rows.size:
         raise InputError(
-            f"{where}, sample {wrong_rows[0] + 1}: {names[0]}, qx, qy, qz: expected a quaternion of "
-            f"length 1, found one of length {norms[wrong_rows[0], 0]:.3g}"
+            f"{where}, sample {wrong_rows[0] + 1}: {names[0]}, qx, qy, qz: expected a quaternion "
+            f"of length 1, found one of length {norms[wrong_rows[0], 0]:.3g}"
         )
     angles = compute_angles(quaternions / norms, reference)
     steep_rows = np.flatnonzero(np.abs(angles[:, 1]) > MAX_PITCH)

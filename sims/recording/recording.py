@@ -21,6 +21,7 @@ from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
 from sims.recording.drive_switches import apply_drive_switches
 from sims.recording.log_joining import read_logs
+from sims.recording.recorded_poses import convert_quaternions
 from sims.recording.recording_description import (
     DeclaredSignals,
     ModelFileReference,
@@ -38,7 +39,6 @@ from sims.recording.recording_frame import (
     move_index_to_columns,
     read_frame,
 )
-from sims.recording.recorded_poses import convert_quaternions
 from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale, unwrapped
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]

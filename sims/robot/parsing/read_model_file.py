@@ -121,7 +121,7 @@ def _make_robot(
     notes += compile_repairs.apply_engine_settings(spec, engine, source)
     notes += xml_files.name_unnamed_elements(spec)
     bases, base_notes = recorded_bases.separate_floating_joints(
-        spec, engine.get("recorded_bases", ()), source
+        spec, () if engine.get("fix_base") else engine.get("recorded_bases", ()), source
     )
     notes += base_notes
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}

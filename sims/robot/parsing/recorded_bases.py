@@ -62,9 +62,10 @@ def separate_floating_joints(
             if np.any(getattr(joint, name))
         ]
         if stated:
+            value = np.ravel(getattr(joint, stated[0]))[0]
             raise InputError(
-                f"{source}: joint {base}: expected no {stated[0]} at a floating joint whose pose is "
-                f"a channel, found {np.ravel(getattr(joint, stated[0]))[0]:g}; remove it, or state "
+                f"{source}: joint {base}: expected no {stated[0]} at a floating joint whose pose "
+                f"is a channel, found {value:g}; remove it, or state "
                 f'the first pose of each run as [extra."q.{base}.qw"] instead of a channel'
             )
         body, is_free = joint.parent, joint.type == mujoco.mjtJoint.mjJNT_FREE
