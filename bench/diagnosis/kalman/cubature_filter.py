@@ -114,6 +114,29 @@ def estimate_first_states(
         First states with the likeliest missing force of each run; None if `can_filter` is false, or
         if the filter diverges.
     """
+    best = smooth_first_states(evaluator, theta, sigma)
+    if best is None:
+        return None
+    states = [
+        _refine_first_state(evaluator, theta, sigma, run, smoothed)
+        for run, smoothed in enumerate(best)
+    ]
+    return FirstStates(np.array(states), compute_first_deviations(best))
+
+
+def smooth_first_states(
+    evaluator: RunEvaluator, theta: Array, sigma: Array
+) -> list[SmoothedStart] | None:
+    """Filter and smooth all runs with the likeliest missing force of each.
+
+    Args:
+        evaluator: the runs.
+        theta: (P,) parameters of the model.
+        sigma: (C,) standard deviation of the noise of each channel.
+
+    Returns:
+        First states by run; None if `can_filter` is false, or if the filter diverges.
+    """
     if not can_filter(evaluator, theta):
         return None
     runs, tried = range(len(evaluator.prepared_runs)), len(FORCE_SHARES)
@@ -124,12 +147,17 @@ def estimate_first_states(
         max(results[tried * run : tried * (run + 1)], key=lambda smoothed: smoothed.log_likelihood)
         for run in runs
     ]
-    variances = [np.diag(smoothed.covariance) for smoothed in best]
-    deviations = np.sqrt(np.mean(variances, axis=0))
-    if not np.isfinite(deviations).all() or not all(np.isfinite(one.mean).all() for one in best):
-        return None
-    states = [_refine_first_state(evaluator, theta, sigma, run, best[run]) for run in runs]
-    return FirstStates(np.array(states), deviations)
+    is_finite = all(
+        np.isfinite(one.mean).all() and np.isfinite(one.covariance).all() for one in best
+    )
+    return best if is_finite else None
+
+
+def compute_first_deviations(smoothed: Sequence[SmoothedStart]) -> Array:
+    """Return the standard deviations (2 D,) of first states, RMS over the runs."""
+    variances = [np.diag(one.covariance) for one in smoothed]
+    deviations: Array = np.sqrt(np.mean(variances, axis=0))
+    return deviations
 
 
 def _refine_first_state(
@@ -144,7 +172,7 @@ def _refine_first_state(
     """
     is_recorded = np.isfinite(evaluator.observed[run])
     rng = np.random.default_rng(0)
-    root = _compute_root(smoothed.covariance[None])[0]
+    root = compute_root(smoothed.covariance[None])[0]
     best, deviates = smoothed.mean, np.zeros(smoothed.mean.size)
     width, lowest = 1.0, np.inf
     for _ in range(SEARCH_ROUNDS):
@@ -288,7 +316,7 @@ class _CubatureFilters:
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
                 log_likelihood_gain, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += log_likelihood_gain
-                root = _compute_root(covariance + added_covariance)
+                root = compute_root(covariance + added_covariance)
                 displacements = points[:, :size] @ root.swapaxes(1, 2)  # (1)
                 missing_forces = points[:, size:] * self._force_deviations[:, None]
                 ends = self._propagate(
@@ -408,7 +436,7 @@ def _solve(matrices: Array, sides: Array) -> Array:
     return np.asarray(np.linalg.solve(matrices, sides), dtype=np.float64)
 
 
-def _compute_root(matrices: Array) -> Array:
+def compute_root(matrices: Array) -> Array:
     """Return square roots S of symmetric matrices (F, Z, Z), P = S S'."""
     try:
         root = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)

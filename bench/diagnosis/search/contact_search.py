@@ -5,7 +5,8 @@ sticks, and a small change of a coefficient does not show what a large one does.
 therefore estimated by maximum likelihood of the filter, which follows the data with a missing
 force, or by scans of simulated runs. The initial states are estimated again with the fitted effect,
 because the first estimate belongs to the model without it. Where a contact begins to slide, the sum
-of squares has kinks at which Gauss-Newton steps end, so each fit begins with a scan.
+of squares has steps at which Gauss-Newton steps end, so each fit begins with a scan and a random
+search of coefficients and initial states (`random_search`).
 
 If one of these fits leaves only noise, scores about it are valid. They show whether a further
 effect acts, and which effects may replace it: to first order, the base model leaves the residual
@@ -27,19 +28,26 @@ from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.cubature_filter import (
+    FIRST_STATE_MARGIN,
     Hypothesis,
+    compute_first_deviations,
     filter_hypotheses,
     set_first_states_in_contact,
+    smooth_first_states,
 )
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.effect_search import MAX_P_VALUE_FURTHER_EFFECT, EffectSearch
 from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES
-from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART
+from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomSearch
+from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
 from bench.diagnosis.search.start_selection import select_refit_starts
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.simulator import Array
 
-MAX_COMPETITOR_SIZE = 2.0
+MAX_COMPETITOR_SIZE = 1.3
 """Maximum residual of a competing effect to first order, relative to that of the model (RMS)."""
+DIFFERENCE_SHARES = (1e-2, 1e-3, 1e-4, 1e-5)
+"""Relative changes of the coefficients in difference quotients."""
 MAX_COMPETITORS = 4
 """Maximum number of competing effects that are fitted."""
 DECREASES = (0.75, 0.5, 0.25)
@@ -61,24 +69,32 @@ NEAR_SCAN_WIDTHS = (0.05, 0.01, 0.002, 0.0005)
 """Half of the intervals of scans near an estimate, relative to the number of the model file."""
 SCANNED_VALUES = 21
 """Number of values of a scan."""
-MAX_SCANNED_FITS = 4
-"""Maximum number of fits that follow a scan."""
+MAX_STATE_ESTIMATES = 4
+"""Maximum number of estimates of the initial states with an effect."""
+SAMPLED_WIDTH = 0.04
+"""Standard deviation of coefficients in a random search, relative to the number of the model file.
+
+For effects without such a number, it is relative to the coefficient.
+"""
+STEP_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003)
+"""Half of the intervals in which coefficients that fit equally well are searched.
+
+They are relative to the standard deviation of coefficients in a random search.
+"""
 MAX_TRIED_EFFECTS = 3
-"""Maximum number of effects at contacts that are fitted by simulation."""
-MAX_MOVED_MODELS = 4
-"""Maximum number of models of one effect that are fitted again from other initial states."""
+"""Maximum number of effects that are fitted with initial states of their own."""
 MAX_SCAN_RATIO = 0.9
 """Maximum sum of squares in a scan of an effect that is fitted, relative to that without it."""
 MAX_COST_RATIO = 0.5
 """Maximum sum of squares of an effect that is pursued, relative to that of the base model."""
 MAX_EXPLAINED_EXCESS = 0.05
 """Maximum excess of a model whose initial states are not estimated again."""
-MIN_COST_RATIO = 0.95
+MIN_COST_RATIO = 0.7
 """Ratio of the sums of squares of two fits above which no further fit is made."""
 
 
 def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvaluator]) -> None:
-    """Fit single effects from initial states that belong to them, those at contacts first.
+    """Fit single effects from initial states that belong to them, the likeliest at a contact first.
 
     Nothing is fitted if the base model leaves only noise, and no further effect if one explains the
     recording.
@@ -90,59 +106,109 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     Raises:
         SearchStoppedError: the search had to end; it has the models that were fitted so far.
     """
-    if search.is_noise_like(search.base_model):
-        return
-    first_states = [(e.initial_state_guesses, e.state_prior) for e in evaluators]
     base = search.base_model
+    if search.is_noise_like(base):
+        return
+    try:
+        best = _fit_single_effects(search)
+        if best is not None:
+            _use_first_states_of(search, evaluators, best)
+    except SearchStoppedError:
+        search.models.setdefault(frozenset(), base)
+        raise
+
+
+def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
+    """Fit single effects until one explains the recording.
+
+    Returns:
+        The best model; None if none removes a large part of the discrepancy. Then the initial
+        states are those of the base model, and the search has the fits about them.
+    """
+    base, evaluator = search.base_model, search.evaluator
+    states, deviations = evaluator.initial_state_guesses, evaluator.state_prior
+    assert deviations is not None
+    fits: list[FittedModel] = []
     likeliest = _find_likeliest_effect(search)
     if likeliest is not None:
         value = _refine_coefficient(search, likeliest)
-        fits = [_fit_about_first_states_in_turn(search, evaluators, value)]
-        if not _is_explained(search, fits[0][0]):
-            others = [v for v in _rank_effects_at_contacts(search, base) if v.name != value.name]
-            fits += [
-                _fit_about_its_first_states(search, evaluators, v, SCAN_WIDTHS) for v in others
-            ]
-        model, value = min(fits, key=lambda pair: pair[0].fit.cost)
-        if model.fit.cost < MAX_COST_RATIO * base.fit.cost:
-            if not _is_explained(search, model):
-                model, _ = _fit_about_first_states_in_turn(search, evaluators, value)
-            search.fit_to_convergence(model)
-            return
-    for evaluator, (states, deviations) in zip(evaluators, first_states, strict=True):
-        assert deviations is not None
+        fits.append(_fit_about_its_first_states(search, _make_start(search, value, states)))
+    if not any(_is_explained(search, model) for model in fits):
         evaluator.begin_at(states, deviations)
-    search.models.clear()
-    search.add_fit(base.fit)
-    _propose_single_effects(search, evaluators)
+        search.models.clear()
+        search.add_fit(base.fit)
+        for start in _list_single_starts(search):
+            fits.append(_fit_about_its_first_states(search, start))
+            if _is_explained(search, fits[-1]):
+                break
+    best = min(fits, key=lambda model: model.fit.cost, default=base)
+    if best.fit.cost < MAX_COST_RATIO * base.fit.cost:
+        return best
+    evaluator.begin_at(states, deviations)
+    return None
 
 
-def _fit_about_its_first_states(
-    search: EffectSearch,
-    evaluators: Sequence[RunEvaluator],
-    value: _ScannedValue,
-    widths: Sequence[float] = NEAR_SCAN_WIDTHS,
-) -> tuple[FittedModel, _ScannedValue]:
-    """Estimate the initial states with an effect, and scan and fit its coefficient about them."""
-    _move_to_first_states_of(search, evaluators, _add_effect(search, value))
-    states = search.evaluator.initial_state_guesses
-    value = _scan_in_turn(search, value, states, widths)
-    model = search.fit_one(FitStart((value.name,), _add_effect(search, value), states))
-    index = search.evaluator.coefficient_slices[value.name].start
-    return model, value._replace(coefficient=float(model.fit.theta[index]))
+def _list_single_starts(search: EffectSearch) -> list[FitStart]:
+    """Return starts of the effects that explain most from the initial states of the base model.
+
+    Effects at contacts are scanned over their range. Of the others, those with the best scores are
+    fitted.
+    """
+    base = search.base_model
+    states = base.fit.initial_states
+    ranked = [
+        (value.squares, _make_start(search, value, states))
+        for value in _rank_effects_at_contacts(search, base)
+    ]
+    exclude_laws_with_many_shapes(search)
+    search.refit_extensions([base], MAX_REFITTED_CANDIDATES)
+    ranked += [
+        (model.fit.cost, model.fit.make_start())
+        for model in search.models.values()
+        if model.effects and model.fit.cost < MAX_SCAN_RATIO * base.fit.cost
+    ]
+    ranked.sort(key=lambda pair: pair[0])
+    return [start for _, start in ranked[:MAX_TRIED_EFFECTS]]
 
 
-def _fit_about_first_states_in_turn(
-    search: EffectSearch, evaluators: Sequence[RunEvaluator], value: _ScannedValue
-) -> tuple[FittedModel, _ScannedValue]:
+def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> FittedModel:
     """Fit an effect and estimate the initial states in turn, while the sum of squares decreases."""
+    evaluator, sigma = search.evaluator, search.noise.sigma
+    (name,) = start.effects
+    indices = list(evaluator.get_coefficient_indices(name))
+    bounds = np.array(compute_coefficient_bounds(evaluator, name))
+    is_at_contact = evaluator.available_effects[name].at == "contact"
+    rng = search.make_rng("initial states", start.effects)
     limit = MAX_COST_RATIO * search.base_model.fit.cost
-    for _ in range(MAX_SCANNED_FITS):
-        model, value = _fit_about_its_first_states(search, evaluators, value)
+    theta = start.theta
+    for _ in range(MAX_STATE_ESTIMATES):
+        smoothed = smooth_first_states(evaluator, theta, sigma)
+        if smoothed is None:
+            return search.fit_one(start)
+        if is_at_contact:
+            value = _ScannedValue(name, float(theta[indices[0]]), _get_unit(search, name), np.inf)
+            states = np.array([one.mean for one in smoothed])
+            theta = _add_effect(search, _scan_in_turn(search, value, NEAR_SCAN_WIDTHS, states))
+        widths = _compute_widths(search, name, theta[indices])
+        found = RandomSearch(evaluator, sigma, smoothed, rng).run(theta, indices, widths, bounds)
+        evaluator.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
+        # Sums of squares about other initial states are not comparable.
+        search.models.pop(frozenset(start.effects), None)
+        model = search.fit_one(FitStart(start.effects, found.theta, found.states))
         if _is_explained(search, model) or not model.fit.cost < limit:
             break
-        limit = MIN_COST_RATIO * model.fit.cost
-    return model, value
+        limit, theta = MIN_COST_RATIO * model.fit.cost, model.fit.theta
+    return model
+
+
+def _compute_widths(search: EffectSearch, name: str, coefficients: Array) -> Array:
+    """Return the standard deviations (K,) of the samples of an effect's coefficients (K,).
+
+    The uncertainty of an effect at a contact is relative to the number of the model file.
+    """
+    is_at_contact = search.evaluator.available_effects[name].at == "contact"
+    units = _get_unit(search, name) if is_at_contact else np.abs(coefficients)
+    return np.broadcast_to(SAMPLED_WIDTH * units, coefficients.shape)
 
 
 def _is_explained(search: EffectSearch, model: FittedModel) -> bool:
@@ -150,52 +216,93 @@ def _is_explained(search: EffectSearch, model: FittedModel) -> bool:
     return search.compute_excess_residual(model) < MAX_EXPLAINED_EXCESS
 
 
-def _propose_single_effects(search: EffectSearch, evaluators: Sequence[RunEvaluator]) -> None:
-    """Fit the effects with the best scores, and estimate the initial states with the best of them.
-
-    The first estimate belongs to the model without the effect. The best effects are fitted again
-    until one of them explains the recording.
-    """
-    exclude_laws_with_many_shapes(search)
-    base = search.base_model
-    search.refit_extensions([base], MAX_REFITTED_CANDIDATES)
-    for _ in range(MAX_SCANNED_FITS):
-        fitted = sorted(
-            (model for model in search.models.values() if model.effects),
-            key=lambda model: model.fit.cost,
-        )
-        if not fitted or _is_explained(search, fitted[0]):
-            return
-        if not fitted[0].fit.cost < MAX_COST_RATIO * base.fit.cost:
-            return
-        cost = fitted[0].fit.cost
-        _move_to_first_states_of(search, evaluators, fitted[0].fit.theta)
-        states = search.evaluator.initial_state_guesses
-        search.refit_models(
-            [FitStart(m.effects, m.fit.theta, states) for m in fitted[:MAX_MOVED_MODELS]],
-            is_racing=False,
-        )
-        if not min(m.fit.cost for m in search.models.values()) < MIN_COST_RATIO * cost:
-            return
-
-
-def _move_to_first_states_of(
-    search: EffectSearch, evaluators: Sequence[RunEvaluator], theta: Array
+def _use_first_states_of(
+    search: EffectSearch, evaluators: Sequence[RunEvaluator], model: FittedModel
 ) -> None:
-    """Estimate the initial states with parameters (P,), and fit the base model again about them.
+    """Use the initial states of a model for all runs, and fit it and the base model about them.
 
-    Raises:
-        SearchStoppedError: the search had to end; it keeps the models about the former states.
+    Those of held-out runs are estimated with its coefficients.
     """
-    base, known = search.base_model, dict(search.models)
-    set_first_states_in_contact(evaluators, theta, search.noise.sigma)
-    # Sums of squares about other initial states are not comparable.
+    base, evaluator = search.base_model, search.evaluator
+    deviations = evaluator.state_prior
+    assert deviations is not None
+    start = model.fit.make_start()
+    evaluator.begin_at(model.fit.initial_states, deviations)
+    held_out = [other for other in evaluators if other is not evaluator]
+    set_first_states_in_contact(held_out, start.theta, search.noise.sigma)
+    for other in held_out:
+        start = replace(start, theta=_choose_within_steps(search, other, model, start.theta))
     search.models.clear()
-    try:
-        search.refit_models([FitStart((), base.fit.theta, search.evaluator.initial_state_guesses)])
-    except SearchStoppedError:
-        search.models.update(known)
-        raise
+    search.refit_models([FitStart((), base.fit.theta, evaluator.initial_state_guesses)])
+    is_moved = start.theta is not model.fit.theta
+    search.fit_to_convergence(search.fit_one(start) if is_moved else search.add_fit(model.fit))
+
+
+def _choose_within_steps(
+    search: EffectSearch, held_out: RunEvaluator, model: FittedModel, theta: Array
+) -> Array:
+    """Return parameters (P,) that explain held-out runs, among those that fit equally well.
+
+    The sum of squares has steps where a contact begins or ends at another time. Between two steps,
+    the runs for fitting hardly depend on the coefficient, while a held-out run may have a step
+    there. Its initial states are estimated again with the chosen coefficient.
+
+    Args:
+        search: search with the runs for fitting.
+        held_out: held-out runs, which begin at states that were estimated with `theta`.
+        model: fitted model with one effect.
+        theta: (P,) its parameters.
+    """
+    (name,) = model.effects
+    indices = list(search.evaluator.get_coefficient_indices(name))
+    sigma = search.noise.sigma
+    unexplained = _compute_squares(held_out, sigma, theta[None], held_out.initial_state_guesses)
+    count = int(np.isfinite(held_out.observed).sum())
+    if len(indices) != 1 or not float(unexplained[0]) > EXPLAINED_SQUARES * count:
+        return theta
+    widths = _compute_widths(search, name, theta[indices])
+    distances = np.concatenate([share * np.linspace(-1.0, 1.0, 13) for share in STEP_SHARES])
+    samples = np.repeat(theta[None], len(distances), axis=0)
+    samples[:, indices[0]] += widths[0] * distances
+    states = model.fit.initial_states
+    squares = _compute_squares(search.evaluator, sigma, samples, states)
+    is_as_good = squares < squares.min() + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    values = samples[is_as_good, indices[0]]
+    smoothed = smooth_first_states(held_out, theta, sigma)
+    if smoothed is None or not np.ptp(values) > 0.0:
+        return theta
+    bounds = np.array([[values.min(), values.max()]])
+    rng = search.make_rng("held-out states", model.effects)
+    found = RandomSearch(held_out, sigma, smoothed, rng).run(
+        theta, indices, 0.5 * np.ptp(bounds, axis=1), bounds
+    )
+    (after,) = _compute_squares(search.evaluator, sigma, found.theta[None], states)
+    is_better = found.mean_square * count < float(unexplained[0])
+    if not is_better or after > squares.min() + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        return theta
+    held_out.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
+    return found.theta
+
+
+def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, states: Array) -> Array:
+    """Return sums of squares (N,) of the residual, in units of the noise.
+
+    Args:
+        evaluator: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        samples: (N, P) parameters.
+        states: (R, s) initial states.
+    """
+    runs, count = len(states), len(samples)
+    simulated = evaluator.simulate(
+        np.repeat(samples, runs, axis=0),
+        np.tile(np.arange(runs), count),
+        np.tile(states, (count, 1)),
+    )
+    residual = simulated.reshape(count, *evaluator.observed.shape) - evaluator.observed
+    scaled = np.where(np.isfinite(evaluator.observed), residual, 0.0) / sigma
+    squares = np.square(scaled).sum(axis=(1, 2, 3))
+    return np.where(np.isfinite(squares), squares, np.inf)
 
 
 class _ScannedValue(NamedTuple):
@@ -218,11 +325,16 @@ def _list_effects_at_contacts(search: EffectSearch) -> list[_ScannedValue]:
     """Return the effects at contacts, each with the coefficient zero."""
     evaluator = search.evaluator
     return [
-        # A coefficient is limited below, where the number of the file becomes zero.
-        _ScannedValue(name, 0.0, -compute_coefficient_bounds(evaluator, name)[0][0], np.inf)
+        _ScannedValue(name, 0.0, _get_unit(search, name), np.inf)
         for name in evaluator.library
         if evaluator.available_effects[name].at == "contact"
     ]
+
+
+def _get_unit(search: EffectSearch, name: str) -> float:
+    """Return the number of the model file that an effect at a contact changes, in its unit."""
+    # A coefficient is limited below, where the number of the file becomes zero.
+    return -compute_coefficient_bounds(search.evaluator, name)[0][0]
 
 
 def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
@@ -273,11 +385,11 @@ def find_lowest_scan(search: EffectSearch) -> float:
 def _scan_effects_at_contacts(search: EffectSearch, states: Array) -> list[_ScannedValue]:
     """Return the best value of each effect at a contact over its range, from initial states."""
     values = _list_effects_at_contacts(search)
-    return [_scan_in_turn(search, value, states, SCAN_WIDTHS) for value in values]
+    return [_scan_in_turn(search, value, SCAN_WIDTHS, states) for value in values]
 
 
 def _scan_in_turn(
-    search: EffectSearch, value: _ScannedValue, states: Array, widths: Sequence[float]
+    search: EffectSearch, value: _ScannedValue, widths: Sequence[float], states: Array
 ) -> _ScannedValue:
     """Return the best value of scans with these widths, each about the best value of the last."""
     for width in widths:
@@ -303,20 +415,11 @@ def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Arra
         width: half of the interval, relative to the number of the model file.
         states: (R, s) initial states.
     """
-    evaluator, runs = search.evaluator, len(states)
-    evaluator.search_control.check_not_stopped()
+    search.evaluator.search_control.check_not_stopped()
     distances = width * np.linspace(-1.0, 1.0, SCANNED_VALUES)
     values = _list_nearby_values(search, value, distances)
     theta = np.array([_add_effect(search, value) for value in values])
-    simulated = evaluator.simulate(
-        np.repeat(theta, runs, axis=0),
-        np.tile(np.arange(runs), len(theta)),
-        np.tile(states, (len(theta), 1)),
-    )
-    residual = simulated.reshape(len(theta), *evaluator.observed.shape) - evaluator.observed
-    scaled = np.where(search.observed_mask, residual, 0.0) / search.noise.sigma
-    squares = np.square(scaled).sum(axis=(1, 2, 3))
-    squares = np.where(np.isfinite(squares), squares, np.inf)
+    squares = _compute_squares(search.evaluator, search.noise.sigma, theta, states)
     best = int(np.argmin(squares))
     return values[best]._replace(squares=float(squares[best]))
 
@@ -335,6 +438,11 @@ def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValu
     found = np.array([result.log_likelihood for result in results])
     total: Array = found.reshape(len(values), len(runs)).sum(axis=1)
     return total
+
+
+def _make_start(search: EffectSearch, value: _ScannedValue, states: Array) -> FitStart:
+    """Return the start of a fit of an effect at a contact, with initial states (R, s)."""
+    return FitStart((value.name,), _add_effect(search, value), states)
 
 
 def _add_effect(search: EffectSearch, value: _ScannedValue) -> Array:
@@ -398,18 +506,33 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
         model: the model.
     """
     (name,) = model.effects
+    model = search.refine_jacobian(model)
     scan = search.cached_scans[frozenset(model.effects)]
     residual = search.compute_residual(model.fit)
+    columns = _find_columns(search, model)
     change = _compute_change(search, model)
-    scores = scan.test.compute_scores(residual + change)
-    sigma = search.noise.sigma
+    # A test about the model itself would project out the change.
+    fit_without_effect = replace(
+        model.fit,
+        effects=(),
+        free_indices=np.delete(model.fit.free_indices, columns),
+        jacobian=np.delete(model.fit.jacobian, columns, axis=3),
+    )
+    test = ScoreTest(
+        fit_without_effect,
+        scan.directions,
+        search.observed_mask,
+        search.compute_channel_weights(model),
+    )
+    scores = test.compute_scores(residual + change)
+    # Initial states absorb a part of the change.
     before, after = (
-        float(np.square((values / sigma)[search.observed_mask]).sum())
-        for values in (residual + change, residual)
+        float(np.square(values / search.noise.sigma).sum())
+        for values in (test.project_out((residual + change)[None])[0], residual)
     )
     count = int(search.observed_mask.sum())
-    # A score is n log(SS / SS_k) of the sums of squares before and after.
-    sizes = np.sqrt(before * np.exp(-scores.score / count) / after)
+    # Without autocorrelation, a score is n log(SS / SS_k) of the sums of squares.
+    sizes = np.sqrt(before * np.exp(-scores.white_noise_scores / count) / after)
     order = [int(i) for i in np.argsort(sizes) if sizes[i] < MAX_COMPETITOR_SIZE][:MAX_COMPETITORS]
     if not order:
         return
@@ -439,10 +562,34 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     search.refit_models(starts, is_racing=False)
 
 
-def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
-    """Return the change of the runs by the only effect of a model, to first order (R, T, C)."""
+def _find_columns(search: EffectSearch, model: FittedModel) -> list[int]:
+    """Return the columns of a fit's derivatives that belong to the only effect of a model."""
     (name,) = model.effects
-    places = list(search.evaluator.get_coefficient_indices(name))
-    columns = [int(np.flatnonzero(model.fit.free_indices == place)[0]) for place in places]
-    change: Array = model.fit.jacobian[..., columns] @ model.fit.theta[places]
-    return np.where(search.observed_mask, change, 0.0)
+    places = search.evaluator.get_coefficient_indices(name)
+    return [int(np.flatnonzero(model.fit.free_indices == place)[0]) for place in places]
+
+
+def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
+    """Return the change of the runs by the only effect of a model, to first order (R, T, C).
+
+    A difference quotient over a step of the motion is arbitrarily large, so the smallest of several
+    quotients is used.
+    """
+    (name,) = model.effects
+    evaluator, fit = search.evaluator, model.fit
+    indices = list(evaluator.get_coefficient_indices(name))
+    runs = len(fit.initial_states)
+    shares = np.concatenate([DIFFERENCE_SHARES, -np.array(DIFFERENCE_SHARES)])
+    samples = np.repeat(fit.theta[None], len(shares), axis=0)
+    samples[:, indices] *= 1.0 + shares[:, None]
+    simulated = evaluator.simulate(
+        np.repeat(samples, runs, axis=0),
+        np.tile(np.arange(runs), len(shares)),
+        np.tile(fit.initial_states, (len(shares), 1)),
+    ).reshape(len(shares), *evaluator.observed.shape)
+    upper, lower = np.split(simulated, 2)
+    widths = 2.0 * np.array(DIFFERENCE_SHARES)[:, None, None, None]
+    changes = np.where(search.observed_mask, (upper - lower) / widths, 0.0)
+    squares = np.square(changes / search.noise.sigma).sum(axis=(1, 2, 3))
+    result: Array = changes[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
+    return result

@@ -1,0 +1,165 @@
+"""Random search of coefficients and initial states of runs whose geoms touch.
+
+Where a contact begins or ends, slides or sticks, the sum of squares has steps, at which
+Gauss-Newton steps end; between them, it hardly depends on the initial states. Coefficients and
+initial states are therefore sampled together and the samples move to the best ones (cross-entropy
+method; R. Y. Rubinstein, D. P. Kroese, The Cross-Entropy Method, 2004,
+doi:10.1007/978-1-4757-4321-0). Given the coefficients c, the runs r do not depend on each other.
+Their initial states x are minimised for each sample of the coefficients:
+
+    J(c) = sum_r min_x J_r(c, x)                                                               (1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.kalman.cubature_filter import (
+    FIRST_STATE_MARGIN,
+    SmoothedStart,
+    compute_root,
+)
+from sims.core.simulator import Array
+
+COEFFICIENT_SAMPLES = 12
+"""Number of samples of the coefficients in a round."""
+STATE_SAMPLES = 10
+"""Number of initial states of each run that are simulated for a sample of the coefficients."""
+BEST_COEFFICIENTS = 4
+"""Number of best samples of the coefficients whose spread is that of the next round."""
+BEST_STATES = 15
+"""Number of best initial states of a run whose covariance is that of the next round."""
+SPREAD_FACTOR = 1.5
+"""Ratio of the standard deviation of new coefficients to that of the best ones."""
+KEPT_SHARE = 0.15
+"""Share of the former covariance of the initial states in the new one."""
+MIN_COST_DECREASE = 0.1
+"""Minimum relative decrease of the cost in a round after which there is another one."""
+MAX_ROUNDS = 6
+"""Maximum number of rounds."""
+EXPLAINED_SQUARES = 1.05
+"""Mean square of the residual, in units of the noise, at which the search ends."""
+
+
+class FoundValues(NamedTuple):
+    """Best sample of a search.
+
+    Attributes:
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        mean_square: mean square of the residual, in units of the noise.
+    """
+
+    theta: Array
+    states: Array
+    mean_square: float
+
+
+class RandomSearch:
+    """Search about given coefficients and smoothed first states of all runs.
+
+    Args:
+        evaluator: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        smoothed: first states of the runs with their covariances.
+        rng: random generator.
+    """
+
+    def __init__(
+        self,
+        evaluator: RunEvaluator,
+        sigma: Array,
+        smoothed: Sequence[SmoothedStart],
+        rng: np.random.Generator,
+    ) -> None:
+        """Begin with the smoothed states, whose deviates are normalised by their covariances."""
+        self._evaluator, self._sigma, self._rng = evaluator, sigma, rng
+        self._means = [one.mean for one in smoothed]
+        self._roots = [compute_root(one.covariance[None])[0] for one in smoothed]
+        self._deviates = [np.zeros(mean.size) for mean in self._means]
+        self._covariances = [np.eye(mean.size) for mean in self._means]
+        self._is_recorded = np.isfinite(evaluator.observed)
+
+    def run(
+        self, theta: Array, indices: Sequence[int], widths: Array, bounds: Array
+    ) -> FoundValues:
+        """Return the best sample of all rounds.
+
+        Args:
+            theta: (P,) parameters.
+            indices: indices of the K coefficients that are searched.
+            widths: (K,) their standard deviations in the first round.
+            bounds: (K, 2) their lower and upper bounds.
+        """
+        count = int(self._is_recorded.sum())
+        best, centre, lowest = theta.copy(), theta[list(indices)], np.inf
+        spread = widths.astype(np.float64)
+        for _ in range(MAX_ROUNDS):
+            self._evaluator.search_control.check_not_stopped()
+            deviates = self._rng.standard_normal((COEFFICIENT_SAMPLES, len(indices)))
+            deviates[0] = 0.0
+            values = np.clip(centre + spread * deviates, bounds[:, 0], bounds[:, 1])
+            samples = np.repeat(theta[None], COEFFICIENT_SAMPLES, axis=0)
+            samples[:, list(indices)] = values
+            tried = [self._sample_states(run, samples) for run in range(len(self._means))]
+            totals = np.sum([costs.min(axis=1) for _, costs in tried], axis=0)  # (1)
+            index, former = int(np.argmin(totals)), lowest
+            if totals[index] < lowest:
+                lowest, best, centre = float(totals[index]), samples[index], values[index]
+                for run, (states, costs) in enumerate(tried):
+                    self._deviates[run] = states[index, np.argmin(costs[index])]
+            if not lowest < (1.0 - MIN_COST_DECREASE) * former:
+                break
+            if not lowest > EXPLAINED_SQUARES * count:
+                break
+            order = np.argsort(totals)[:BEST_COEFFICIENTS]
+            deviation = np.sqrt(np.square(values[order] - centre).mean(axis=0))
+            spread = np.minimum(spread, SPREAD_FACTOR * deviation)
+            for run, (states, costs) in enumerate(tried):
+                self._move_covariance(run, states, costs)
+        found = [
+            mean + root @ deviate
+            for mean, root, deviate in zip(self._means, self._roots, self._deviates, strict=True)
+        ]
+        evaluator = self._evaluator
+        states = np.where(evaluator.known_state_mask, evaluator.initial_state_guesses, found)
+        return FoundValues(best, states, lowest / max(count, 1))
+
+    def _sample_states(self, run: int, samples: Array) -> tuple[Array, Array]:
+        """Simulate one run from random initial states with each sample of the parameters (N, P).
+
+        Returns:
+            Deviates (N, M, s) of the initial states, and costs (N, M): sums of squares of the
+            residual and of the deviates, which are as uncertain as the prior of the fit.
+        """
+        mean, root = self._means[run], self._roots[run]
+        shape = (len(samples), STATE_SAMPLES, mean.size)
+        spread = compute_root(self._covariances[run][None])[0]
+        deviates = self._deviates[run] + self._rng.standard_normal(shape) @ spread.T
+        deviates[:, 0] = self._deviates[run]
+        states = np.where(
+            self._evaluator.known_state_mask[run],
+            self._evaluator.initial_state_guesses[run],
+            mean + deviates.reshape(-1, mean.size) @ root.T,
+        )
+        simulated = self._evaluator.simulate(
+            np.repeat(samples, STATE_SAMPLES, axis=0), np.full(len(states), run), states
+        )
+        residual = simulated - self._evaluator.observed[run]
+        scaled = np.where(self._is_recorded[run], residual, 0.0) / self._sigma
+        squares = np.square(scaled).sum(axis=(1, 2)).reshape(shape[:2])
+        costs = squares + np.square(deviates / FIRST_STATE_MARGIN).sum(axis=2)
+        return deviates, np.where(np.isfinite(costs), costs, np.inf)
+
+    def _move_covariance(self, run: int, deviates: Array, costs: Array) -> None:
+        """Take the covariance of the best deviates (N, M, s) about the best one."""
+        order = np.argsort(costs, axis=None)[:BEST_STATES]
+        differences = deviates.reshape(-1, deviates.shape[2])[order] - self._deviates[run]
+        covariance = differences.T @ differences / len(order)
+        self._covariances[run] = (1.0 - KEPT_SHARE) * covariance + KEPT_SHARE * self._covariances[
+            run
+        ]
