@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -72,6 +72,7 @@ from bench.pages.text_format import joined
 from sims import extended_simulator as extend
 from sims.core.simulator import Array, InputError, Simulator
 from sims.extended_simulator import ExtendedSimulator
+from sims.recording.recorded_poses import ANGLES
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import read_meta
 from sims.system_simulator import SystemSimulator
@@ -135,8 +136,60 @@ def explain(
         InputError: The recording cannot be read or is too short, its simulator takes no effects, or
             the search was stopped before anything could be simulated.
     """
-    with _explain_run(recording, replace(options or ExplainOptions(), **changes)) as run:
-        return run.run()
+    return _run_in_segments(
+        recording, replace(options or ExplainOptions(), **changes), _ExplainRun.run
+    )
+
+
+RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
+"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
+_Result = TypeVar("_Result")
+
+
+MAX_ROTATION_ERROR = 0.5
+"""Largest error in rad of the simulated orientation of a floating body; beyond it, the effects of
+small changes are not linear."""
+
+
+class DivergingSimulationError(InputError):
+    """Error if no simulation follows the runs, at any starting point of the base fit."""
+
+
+def _run_in_segments(
+    recording: RecordingSource | Sequence[RecordingSource],
+    options: ExplainOptions,
+    action: Callable[[_ExplainRun], _Result],
+) -> _Result:
+    """Run a diagnosis, and again in ever shorter segments while the robot's simulation diverges.
+
+    The motion of a robot that balances or flies is unstable without its controller. A simulation
+    with the recorded commands and a wrong model leaves it within a second, but not within a short
+    segment whose initial state is estimated.
+
+    Args:
+        recording: See `explain`.
+        options: Options of the explanation.
+        action: Runs the diagnosis.
+
+    Raises:
+        DivergingSimulationError: The simulation fails in the shortest segments, too.
+    """
+    started, attempt, retried = time.perf_counter(), options, list(RETRIED_SEGMENTS)
+    while True:
+        with _explain_run(recording, attempt) as run:
+            run.may_divide = run.is_divisible and options.pieces is None and bool(retried)
+            try:
+                return action(run)
+            except DivergingSimulationError:
+                if not run.may_divide:
+                    raise
+                seconds, elapsed = retried.pop(0), time.perf_counter() - started
+                budget = None if options.budget is None else max(options.budget - elapsed, 0.0)
+                attempt = replace(options, pieces=seconds, budget=budget)
+                options.say(
+                    f"no simulation follows the runs: they are cut into pieces of {seconds:g} s, "
+                    "each with its own initial state (--pieces)"
+                )
 
 
 @contextmanager
@@ -188,10 +241,13 @@ def explain_and_design(
         longest: Maximum duration in seconds, if `seconds` do not suffice.
         options: Options of the explanation.
     """
-    with _explain_run(recording, options) as run:
+
+    def run_and_design(run: _ExplainRun) -> ExplanationAndDesign:
         explanation = run.run()
         run.search_control.begin_stage("designing the next recording")
         return ExplanationAndDesign(explanation, run.design(seconds, longest))
+
+    return _run_in_segments(recording, options, run_and_design)
 
 
 def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
@@ -298,6 +354,8 @@ class _ExplainRun:
         self.finer: Reusable[StepRefinement] | None = None
         self.file = RunEvaluators(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
+        # Whether the runs are cut into shorter pieces if no simulation follows them.
+        self.may_divide = False
         self.unit_errors: tuple[RecordingFault, ...] = ()
         self._check_recording()
 
@@ -455,6 +513,8 @@ class _ExplainRun:
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
+        if self.may_divide and self._loses_orientation(base):
+            raise DivergingSimulationError(f"{self.path}: the simulation loses the orientation")
         result = self._search_with_friction_forms(base)
         result = self._search_with_better_step(result.search, result.finding) or result
         result = self._search_with_possible_options(result) or result
@@ -1289,6 +1349,23 @@ class _ExplainRun:
     def _make_rng(self) -> np.random.Generator:
         return make_rng("explain", self.recording.system, self.seed)
 
+    @property
+    def is_divisible(self) -> bool:
+        """True if runs may be cut into segments: those of a robot without unrecorded poses."""
+        return self.kind.has_model and not self.kind.system.afloat
+
+    def _loses_orientation(self, base: BaseFit) -> bool:
+        """Return whether the simulated orientation of a recorded floating body is far from it."""
+        names = [
+            f"q.{base_name}.{angle}"
+            for base_name in self.kind.system.base_orientations
+            for angle in ANGLES
+        ]
+        channels = self.fitting.simulator.channels
+        rows = [c for c, channel in enumerate(channels) if channel.name in names]
+        errors = (base.fit.simulated - self.fitting.observed)[..., rows]
+        return bool(np.nanmax(np.abs(errors), initial=0.0) > MAX_ROTATION_ERROR)
+
     def _make_simulation_error(self) -> InputError:
         """Return the error that explains why nothing could be simulated."""
         if self.unit_errors:
@@ -1298,7 +1375,7 @@ class _ExplainRun:
                 f"{self.path}: the search was stopped before the first fit of the recording was "
                 "finished"
             )
-        return InputError(
+        return DivergingSimulationError(
             f"{self.path}: the simulation fails at every starting point of the fit; "
             "check constants, units, inputs and initial states"
         )

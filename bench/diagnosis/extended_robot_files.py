@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -43,13 +43,15 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     from sims.robot.export.mjcf_document import strip_heading
     from sims.robot.export.round_trip_check import check_written_files
     from sims.robot.export.write_model_file import write_model_files
+    from sims.robot.parsing.read_model_file import restore_floating_joints
 
     # Models with all meshes are compiled several times, which needs the memory of the search.
     release_free_memory()
-    causes, left_out = select_written_causes(collect_causes(extended))
-    written_files = write_model_files(kind.robot, causes, extended.title)
+    causes, left_out = select_written_causes(collect_causes(extended), kind.robot.base_joints)
+    robot = restore_floating_joints(kind.robot)
+    written_files = write_model_files(robot, causes, extended.title)
     try:
-        check_written_files(kind.robot, causes, written_files)
+        check_written_files(robot, causes, written_files)
     except RuntimeError as error:
         # An error here must not discard the result of minutes of search.
         return ExtendedRobotFiles(
@@ -71,19 +73,22 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
 
 def select_written_causes(
     causes: Mapping[str, Mapping[str, FittedValue]],
+    base_joints: Collection[str] = (),
 ) -> tuple[dict[str, Mapping[str, FittedValue]], tuple[str, ...]]:
     """Select the causes that a model file may contain.
 
     Numbers at a bound of their range, or without an interval, are not results and are left out.
+    So are effects at the coordinates of a floating body, which the file does not have.
 
     Args:
         causes: Coefficients by effect.
+        base_joints: Names of these coordinates.
 
     Returns:
         The selected causes, and a line for each number that is left out.
     """
     selected_causes: dict[str, Mapping[str, FittedValue]] = {}
-    left_out = []
+    causes, left_out = _leave_out_base_effects(causes, base_joints)
     for effect, numbers in causes.items():
         if effect.startswith("numerics."):
             selected_causes[effect] = numbers
@@ -108,6 +113,28 @@ def select_written_causes(
                 "is not a result"
             )
     return selected_causes, tuple(left_out)
+
+
+def _leave_out_base_effects(
+    causes: Mapping[str, Mapping[str, FittedValue]], base_joints: Collection[str]
+) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
+    """Leave out effects at the coordinates of floating bodies, and return a line for each."""
+    remaining: dict[str, Mapping[str, FittedValue]] = {}
+    left_out = []
+    for name, numbers in causes.items():
+        effect, _, place = name.partition("@")
+        at_base = {
+            key: n for key, n in numbers.items() if (key.partition("@")[2] or place) in base_joints
+        }
+        for key, number in at_base.items():
+            value_text = append_unit(f"{number.value:.4g}", number.unit)
+            left_out.append(
+                f"{effect}@{key.partition('@')[2] or place}: {value_text}, not in the file: MuJoCo "
+                "has no such element at a free joint"
+            )
+        if len(at_base) < len(numbers):
+            remaining[name] = {key: n for key, n in numbers.items() if key not in at_base}
+    return remaining, left_out
 
 
 def _collect_written_files(written_files: WrittenModelFiles) -> dict[str, str]:

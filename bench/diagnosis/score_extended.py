@@ -136,7 +136,9 @@ def _load_robot(
         name: table for name, table in tables.items() if name not in present_actuators
     }
     # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
-    engine = reference.engine if reference and model.suffix == ".urdf" else {}
+    engine = reference.engine if reference else {}
+    if model.suffix != ".urdf":
+        engine = {key: engine[key] for key in ("recorded_bases",) if key in engine}
     kind = cast(type[SystemSimulator], make_robot_simulator(model, missing_actuators, engine))
     return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 

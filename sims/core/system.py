@@ -222,6 +222,8 @@ class System(ABC):
         afloat: Units by name of the poses and velocities of floating bodies, which are states but
             no coordinates: they are known at the beginning of a run, but not at the beginning of a
             part of a run.
+        base_orientations: Orientation (w, x, y, z) in the model file of each floating body whose
+            pose is recorded, by the name of its joint.
         sensed: Channels on which sensor effects may act, in order of preference.
         primary: Index of the coordinate on which biases and springs act.
         servo: Input that is the set point of the servo of the primary coordinate; empty without a
@@ -254,6 +256,7 @@ class System(ABC):
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
     afloat: ClassVar[Mapping[str, str]] = {}
+    base_orientations: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     uniform: ClassVar[bool] = False
     guided: ClassVar[int] = 0
     bends: ClassVar[bool] = False

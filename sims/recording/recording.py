@@ -21,6 +21,7 @@ from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
 from sims.recording.drive_switches import apply_drive_switches
 from sims.recording.log_joining import read_logs
+from sims.recording.recorded_poses import convert_quaternions
 from sims.recording.recording_description import (
     DeclaredSignals,
     ModelFileReference,
@@ -369,6 +370,9 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
     metadata = description.runs.get(part.name, _UNMARKED)
     channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
     inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}
+    for base, reference in description.orientations.items():
+        where = f"{table}: run {part.name!r}"
+        channels = convert_quaternions(channels, base, reference, where)
     for name, command in description.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.

@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+
 from sims.core.files import require_file
-from sims.core.simulator import Channel, InputError, Simulator
+from sims.core.simulator import Array, Channel, InputError, Simulator
 from sims.core.system import System
 from sims.core.toml_validation import (
     check_finite,
@@ -28,6 +30,12 @@ from sims.recording.drive_switches import (
     check_switches,
     read_switches,
     without_switches,
+)
+from sims.recording.recorded_poses import (
+    ANGLES,
+    QUATERNION_ENTRIES,
+    find_recorded_bases,
+    list_channel_names,
 )
 from sims.recording.unit_conversion import UnitScale, compute_unit_scale
 
@@ -93,6 +101,8 @@ class RecordingDescription:
         wrapped: Angles whose whole turns are restored, each with the input that determines the
             turn.
         switches: Columns that say when drives are on.
+        orientations: Floating bodies whose orientation is recorded as a quaternion, with the
+            orientation (4,) in the model file. The four columns are among the channels.
     """
 
     system: str
@@ -108,6 +118,7 @@ class RecordingDescription:
     sources: RecordingSources
     switches: tuple[DriveSwitch, ...] = ()
     wrapped: Mapping[str, str] = field(default_factory=dict)
+    orientations: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -117,7 +128,8 @@ class ModelFileReference:
     Attributes:
         path: Path of the model file.
         actuators: Actuators that are missing in the file, by name.
-        engine: Time step and integrator, where they differ from those of the file.
+        engine: Time step and integrator, where they differ from those of the file, and floating
+            joints whose pose is recorded.
         free: Unknown parameters that are estimated unless others are requested.
     """
 
@@ -163,7 +175,12 @@ def model_in(
             raise InputError(f"{description}: expected system or model, found both; leave one out")
         model = description.parent / check_text(description, "model", meta["model"])
     actuators = without_switches(check_table(description, "actuators", meta.get("actuators", {})))
-    engine = check_table(description, "engine", meta.get("engine", {}))
+    engine = dict(check_table(description, "engine", meta.get("engine", {})))
+    bases = find_recorded_bases(
+        list_channel_names(check_table(description, "channels", meta.get("channels", {})))
+    )
+    if bases and not engine.get("fix_base"):
+        engine["recorded_bases"] = bases
     return ModelFileReference(
         Path(model), actuators, engine, _read_free_parameters(description, meta)
     )
@@ -224,7 +241,7 @@ def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str
     description = get_description_path(path)
     meta = read_toml(description)
     columns = {
-        **_read_columns(description, "channel", meta, declared.channels),
+        **_read_columns(description, "channel", meta, _list_channels(declared)),
         **_read_columns(description, "input", meta, declared.inputs),
     }
     return {
@@ -281,7 +298,8 @@ def check_description(
         raise make_error(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
     title = check_text(path, "title", meta.get("title", path.stem))
     _refuse_poses(path, meta, declared)
-    channels = _read_columns(path, "channel", meta, declared.channels)
+    channels = _read_columns(path, "channel", meta, _list_channels(declared))
+    orientations = _find_orientations(path, channels, declared)
     _refuse_inputs(path, meta, declared)
     inputs = _read_columns(path, "input", meta, declared.inputs)
     if not channels:
@@ -310,7 +328,7 @@ def check_description(
         title=title,
         channels={name: column.scale for name, column in channels.items()},
         inputs={name: column.scale for name, column in inputs.items()},
-        noise=_read_noises(path, channels, declared),
+        noise=_convert_quaternion_noise(_read_noises(path, channels, declared), orientations),
         constants=constants,
         runs=runs,
         extra=extra_units,
@@ -321,6 +339,7 @@ def check_description(
         sources=sources,
         switches=switches,
         wrapped=_read_wrapped_channels(path, channels, inputs, declared),
+        orientations=orientations,
     )
 
 
@@ -340,7 +359,7 @@ def _read_wrapped_channels(
         inputs: columns of the inputs.
         declared: signals that the system declares.
     """
-    units = {channel.name: channel.unit for channel in declared.channels}
+    units = {channel.name: channel.unit for channel in _list_channels(declared)}
     result = {}
     for name, column in channels.items():
         value = column.table.get("unwrap", False)
@@ -416,6 +435,62 @@ def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
     """Return the units of the states of floating bodies, by name; empty if there are none."""
     units: Mapping[str, str] = getattr(_get_system(declared), "afloat", {})
     return units
+
+
+def _get_orientations(declared: DeclaredSignals) -> Mapping[str, tuple[float, ...]]:
+    """Return the orientation in the model file of floating bodies whose pose is recorded."""
+    orientations: Mapping[str, tuple[float, ...]] = getattr(
+        _get_system(declared), "base_orientations", {}
+    )
+    return orientations
+
+
+def _list_channels(declared: DeclaredSignals) -> list[Channel]:
+    """List the channels of a system, and the quaternions from which some of them are computed."""
+    quaternions = [
+        Channel(f"q.{base}.{entry}", "1")
+        for base in _get_orientations(declared)
+        for entry in QUATERNION_ENTRIES
+    ]
+    return [*declared.channels, *quaternions]
+
+
+def _find_orientations(
+    path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
+) -> dict[str, Array]:
+    """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
+
+    Raises:
+        InputError: A quaternion is incomplete, or the angles are recorded in addition.
+    """
+    found = {}
+    for base, reference in _get_orientations(declared).items():
+        names = [f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES]
+        recorded = [name for name in names if name in channels]
+        if not recorded:
+            continue
+        missing = [name for name in names if name not in channels]
+        if missing:
+            raise InputError(f"{path}: expected all of {', '.join(names)}, found no {missing[0]}")
+        doubled = [f"q.{base}.{angle}" for angle in ANGLES if f"q.{base}.{angle}" in channels]
+        if doubled:
+            raise InputError(
+                f"{path}: expected {names[0]} or {doubled[0]}, found both; leave one out"
+            )
+        found[base] = np.array(reference)
+    return found
+
+
+def _convert_quaternion_noise(
+    noises: Mapping[str, float], orientations: Mapping[str, Array]
+) -> dict[str, float]:
+    """Replace the noise of quaternions by that of the angles, which is twice as large."""
+    result = dict(noises)
+    for base in orientations:
+        stated = [result.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES]
+        if max(stated) > 0:
+            result |= {f"q.{base}.{angle}": 2.0 * max(stated) for angle in ANGLES}
+    return result
 
 
 def _get_system(declared: DeclaredSignals) -> object:
@@ -577,7 +652,7 @@ def _read_noises(
         channels: columns of the channels.
         declared: signals that the system declares, with their scales.
     """
-    sizes = {channel.name: channel.scale for channel in declared.channels}
+    sizes = {channel.name: channel.scale for channel in _list_channels(declared)}
     noises = {}
     for name, column in channels.items():
         if "noise" not in column.table:
@@ -616,7 +691,8 @@ def _read_extra_columns(
         declared: channels and inputs that the system declares.
     """
     # A forgotten channel must not be accepted as an unused column.
-    used_names = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
+    signals = (*_list_channels(declared), *declared.inputs)
+    used_names = ["run", "t", *(signal.name for signal in signals)]
     tables: dict[str, Mapping[str, Any]] = {}
     extra_tables = dotted(
         check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)

@@ -11,6 +11,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 import numpy as np
 
 from sims.core.simulator import InputError, make_unknown_name_error
+from sims.recording.recorded_poses import ANGLES, POSITION_AXES
 from sims.robot.friction_form import FrictionForm
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing.collision_hulls import CollisionShapes
@@ -150,6 +151,8 @@ class RobotModel:
             simulation sets it.
         actuator_tables: actuators that a recording added, by name, as specified there.
         engine_table: time step and integrator that a recording specified instead of the file's.
+        recorded_bases: floating joints that are replaced by slides and hinges, since their pose is
+            recorded (`sims.robot.parsing.recorded_bases`).
         speeds: velocity limits of joints in a URDF, rad/s or m/s; an MJCF specifies none.
         series: added joints in series with others (`dynamics.series_joints`): inertia about them by
             name, kg or kg m^2; only these joints are not in the model file.
@@ -171,6 +174,7 @@ class RobotModel:
     rate_controlled_actuators: tuple[str, ...] = ()
     actuator_tables: Mapping[str, Any] = field(default_factory=dict)
     engine_table: Mapping[str, Any] = field(default_factory=dict)
+    recorded_bases: tuple[str, ...] = ()
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
@@ -205,6 +209,21 @@ class RobotModel:
         other = replace(self, contacts=contacts)
         other.__dict__["compiled"] = self.compiled
         return other
+
+    @cached_property
+    def base_orientations(self) -> Mapping[str, tuple[float, ...]]:
+        """Orientation (w, x, y, z) in the file of each body with a recorded pose, by its joint."""
+        bodies = {base: self.joint(f"{base}.{ANGLES[0]}").id for base in self.recorded_bases}
+        return {
+            base: tuple(self.compiled.body(int(self.compiled.jnt_bodyid[joint])).quat.tolist())
+            for base, joint in bodies.items()
+        }
+
+    @cached_property
+    def base_joints(self) -> frozenset[str]:
+        """Names of the slides and hinges that replace floating joints whose pose is recorded."""
+        axes = (*POSITION_AXES, *ANGLES)
+        return frozenset(f"{base}.{axis}" for base in self.recorded_bases for axis in axes)
 
     @property
     def name(self) -> str:

@@ -262,7 +262,11 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     if not joints:
-        raise InputError(f"{robot.path}: expected a hinge or slide joint, found none that moves")
+        free = robot.joints[0].name
+        raise InputError(
+            f"{robot.path}: expected a hinge or slide joint, found none that moves; if the pose of "
+            f"the body is recorded, state it as channels q.{free}.x, y, z, qw, qx, qy, qz"
+        )
     channels = _list_channels(robot)
     inputs = [Channel(f"u.{a.name}", a.control_unit) for a in robot.actuators]
     inputs += [Channel(f"force.{j.name}", j.force_unit) for j in joints]
@@ -295,6 +299,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
         "afloat": MappingProxyType(floating.units()),
+        "base_orientations": MappingProxyType(dict(robot.base_orientations)),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(
             SingleJointSystem() if j.kind == "hinge" else SingleSlideSystem() for j in joints

@@ -109,6 +109,12 @@ class Columns:
             np.concatenate([self.readings, others.readings], axis=3),
         )
 
+    def subset(self, chosen: Sequence[int]) -> Columns:
+        """Return some of the candidates, with the columns of all."""
+        indices = list(chosen)
+        probes = tuple(self.probes[i] for i in indices)
+        return replace(self, probes=probes, places=self.places[indices], sizes=self.sizes[indices])
+
     def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
         """Return the sum of the inputs of the chosen candidates.
 

@@ -44,6 +44,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     MIN_FURTHER_GAIN_SHARE,
     fit_filtered,
     is_explained,
+    is_nearly_explained,
     make_replacing_start,
     remove_idle_effects,
     select_more_likely,
@@ -302,15 +303,16 @@ class _CompetingEffect(NamedTuple):
 def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedModel:
     """Return a model with one effect in place of several if it is as good.
 
-    Two linear laws may imitate one nonlinear law.
+    Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
+    few. The several effects explain the runs, or nearly.
 
     Args:
         context: context of the search.
         best: the best model so far.
     """
-    explained = len(best.effects) > 1 and is_explained(context, best)
+    imitates = len(best.effects) > 1 and is_nearly_explained(context, best)
     if (
-        not explained
+        not imitates
         or has_series(context.evaluator, best.effects)
         or context.evaluator.search_control.is_over()
     ):

@@ -45,6 +45,13 @@ MAX_JOINT_PROPOSALS = 3
 """Maximum number of effects of the joint and servo models that are added to a set."""
 MIN_GAIN_SHARE = 0.3
 """Minimum gain by regression of a proposed effect, as a share of the largest gain."""
+COMMAND_MODEL = ("input.lag@*",)
+"""Effects of all commands that are proposed where no actuator acts at the joint alone.
+
+Actuators at sites and tendons, such as rotors, move several joints.
+"""
+FIRST_LAG_INTERVALS = 2.0
+"""Initial lag of commands, in sampling intervals."""
 FIRST_SHARE = 0.1
 """Initial coefficient, as a share of the specified friction or of the typical force."""
 
@@ -159,7 +166,9 @@ class EffectProposals:
         speed = max(
             float(np.abs(proposal.trajectory.v[:, joint]).max()) for proposal in followed.linear
         )
+        interval = float(np.median(np.diff(evaluator.runs[0].times)))
         typical = {
+            **dict.fromkeys(COMMAND_MODEL, FIRST_LAG_INTERVALS * interval),
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
             f"inertia.armature@{place}": float(
                 compute_joint_scales(evaluator.simulator.robot).inertia[joint]
@@ -195,7 +204,7 @@ class EffectProposals:
         return max((self._compute_likelihood_step(base, name)[1] for name in others), default=0.0)
 
     def _list_effects_at(self, joint: int) -> list[str]:
-        """Return the effects of the joint model of a joint, and of the model of its servo."""
+        """Return the effects of the joint model of a joint, of its servo, and of all commands."""
         evaluator = self.filters.evaluator
         place, servo = (
             get_joint_name(evaluator, joint),
@@ -203,6 +212,8 @@ class EffectProposals:
         )
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        if not getattr(evaluator.simulator.system, "drives", {}).get(joint):
+            names += COMMAND_MODEL
         return [name for name in names if name in evaluator.library]
 
     def _compute_likelihood_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:

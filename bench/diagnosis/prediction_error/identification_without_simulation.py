@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around
@@ -37,7 +36,7 @@ from bench.diagnosis.kalman.likelihood_fit import (
     maximise_innovation_likelihood,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, has_many_shapes
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 from bench.diagnosis.prediction_error.regression_columns import (
     build_regression_about,
     group_coefficients,
@@ -124,7 +123,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     for _ in range(MAX_ADDED):
         if _is_negligible(context, current):
             break
-        columns = columns or filters.base.columns(_list_probes(context))
+        columns = columns or _list_single_effects(context)
         larger = _add_next_effect(context, current, columns)
         if larger is None:
             break
@@ -304,17 +303,16 @@ def _add_next_effect(
     return larger if gain > _compute_min_gain(context, larger, name) else None
 
 
-def _list_probes(context: SearchContext) -> list[CandidateDirection]:
-    """Return probes of the laws that may be added: one place, few coefficients and few shapes."""
-    evaluator = context.evaluator
-    names = [
-        name
-        for name in evaluator.library
-        if not name.endswith("@*")
-        and not has_many_shapes(name)
-        and len(evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE
+def _list_single_effects(context: SearchContext) -> Columns:
+    """Return inputs of the laws that may be added: one place, few coefficients and few shapes."""
+    library = context.columns.library
+    chosen = [
+        i
+        for i, probe in enumerate(library.probes)
+        if not probe.effect.endswith("@*")
+        and len(context.evaluator.get_coefficient_indices(probe.effect)) <= MAX_IMPROVED_SIZE
     ]
-    return context.columns.probes(names)
+    return library.subset(chosen)
 
 
 def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:

@@ -13,8 +13,8 @@ residual of a set is only noise. The order is:
        (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`competing_models`).
-    5. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`).
-    6. Try one effect in place of several (`competing_models`).
+    5. Try one effect in place of several (`competing_models`).
+    6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`).
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
 (`identification_without_simulation`), and nothing of the above is done.
@@ -126,8 +126,8 @@ class PredictionErrorSearch(EffectSearch):
 
         Each further method is slower, so it is tried only if the best model does not explain the
         runs: dry friction alone, the selected set, effects with many shapes, effects that
-        regression missed, elastic or slack transmissions, and at last one effect in place of
-        several.
+        regression missed, one effect in place of several, and at last elastic or slack
+        transmissions.
         """
         context = self._search_context
         selected = context.columns.select()
@@ -144,11 +144,12 @@ class PredictionErrorSearch(EffectSearch):
             check_simple_friction(context, best)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
+        best = fit_single_in_place(context, best)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
-        return fit_single_in_place(context, best)
+        return best
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

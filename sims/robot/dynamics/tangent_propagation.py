@@ -267,8 +267,11 @@ class TangentModel:
             c: coefficients (K, 1, 1).
         """
         force = self._at.compute_effect_force(effect, c)
-        joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
-        changes = [Perturbation(owner, joint=int(j), series=force[:, j]) for j in joints]
+        changes = [
+            Perturbation(owner, joint=joint, series=series)
+            for joint, series in enumerate(force.T)
+            if np.abs(series).max() > 0
+        ]
         if is_in_drive(effect) and self._at.reads_drives:
             changes.append(
                 Perturbation(

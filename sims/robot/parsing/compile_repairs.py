@@ -261,6 +261,7 @@ class EngineTable(TypedDict, total=False):
     timestep: float
     integrator: str
     fix_base: bool
+    recorded_bases: tuple[str, ...]
 
 
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")

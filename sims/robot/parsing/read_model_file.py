@@ -23,6 +23,7 @@ from sims.robot.parsing import (
     collision_hulls,
     compile_repairs,
     mjcf_loading,
+    recorded_bases,
     urdf_loading,
     xml_files,
 )
@@ -54,8 +55,8 @@ def read_robot(
     Args:
         path: path of an MJCF or a URDF; the content determines the format.
         actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
-        engine: ``timestep`` (s) and ``integrator`` that replace those of the file, and whether to
-            ``fix_base``.
+        engine: ``timestep`` (s) and ``integrator`` that replace those of the file, whether to
+            ``fix_base``, and ``recorded_bases``, the floating joints whose pose is recorded.
 
     Returns:
         The robot, with a note for everything that was repaired or omitted.
@@ -77,6 +78,15 @@ def read_robot(
             return _make_robot(files, root, kind, actuators or {}, engine or {}, warnings)
     except RecursionError:
         raise InputError(f"{path}: elements too deep within each other") from None
+
+
+def restore_floating_joints(robot: RobotModel) -> RobotModel:
+    """Return a robot with the free joints of its file, in place of recorded coordinates."""
+    if not robot.recorded_bases:
+        return robot
+    engine = {k: entry for k, entry in robot.engine_table.items() if k != "recorded_bases"}
+    restored = read_robot(robot.path, actuators=robot.actuator_tables, engine=engine)
+    return restored.with_friction_form(robot.friction_form).with_contacts(robot.contacts)
 
 
 def _make_robot(
@@ -110,6 +120,10 @@ def _make_robot(
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
     notes += compile_repairs.apply_engine_settings(spec, engine, source)
     notes += xml_files.name_unnamed_elements(spec)
+    bases, base_notes = recorded_bases.separate_floating_joints(
+        spec, () if engine.get("fix_base") else engine.get("recorded_bases", ()), source
+    )
+    notes += base_notes
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     spec, model = repairs.compile(spec)
     _check_model(files, model)
@@ -140,6 +154,7 @@ def _make_robot(
         rate_controlled_actuators=rate_controlled,
         actuator_tables=actuators,
         engine_table=engine,
+        recorded_bases=bases,
         speeds=urdf_loading.read_velocity_limits(root) if kind == "urdf" else {},
     )
     # The model is stored here, so that it is not compiled again.

@@ -28,8 +28,8 @@ UNKNOWN_LENGTH = 0.1
 def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     """Return the limits of the offset of a body's centre of mass.
 
-    The limits are a box that contains the geoms of the link and the joints of its child links. A
-    link without either is assumed to be as long as its distance from its parent.
+    The limits are a box that contains the geoms and sites of the link and the joints of its child
+    links. A link without any is assumed to be as long as its distance from its parent.
 
     Args:
         robot: robot with the body.
@@ -58,8 +58,8 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
 def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
     """Yield the points of a link, in its own frame, that its box must contain.
 
-    They are its origin, its specified centre of mass, the corners of its geoms, and the origins of
-    its child bodies.
+    They are its origin, its specified centre of mass, the corners of its geoms, its sites, such as
+    those of rotors, and the origins of its child bodies.
 
     Args:
         model: compiled model.
@@ -74,6 +74,8 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     for body in _list_fixed_bodies(model, number):
         yield axes.T @ (data.xpos[body] - origin)
+        for site in np.flatnonzero(model.site_bodyid == body):
+            yield axes.T @ (data.site_xpos[site] - origin)
         first, count = model.body_geomadr[body], model.body_geomnum[body]
         for geom in range(first, first + count):
             if int(model.geom_type[geom]) in flat:

@@ -67,6 +67,8 @@ EFFECTS_WITH_TOTAL = frozenset({"contact.friction", "gravity.compensation"})
 """Effects, in addition to those at joints, whose coefficient is a difference from the file."""
 SHARED_ACTUATOR_EFFECTS = frozenset({"supply.sag"})
 """Effects at actuators that the actuators may share, such as a battery; one number of the world."""
+BASE_EFFECTS = frozenset({"drag.linear", "drag.quadratic", "force.bias"})
+"""Effects at the coordinates of a floating body: it has no bearing and no drive."""
 POSITION_SENSOR_EFFECTS = frozenset({"sensor.slip"})
 """Effects of position encoders, which act on no other channel."""
 REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0, "contact": 1.0}
@@ -475,6 +477,8 @@ def _acts_at(
     example, and a servo effect a position servo.
     """
     if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[effect_place.kind]) is None:
+        return False
+    if effect.at == "joint" and effect_place.is_base and effect.name not in BASE_EFFECTS:
         return False
     if effect.at == "joint" and effect.needs == "input":
         return any(

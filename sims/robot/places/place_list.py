@@ -69,6 +69,7 @@ class EffectPlace(NamedTuple):
         tilts: for a joint, the axes of its body's frame about which a tilt of its axis shows in the
             motion.
         pairs: for a contact, the pairs of geoms whose contacts get parameters of their own.
+        is_base: whether it is a coordinate of a floating body whose pose is recorded.
     """
 
     name: str
@@ -87,6 +88,7 @@ class EffectPlace(NamedTuple):
     mass: float = 0.0
     tilts: tuple[str, ...] = ()
     pairs: tuple[str, ...] = ()
+    is_base: bool = False
 
 
 def list_places(
@@ -128,6 +130,7 @@ def list_places(
                 last=last_joint_of_body[int(bodies[joint.id])] == joint.id,
                 coupled=joint.name in may_be_coupled,
                 tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
+                is_base=joint.name in robot.base_joints,
             )
         )
     for actuator in robot.actuators:

@@ -164,7 +164,7 @@ def test_the_engine_is_what_the_recording_says(write):
             {"integrator": "Heun"},
             "unknown integrator 'Heun'; there are: Euler, RK4, implicit, impl",
         ),
-        ({"step": 1}, "'step'; there are: fix_base, integrator, timestep"),
+        ({"step": 1}, "'step'; there are: fix_base, integrator, recorded_bases, timestep"),
     ],
 )
 def test_faults_of_the_engine(write, table, message):

@@ -1,0 +1,143 @@
+"""Recorded poses of floating bodies, as from motion capture: quaternions become three angles.
+
+A free joint has no coordinates that a channel shows. A body whose whole pose is recorded is
+therefore simulated with six joints in place of the free joint: three slides along the axes of the
+world, and the rotations yaw, pitch and roll (psi, theta, phi). With R the orientation of the body
+in the world, and R_0 its orientation in the model file,
+
+    R R_0^-1 = R_z(psi) R_y(theta) R_x(phi).                                                   (1)
+
+Yaw and roll are not defined at a pitch of 90 degrees (J. Diebel, Representing attitude, Stanford
+University, 2006, section 8).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+from sims.recording.unit_conversion import unwrapped
+
+POSITION_AXES = ("x", "y", "z")
+"""Axes of translation, those of the world; the channel of the first is ``q.BASE.x``."""
+ANGLES = ("yaw", "pitch", "roll")
+"""Rotations by eq. (1), in the order in which they follow each other."""
+QUATERNION_ENTRIES = ("qw", "qx", "qy", "qz")
+"""Entries of a unit quaternion, as in the channel ``q.BASE.qw``."""
+MAX_PITCH = np.deg2rad(80.0)
+"""Largest absolute pitch, in rad, at which yaw and roll are well defined."""
+MAX_NORM_ERROR = 0.1
+"""Largest difference of a quaternion's length from 1: more is no rounding."""
+
+
+def find_recorded_bases(channels: Iterable[str]) -> list[str]:
+    """Find the floating joints of bodies whose whole pose is among the channels.
+
+    A pose is a position, ``q.BASE.x``, y and z, unless BASE is a ball joint, and a quaternion,
+    ``q.BASE.qw``, qx, qy and qz, or the three angles.
+
+    Args:
+        channels: names of the channels.
+    """
+    names = set(channels)
+    found = []
+    for name in sorted(names):
+        match = re.fullmatch(r"q\.(.+)\.(qw|yaw)", name)
+        if match is None or match[1] in found:
+            continue
+        is_quaternion = {f"q.{match[1]}.{entry}" for entry in QUATERNION_ENTRIES} <= names
+        is_pose = {f"q.{match[1]}.{entry}" for entry in (*POSITION_AXES, *ANGLES)} <= names
+        if is_quaternion or is_pose:
+            found.append(match[1])
+    return found
+
+
+def list_channel_names(tables: Mapping[str, Any]) -> list[str]:
+    """List the names of channels in the tables of a description, of which some may be nested.
+
+    TOML reads ``[channels.q.base.x]`` as tables within each other.
+    """
+    names = []
+    for name, entry in tables.items():
+        nested = (
+            isinstance(entry, dict) and entry and all(isinstance(e, dict) for e in entry.values())
+        )
+        names += [f"{name}.{inner}" for inner in list_channel_names(entry)] if nested else [name]
+    return names
+
+
+def compute_angles(quaternions: Array, reference: Array) -> Array:
+    """Compute yaw, pitch and roll (T, 3) in rad of orientations by eq. (1).
+
+    Args:
+        quaternions: (T, 4) orientations (w, x, y, z); NaN where a sample is missing.
+        reference: (4,) orientation in the model file, a unit quaternion.
+    """
+    w, x, y, z = _multiply_by_inverse(quaternions, reference).T
+    with np.errstate(invalid="ignore"):
+        angles = [
+            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        ]
+    result: Array = np.stack(angles, axis=1)
+    return result
+
+
+def convert_quaternions(
+    channels: Mapping[str, Array], base: str, reference: Array, where: str
+) -> dict[str, Array]:
+    """Replace the quaternion of a floating body among the channels of a run by its three angles.
+
+    Args:
+        channels: channels of the run by name, each (T,).
+        base: name of the free or ball joint.
+        reference: (4,) orientation of the body in the model file, a unit quaternion.
+        where: beginning of error messages.
+
+    Raises:
+        InputError: a quaternion has another length than 1, or a pitch is close to 90 degrees.
+    """
+    names = [f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES]
+    if names[0] not in channels:
+        return dict(channels)
+    quaternions = np.stack([channels[name] for name in names], axis=1)
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    wrong_rows = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > MAX_NORM_ERROR)
+    if wrong_rows.size:
+        raise InputError(
+            f"{where}, sample {wrong_rows[0] + 1}: {names[0]}, qx, qy, qz: expected a quaternion "
+            f"of length 1, found one of length {norms[wrong_rows[0], 0]:.3g}"
+        )
+    angles = compute_angles(quaternions / norms, reference)
+    steep_rows = np.flatnonzero(np.abs(angles[:, 1]) > MAX_PITCH)
+    if steep_rows.size:
+        raise InputError(
+            f"{where}, sample {steep_rows[0] + 1}: {base} has a pitch of "
+            f"{np.rad2deg(angles[steep_rows[0], 1]):.0f} degrees, and yaw and roll are not defined "
+            "at 90; expected at most 80: leave such samples out, or state another orientation of "
+            "the body in the model file"
+        )
+    converted = {name: values for name, values in channels.items() if name not in names}
+    for angle, values in zip(ANGLES, angles.T, strict=True):
+        # NaN stays NaN, and whole turns are restored.
+        converted[f"q.{base}.{angle}"] = unwrapped(values)
+    return converted
+
+
+def _multiply_by_inverse(quaternions: Array, reference: Array) -> Array:
+    """Compute the products (T, 4) of quaternions with the inverse of a unit quaternion."""
+    w, x, y, z = quaternions.T
+    a, b, c, d = reference * np.array([1.0, -1.0, -1.0, -1.0])
+    products = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    result: Array = np.stack(products, axis=1)
+    return result

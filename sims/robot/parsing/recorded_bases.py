@@ -1,0 +1,106 @@
+"""Replace free and ball joints whose pose is recorded by slides and hinges.
+
+The motion is the same, but each coordinate is one that a channel shows, so that initial states are
+estimated and the body is a place of causes like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.recording.recorded_poses import ANGLES, POSITION_AXES
+
+AXES = np.eye(3)
+"""Axes of the world, as rows."""
+
+
+def separate_floating_joints(
+    spec: Any, bases: Sequence[str], source: str
+) -> tuple[tuple[str, ...], list[str]]:
+    """Replace floating joints by three slides along the axes of the world, and three hinges.
+
+    All coordinates are as in `sims.recording.recorded_poses`: slides have the position of the body
+    in the world, hinges are zero in the orientation of the file. Keyframes are left out, since they
+    have other coordinates.
+
+    Args:
+        spec: a mujoco.MjSpec whose joints have names; it is changed in place.
+        bases: names of free or ball joints.
+        source: beginning of error messages.
+
+    Returns:
+        Names of the replaced joints, and notes about them and about omitted keyframes.
+
+    Raises:
+        InputError: there is no such joint, or it has damping, armature or friction.
+    """
+    import mujoco
+
+    kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    floating = {joint.name: joint for joint in spec.joints if joint.type in kinds}
+    names = {joint.name for joint in spec.joints}
+    # Hinges may have such names in the file already.
+    bases = [base for base in bases if base in floating or f"{base}.{ANGLES[0]}" not in names]
+    if not bases:
+        return (), []
+    model = spec.copy().compile()
+    keyframe_count = len(spec.keys)
+    for base in bases:
+        if base not in floating:
+            raise InputError(
+                f"{source}: pose of {base}: "
+                f"{make_unknown_name_error('floating joint', base, sorted(floating))}"
+            )
+        joint = floating[base]
+        stated = [
+            name
+            for name in ("damping", "armature", "frictionloss", "stiffness")
+            if np.any(getattr(joint, name))
+        ]
+        if stated:
+            value = np.ravel(getattr(joint, stated[0]))[0]
+            raise InputError(
+                f"{source}: joint {base}: expected no {stated[0]} at a floating joint whose pose "
+                f"is a channel, found {value:g}; remove it, or state "
+                f'the first pose of each run as [extra."q.{base}.qw"] instead of a channel'
+            )
+        body, is_free = joint.parent, joint.type == mujoco.mjtJoint.mjJNT_FREE
+        anchor = np.array(joint.pos)
+        compiled = model.body(body.name)
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, compiled.quat)
+        # Columns of the transpose are the world's axes in the frame of the body.
+        axes_in_body = rotation.reshape(3, 3).T @ AXES
+        spec.delete(joint)
+        for k, name in enumerate(POSITION_AXES if is_free else ()):
+            _add_joint(
+                body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_SLIDE, axes_in_body[:, k]
+            ).ref = float(compiled.pos[k])
+        for name, k in zip(ANGLES, (2, 1, 0), strict=True):
+            hinge = _add_joint(
+                body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_HINGE, axes_in_body[:, k]
+            )
+            hinge.pos = np.zeros(3) if is_free else anchor
+    for keyframe in list(spec.keys):
+        spec.delete(keyframe)
+    left_out = f"; {keyframe_count} keyframes are left out" if keyframe_count else ""
+    return tuple(bases), [f"the pose is recorded: {', '.join(bases)}{left_out}"]
+
+
+def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
+    """Add a joint without any force of its own, whatever the defaults of the file are."""
+    joint = body.add_joint(name=name, type=kind, axis=axis)
+    for field in ("damping", "armature", "frictionloss", "stiffness", "springref", "margin"):
+        setattr(
+            joint,
+            field,
+            np.zeros_like(getattr(joint, field)) if np.ndim(getattr(joint, field)) else 0.0,
+        )
+    joint.limited = 0
+    joint.actfrclimited = 0
+    joint.actgravcomp = 0
+    return joint
