@@ -389,8 +389,8 @@ class RunEvaluator:
             Observations (L, T, C); NaN after the simulated share and after the end of a shorter
             run.
         """
-        result = np.empty((len(theta), *self.observed.shape[1:]))
         if self.has_linearisation:
+            result = np.empty((len(theta), *self.observed.shape[1:]))
             elements = zip(theta, runs.tolist(), states, strict=True)
             keys = [
                 b"".join(
@@ -447,6 +447,8 @@ class RunEvaluator:
                 calls.append((bool(group >= 2), theta[part], runs[part], states[part], share))
         for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
+            if len(calls) == 1 and sample_count == length:
+                return simulated
             result[parts[number], :sample_count] = simulated
             result[parts[number], sample_count:] = np.nan
         return result

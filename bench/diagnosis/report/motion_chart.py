@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import ceil, floor, log10
+from math import ceil, floor, isfinite, log10
 from typing import NamedTuple
 
 import numpy as np
@@ -214,7 +214,7 @@ def _format_numbers(values: Array, digits: int) -> list[str]:
         values: (T,) numbers, NaN where missing.
         digits: maximum number of decimals.
     """
-    texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
+    texts = [f"{value:.{digits}f}" if isfinite(value) else "" for value in values.tolist()]
     return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
 
 

@@ -90,6 +90,8 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     from sims.robot.contact_pairs import make_pair_name
 
     model = kind.robot.compiled  # type: ignore[attr-defined]
+    if not _can_touch(model):
+        return ()
     counts = Counter[tuple[int, int]]()
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
@@ -104,6 +106,17 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     acting = Counter({p: counts[p] for p in _select_acting_pairs(model, counts, recorded_trees)})
     frequent_pairs = acting.most_common(MAX_CONTACTS)
     return tuple(sorted({make_pair_name(model, pair) for pair, _ in frequent_pairs}))
+
+
+def _can_touch(model: Any) -> bool:
+    """Return whether any contact can arise in a compiled model (mujoco.MjModel)."""
+    # These imports are needed for robots only.
+    import mujoco
+
+    from sims.robot.parsing.collision_hulls import can_collide
+
+    is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return not is_disabled and can_collide(model)
 
 
 def _select_acting_pairs(
@@ -271,6 +284,8 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
         return
     robot: Any = kind.robot  # type: ignore[attr-defined]
     model = robot.compiled
+    if not _can_touch(model):
+        return
     depths: dict[tuple[str, str], list[float]] = {}
     count = 0
     for run in recording.training():
