@@ -621,22 +621,18 @@ class FollowedRuns:
         gains = self.filtered.gains.astype(np.float32)
         whiteners = self.filtered.whiteners.astype(np.float32)
         with np.errstate(all="ignore"):
-            for run in range(number):
-                last_sample = int(
-                    np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0)
-                )
-                for first_column in range(0, count, COLUMNS_PER_BATCH):
-                    part = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
-                    s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
-                    for i in range(last_sample + 1):
-                        u = h[run, i] @ s
-                        u += readings[run, i, :, part]
-                        np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
-                        if i < last_sample:
-                            s -= gains[run, i] @ u
-                            s = a[run, i] @ s
-                            added = pushed[run, i, :, part]
-                            s[:size] += added if inputs is None else inputs[run, i] @ added
+            for first_column in range(0, count, COLUMNS_PER_BATCH):
+                part = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
+                s = np.zeros((number, a.shape[2], part.stop - part.start), dtype=np.float32)
+                for i in range(samples):
+                    u = h[:, i] @ s
+                    u += readings[:, i, :, part]
+                    np.matmul(whiteners[:, i], u, out=result[:, i, :, part])
+                    if i + 1 < samples:
+                        s -= gains[:, i] @ u
+                        s = a[:, i] @ s
+                        added = pushed[:, i, :, part]
+                        s[:, :size] += added if inputs is None else inputs[:, i] @ added
         result[~np.isfinite(result)] = 0.0
         return result
 
