@@ -224,6 +224,8 @@ class System(ABC):
             part of a run.
         base_orientations: Orientation (w, x, y, z) in the model file of each floating body whose
             pose is recorded, by the name of its joint.
+        loops: Coordinates that constraints couple, such as those of a four-bar linkage, as sets of
+            indices.
         sensed: Channels on which sensor effects may act, in order of preference.
         primary: Index of the coordinate on which biases and springs act.
         servo: Input that is the set point of the servo of the primary coordinate; empty without a
@@ -257,6 +259,7 @@ class System(ABC):
     bounces: ClassVar[bool] = False
     afloat: ClassVar[Mapping[str, str]] = {}
     base_orientations: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    loops: ClassVar[Sequence[frozenset[int]]] = ()
     uniform: ClassVar[bool] = False
     guided: ClassVar[int] = 0
     bends: ClassVar[bool] = False

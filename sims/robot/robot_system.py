@@ -23,6 +23,7 @@ from sims.robot.places.default_excitation import LazyDefaultRecording
 from sims.robot.places.place_list import (
     MUJOCO_EFFECT_WORDS,
     EffectPlace,
+    coupled_joints,
     list_places,
     make_contact_place,
 )
@@ -300,6 +301,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "robot": robot,
         "afloat": MappingProxyType(floating.units()),
         "base_orientations": MappingProxyType(dict(robot.base_orientations)),
+        "loops": tuple(map(frozenset, coupled_joints(model, [j.velocity for j in joints]))),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(
             SingleJointSystem() if j.kind == "hinge" else SingleSlideSystem() for j in joints

@@ -141,7 +141,9 @@ class AlternativeFinder:
             # Skip the model itself, and other fits of the same effects.
             if added == effect:
                 continue
-            distance = self._compute_distance(model, other_model)
+            distance = self._compute_distance(
+                model, other_model, self._act_in_one_loop(effect, added)
+            )
             if is_indistinguishable(distance) and not self._wastes_coefficients(
                 effect, added, distance
             ):
@@ -181,12 +183,27 @@ class AlternativeFinder:
             if not names & set(effects[name].contains)
         ]
 
-    def _compute_distance(self, model: FittedModel, other_model: FittedModel) -> float:
+    def _act_in_one_loop(self, effect: str, other_effect: str) -> bool:
+        """Return whether two effects act at different joints of one kinematic loop."""
+        evaluator = self.search.evaluator
+        joints = {evaluator.available_effects[name].coordinate for name in (effect, other_effect)}
+        return len(joints) == 2 and any(joints <= loop for loop in evaluator.simulator.system.loops)
+
+    def _compute_distance(
+        self, model: FittedModel, other_model: FittedModel, is_in_one_loop: bool
+    ) -> float:
         """Return the distance of another model in twice the log-likelihood.
 
         It is negative if the other model is better. If the residual has structure that neither
         model explains, likelihoods only compare how each model mimics it. The distance then depends
-        on the excesses.
+        on the excesses. So it does for models that differ in the joint of a loop at which an effect
+        acts: likelihoods would compare how the constraint that closes the loop gives way, which is
+        a number of the simulation.
+
+        Args:
+            model: the model.
+            other_model: the model that it is compared with.
+            is_in_one_loop: whether the differing effects act in one kinematic loop.
         """
         validation = self.held_out_validation
         # Held-out runs compare the models only if both were evaluated there.
@@ -195,7 +212,7 @@ class AlternativeFinder:
             and not {model.effects, other_model.effects} <= validation.held_out_fits.keys()
         ):
             validation = None
-        if self.structure:
+        if self.structure or is_in_one_loop:
             other_excess = self.search.compute_excess_residual(other_model)
             ratios = [
                 compute_excess_ratio(other_excess, self.search.compute_excess_residual(model))

@@ -41,6 +41,21 @@ def test_a_four_bar_without_a_cause_is_adequate():
 
 
 @pytest.mark.slow
+def test_joints_of_one_loop_are_a_set():
+    """All joints of the parallelogram turn alike; only the give of the constraint differs."""
+    verdict = answer("fourbar_damping")
+    (cause,) = verdict.causes
+    assert verdict.verdict == "ambiguous"
+    assert {cause.effect, *cause.alternatives} == {
+        "drag.linear@rocker",
+        "drag.linear@crank",
+        "drag.linear@knee",
+        "actuator.damping@m_crank",
+    }
+    assert cause.coefficients["coefficient"].value == pytest.approx(0.18, rel=0.02)
+
+
+@pytest.mark.slow
 def test_equivalent_effects_are_reported_after_a_rejected_cause_is_removed():
     """The servo's damping is equivalent to the joint's, since its force limit is not reached."""
     verdict = answer("friction_and_drag_one_joint")

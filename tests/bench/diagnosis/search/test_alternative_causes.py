@@ -13,13 +13,13 @@ INDISTINGUISHABLE = model("b", likelihood=100.0 - 0.5 * INDISTINGUISHABLE_LOG_LI
 DISTINGUISHABLE = model("c", likelihood=100.0 - 2.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
 
 
-def placed(place="", contains=()):
-    return SimpleNamespace(place=place, contains=contains)
+def placed(place="", contains=(), coordinate=None):
+    return SimpleNamespace(place=place, contains=contains, coordinate=coordinate)
 
 
 def evidence(
     monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, sizes=(1, 1, 1),
-    **excess,
+    loops=(), **excess,
 ):  # fmt: skip
     scores = SimpleNamespace(
         effects=("a", "b", "c"), null_quantiles=np.full(3, luck), null_scores=np.zeros((3, 40))
@@ -34,9 +34,12 @@ def evidence(
     search.scores_by_effects = {frozenset(): scores}
     search.best_p_values = {frozenset(): best}
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
-    effects = {name: placed() for name in "abc"}
+    effects = {name: placed(coordinate=joint) for joint, name in enumerate("abc")}
     search.evaluator = SimpleNamespace(
-        available_effects=effects, coefficient_slices=slots, has_linearisation=False
+        available_effects=effects,
+        coefficient_slices=slots,
+        has_linearisation=False,
+        simulator=SimpleNamespace(system=SimpleNamespace(loops=loops)),
     )
     monkeypatch.setattr(
         AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
@@ -50,6 +53,21 @@ def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
     assert (found.effect, found.alternatives, found.preferred) == ("a", ("b",), "a")
     assert found.gain == pytest.approx(100.0)
     assert found.p_value <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("loops", "excess", "alternatives"),
+    [
+        ((), 0.0, ("b",)),
+        (({0, 2},), 0.0, ("c", "b")),
+        (({0, 2},), 0.5, ("b",)),
+        (({1, 2},), 0.0, ("b",)),
+    ],
+)
+def test_in_a_loop_the_excess_decides(monkeypatch, loops, excess, alternatives):
+    """Effect c is far behind by its likelihood, but leaves as little of the data unexplained."""
+    found = evidence(monkeypatch, loops=loops, a=0.0, b=0.0, c=excess)
+    assert found.alternatives == alternatives
 
 
 @pytest.mark.parametrize(
