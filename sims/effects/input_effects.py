@@ -23,6 +23,7 @@ import numpy as np
 
 from sims.core.effect import Coefficient, Input, Signal
 from sims.core.simulator import Array
+from sims.effects.compiled_recursions import CLAMP, LINEAR, RATE_LIMIT, run_recursion
 
 _MIN_TIME_CONSTANT = 1e-12
 """Smallest time constant in seconds; such a lag has no effect on any step."""
@@ -46,28 +47,6 @@ def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     # expm1, since 1 - exp has cancellation if steps are much shorter than the lag
     mean = np.where(ratio > 0, -np.expm1(-ratio) / divisor, 1.0)
     return np.exp(-ratio), mean
-
-
-def apply_recursion(decay: Array, additions: Array, start: Array) -> Array:
-    """Return the recursion y[k] = decay[k] y[k - 1] + gained[k].
-
-    Args:
-        decay: (L, S) factors.
-        additions: (L, S) additions.
-        start: (L, 1) value y[-1].
-
-    Returns:
-        Values y (L, S).
-    """
-    # rows are contiguous in memory, and the additions become the result
-    result = np.ascontiguousarray(additions.T)
-    decay_rows = np.ascontiguousarray(decay.T)
-    state: Array = start[:, 0]
-    # step by step: a closed form would divide by products of decays, which underflow
-    for row, factor in zip(result, decay_rows, strict=True):
-        row += factor * state
-        state = row
-    return result.T
 
 
 def shift_by_one_step(values: Array, start: Array) -> Array:
@@ -328,7 +307,8 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     # the command is constant over a step, so (2) of sims.effects.input_effects gives the value at
     # its end
     decay, mean = compute_lag_response(signal.steps, lag)
-    step_end_values = apply_recursion(decay, (1.0 - decay) * signal.values, signal.start)
+    additions = (1.0 - decay) * signal.values
+    step_end_values = run_recursion(LINEAR, decay, additions, signal.start)
     # engines hold the input over a step: the mean transfers the same momentum as the lagged input
     return signal.values + (shift_by_one_step(step_end_values, signal.start) - signal.values) * mean
 
@@ -343,17 +323,8 @@ def _apply_play(signal: Signal, half: Array) -> Array:
         signal: the input before the effect.
         half: (L, 1) clearance to either side, in the unit of the input.
     """
-    # The loop runs over contiguous rows, one per step.
-    low = np.ascontiguousarray((signal.values - half).T)
-    high = np.ascontiguousarray((signal.values + half).T)
     # the position within the backlash is not recorded: the centre favours neither direction
-    state: Array = signal.start[:, 0]
-    for lower_limit, upper_limit in zip(low, high, strict=True):
-        # (7), in place and without the overhead of np.clip: the array of lower bounds becomes the
-        # result
-        np.maximum(state, lower_limit, out=lower_limit)
-        state = np.minimum(lower_limit, upper_limit, out=lower_limit)
-    return low.T
+    return run_recursion(CLAMP, signal.values - half, signal.values + half, signal.start)  # (7)
 
 
 def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
@@ -365,21 +336,11 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
         signal: the input before the effect.
         limit: (L, 1) largest rate, infinite for no limit.
     """
-    commands = np.ascontiguousarray(signal.values.T)
     # An infinite limit times a step of zero length counts as zero.
-    reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0).T
-    min_changes = -reach
-    changes = np.empty_like(commands)
-    step_end_values = np.empty_like(commands)
-    state: Array = signal.start[:, 0]
-    for row, max_change, min_change, change, step_end_value in zip(
-        commands, reach, min_changes, changes, step_end_values, strict=True
-    ):
-        np.subtract(row, state, out=change)
-        np.minimum(change, max_change, out=change)
-        np.maximum(change, min_change, out=change)
-        state = np.add(state, change, out=step_end_value)
+    reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0)
+    step_end_values = run_recursion(RATE_LIMIT, signal.values, reach, signal.start)
+    changes = step_end_values - shift_by_one_step(step_end_values, signal.start)
     # It rises until it reaches the command, and is constant for the rest of the step.
     rising = np.abs(changes) / np.where(reach > 0, reach, np.inf)
     mean_values = step_end_values - 0.5 * rising * changes
-    return np.where(np.isfinite(reach), mean_values, commands).T
+    return np.where(np.isfinite(reach), mean_values, signal.values)

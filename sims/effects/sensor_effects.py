@@ -25,7 +25,8 @@ import numpy as np
 
 from sims.core.effect import Coefficient, Sensor, Signal
 from sims.core.simulator import Array
-from sims.effects.input_effects import apply_recursion, compute_lag_response, shift_by_one_step
+from sims.effects.compiled_recursions import LINEAR, run_recursion
+from sims.effects.input_effects import compute_lag_response, shift_by_one_step
 
 _SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
@@ -246,4 +247,4 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     old = shift_by_one_step(signal.values, signal.start)
     # (4) of sims.effects.input_effects without its first term, which is the recursion
     increments = signal.values - decay * old - mean * (signal.values - old)
-    return apply_recursion(decay, increments, signal.start)
+    return run_recursion(LINEAR, decay, increments, signal.start)

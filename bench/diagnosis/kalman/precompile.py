@@ -1,4 +1,4 @@
-"""Compile the recursions of the filter and the smoother during installation.
+"""Compile the recursions of the filter, the smoother and the effects during installation.
 
 The first command then need not compile them. `make install` runs `python -m
 bench.diagnosis.kalman.precompile`.
@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from sims.effects.compiled_recursions import LINEAR, run_recursion
 
 
 def precompile() -> None:
-    """Filter and smooth a tiny example, so that the code is compiled and stored in the cache."""
+    """Run the recursions of tiny examples, so that their code is compiled and stored."""
     states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
     runs = LinearRuns(
         states=states,
@@ -27,6 +28,7 @@ def precompile() -> None:
     )
     force, white = np.ones(1), np.ones(1)
     smooth_runs(runs, filter_runs(runs, force, white), force)
+    run_recursion(LINEAR, np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array, Scenario
-from sims.effects.input_effects import apply_recursion
+from sims.effects.compiled_recursions import LINEAR, run_recursion
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import Actuator, RobotModel, cache_per_robot, filters
 
@@ -84,7 +84,7 @@ class ActivationFilter(NamedTuple):
         retained_share = float(np.exp(-ratio)) if self.exact or is_rk4 else 1.0 - ratio
         inputs = self.clip_controls(controls)
         decay = np.full_like(inputs, retained_share)
-        end_activations = apply_recursion(decay, (1.0 - decay) * inputs, initial[:, None])
+        end_activations = run_recursion(LINEAR, decay, (1.0 - decay) * inputs, initial[:, None])
         # MuJoCo applies a limit within the recursion. But commands that reach the limit stay beyond
         # it for longer than a step, so the difference only lasts as long as the filter's time
         # constant.

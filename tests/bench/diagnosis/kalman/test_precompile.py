@@ -12,13 +12,14 @@ from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, 
 
 
 @pytest.mark.slow
-def test_one_file_holds_the_code_and_is_loaded_without_the_compiler(tmp_path):
+def test_two_files_hold_the_code_and_are_loaded_without_the_compiler(tmp_path):
     pytest.importorskip("numba")
     environment = {**os.environ, "SIMGAP_COMPILED": str(tmp_path)}
     command = [sys.executable, "-m", "bench.diagnosis.kalman.precompile"]
     first = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
     assert "compiling the Kalman filter, once after an install" in first.stderr
-    assert [path.suffix for path in sorted(tmp_path.iterdir())] == [".bin", ".lock"]
+    assert "compiling the effects with memory, once after an install" in first.stderr
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".bin", ".bin", ".lock", ".lock"]
     without = (
         "import sys; sys.modules['numba'] = None; "
         "from bench.diagnosis.kalman.precompile import precompile; precompile()"
