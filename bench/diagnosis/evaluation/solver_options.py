@@ -36,11 +36,16 @@ MIN_DISTINCT_CHANGE = 0.05
 """Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
 MIN_SQUARES_DECREASE = 20.0
 """Minimum decrease of the sum of squares by an alternative, in units of the noise."""
-MAX_EXCESS_RATIO = 0.6
+MAX_EXCESS_RATIO = 0.4
 """Maximum excess of the sum of squares over that of noise by another option, relative to without.
 
 The initial states belong to the options in use. An option is accepted only if it leaves at most a
 quarter of this excess with initial states of its own.
+"""
+MIN_CLEAR_MEAN_SQUARE = 9.0
+"""Minimum mean square of the residual, in units of the noise, at which that ratio counts.
+
+Nearer to the noise, the residual also depends on the initial states.
 """
 
 
@@ -87,7 +92,9 @@ def rank_option_alternatives(
     samples = max(int(is_recorded.sum()), 1)
     present = float(np.square(simulate(kind.numerics) - observed).sum())
     limit = present - MIN_SQUARES_DECREASE
-    limit_of_other_option = min(limit, samples + MAX_EXCESS_RATIO * max(present - samples, 0.0))
+    limit_of_other_option = limit
+    if present > MIN_CLEAR_MEAN_SQUARE * samples:
+        limit_of_other_option = samples + MAX_EXCESS_RATIO * (present - samples)
     changed_options = list_changed_options(kind.robot, kind.numerics).keys()
     ranked: list[tuple[OptionAlternative, Array]] = []
     for numerics in _iterate_alternatives(kind):

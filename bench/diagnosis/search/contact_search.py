@@ -87,6 +87,9 @@ MAX_SCAN_RATIO = 0.9
 """Maximum sum of squares in a scan of an effect that is fitted, relative to that without it."""
 MAX_COST_RATIO = 0.5
 """Maximum sum of squares of an effect that is pursued, relative to that of the base model."""
+MAX_REPEATED_COST_RATIO = 0.25
+"""Maximum sum of squares at which initial states are estimated again, relative to the base model.
+"""
 MAX_EXPLAINED_EXCESS = 0.05
 """Maximum excess of a model whose initial states are not estimated again."""
 MIN_COST_RATIO = 0.7
@@ -179,7 +182,7 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     bounds = np.array(compute_coefficient_bounds(evaluator, name))
     is_at_contact = evaluator.available_effects[name].at == "contact"
     rng = search.make_rng("initial states", start.effects)
-    limit = MAX_COST_RATIO * search.base_model.fit.cost
+    limit = MAX_REPEATED_COST_RATIO * search.base_model.fit.cost
     theta = start.theta
     for _ in range(MAX_STATE_ESTIMATES):
         smoothed = smooth_first_states(evaluator, theta, sigma)
