@@ -100,7 +100,7 @@ class OwnSimulatorEngine:
         count = batch.steps.shape[1] // batch.steps_per_sample + 1
         width = len(batch.system.channels)
         shape = len(batch.theta), count, width
-        result = np.full(shape, np.nan)
+        levels = np.full(shape, np.nan)
         for element in range(len(batch.theta)):
             try:
                 rows = self._run(batch, element)
@@ -109,8 +109,8 @@ class OwnSimulatorEngine:
             except Exception as error:
                 raise _make_simulator_error(self.world, error) from error
             if rows is not None and np.isfinite(rows).all():
-                result[element] = rows
-        return Trajectories(result, result, result)
+                levels[element] = rows
+        return Trajectories(levels, levels, levels)
 
     def _run(self, batch: IntegrationBatch, element: int) -> Array | None:
         """Simulate one batch element, given by its number, with the user's simulator.
@@ -139,10 +139,10 @@ class OwnSimulatorEngine:
         # Steps of zero length, in which this batch element waits for others, are skipped.
         moving = steps > 0
         steps[moving] = equalise_steps(steps[moving], batch.steps_per_sample)
-        row = self._row(system)
+        sample = self._row(system)
         t = 0.0
         has_moved = False
-        rows = [row]
+        samples = [sample]
         for i, seconds in enumerate(steps.tolist()):
             if seconds > 0:
                 inputs = {name: float(u[element, i]) for name, u in batch.inputs.items()}
@@ -154,10 +154,10 @@ class OwnSimulatorEngine:
                 has_moved = True
             # Without a step, the previous row is still valid.
             if (i + 1) % batch.steps_per_sample == 0:
-                row = self._row(system) if has_moved else row
+                sample = self._row(system) if has_moved else sample
                 has_moved = False
-                rows.append(row)
-        return np.array(rows)
+                samples.append(sample)
+        return np.array(samples)
 
     def _row(self, system: System) -> list[float]:
         """Return the present reading of each channel of the user's simulator."""
@@ -418,9 +418,9 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
         InputError: The effect is not possible on this system or at this place; the message states
             the reason or the possible places.
     """
-    base, separator, place = name.partition("@")
+    effect_name, separator, place = name.partition("@")
     try:
-        effect = registry.get(base)
+        effect = registry.get(effect_name)
     except PartUnavailableError:
         return None
     if not issubclass(effect, Level) or not system.levels:
@@ -434,8 +434,10 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
         return effects_by_name[name]
     places: Sequence[str] = [effect_class.place for effect_class in effects_by_name.values()]
     if not separator:
-        alternatives = ", ".join(f"{base}@{place_name}" for place_name in places)
-        raise InputError(f"effect {base} of simulator {system.name} needs a place: {alternatives}")
+        alternatives = ", ".join(f"{effect_name}@{place_name}" for place_name in places)
+        raise InputError(
+            f"effect {effect_name} of simulator {system.name} needs a place: {alternatives}"
+        )
     raise make_unknown_name_error(
-        f"place of effect {base} in simulator {system.name}", place, list(system.levels)
+        f"place of effect {effect_name} in simulator {system.name}", place, list(system.levels)
     )

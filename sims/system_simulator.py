@@ -360,15 +360,15 @@ class SystemSimulator(Simulator):
         times = _compute_state_times(plan, batch.steps_per_sample)
         steps = np.diff(times, axis=1, prepend=0.0)
         # Convert the rows: with a sensor filter, more states than the samples are stored.
-        rows = plan.rows * (plan.steps_per_sample // batch.steps_per_sample)
-        observations = np.empty((*rows.shape, len(names)))
+        sample_steps = plan.rows * (plan.steps_per_sample // batch.steps_per_sample)
+        observations = np.empty((*sample_steps.shape, len(names)))
         for place, name in enumerate(names):
             values = channels[name]
             # A gain or bias affects one channel only.
             reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
                 values = apply_sensor_effects(reading, values, steps, times, clock)
-            observations[:, :, place] = _select_rows(values, rows)
+            observations[:, :, place] = _select_rows(values, sample_steps)
         observations += 0.0  # turn negative zeros into positive ones
         return observations
 
@@ -443,15 +443,15 @@ def make_effect_parameters(
         system: System on which it acts.
         observed: Names of the observed channels, which may determine units; all if empty.
     """
-    result = []
+    parameters = []
     coefficients = effect.on(system)
     for c in coefficients:
         name = effect.name if len(coefficients) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
         nominal = min(max(0.0, low), high)  # zero, or the nearest value of the range
-        result.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
-    return tuple(result)
+        parameters.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
+    return tuple(parameters)
 
 
 def _expand_rows(rows: Sequence[Mapping[str, float]], index: Indices) -> dict[str, Array]:

@@ -475,16 +475,16 @@ class ComparisonResult:
         if self._in_files:
             return table
         last = table[table["simulations"] == table["simulations"].max()]
-        first = last[last["metric"] == last["metric"].iloc[0]]
+        first_metric_rows = last[last["metric"] == last["metric"].iloc[0]]
         import pandas as pd
 
         ranking = self.tables["ranking"]
         last = ranking[ranking["simulations"] == ranking["simulations"].max()]
         verdicts = last.set_index(["range", "tuner"])["verdict"]
-        places = pd.MultiIndex.from_frame(first[["range", "tuner"]])
-        first = first.assign(verdict=verdicts.reindex(places).to_numpy())
+        places = pd.MultiIndex.from_frame(first_metric_rows[["range", "tuner"]])
+        first_metric_rows = first_metric_rows.assign(verdict=verdicts.reindex(places).to_numpy())
         columns = ["tuner", "range", "verdict", "metric", "median", "mean", "low", "high"]
-        best: pd.DataFrame = first[[*columns, "runs", "failures"]]
+        best: pd.DataFrame = first_metric_rows[[*columns, "runs", "failures"]]
         return best.reset_index(drop=True)
 
     def __repr__(self) -> str:

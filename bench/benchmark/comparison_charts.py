@@ -339,12 +339,12 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
         Axis("seconds per simulation", "log"),
         Axis("seconds per target", "log"),
     )
-    parts, panels = [], []
+    tables, panels = [], []
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
         table = build_time_per_target_table(costs)
         rank = table.groupby(["range", "tuner"]).cumcount()
-        parts.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
+        tables.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
             winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
             mark_styles = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
@@ -359,7 +359,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
             panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, spans=spans), view, level))
     return ComparisonChart(
-        _select_panels_with_data(panels), {"seconds": pd.concat(parts)}, notes=_make_notes(view)
+        _select_panels_with_data(panels), {"seconds": pd.concat(tables)}, notes=_make_notes(view)
     )
 
 
@@ -371,7 +371,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
         ReferenceLine(AT_ONCE, "at once: the untrained tuner never reaches the error"),
         ReferenceLine(NEVER, "never: not within 10 000 targets"),
     )
-    parts, panels = [], []
+    tables, panels = [], []
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
         searching, trained = split_by_training(view, level)
@@ -381,7 +381,9 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                 build_break_even_table(view.experiment.name, kind, level, costs[kind])
             )
             break_even_rows = break_even_rows[break_even_rows["learned"].isin(trained)]
-            parts.append(break_even_rows.assign(row=break_even_rows["search"].map(searching.index)))
+            tables.append(
+                break_even_rows.assign(row=break_even_rows["search"].map(searching.index))
+            )
             series = tuple(
                 Series(
                     name,
@@ -399,7 +401,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
             panel = _make_panel(view, kind, "even", "row", series, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, rules=rules), view, level))
     return ComparisonChart(
-        _select_panels_with_data(panels), {"even": pd.concat(parts)}, notes=_make_notes(view)
+        _select_panels_with_data(panels), {"even": pd.concat(tables)}, notes=_make_notes(view)
     )
 
 

@@ -131,19 +131,21 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
     rankings, title = headline.rank_at_checkpoints(view.statistics, kind), _format_title(view, kind)
     if not rankings:
         return f"{title}: the errors on the targets do not decide."
-    last = rankings[-1]
+    last_ranking = rankings[-1]
     # The wording of the first one explains the format of the others.
     first = [
         re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
-        for text in last.worse[:1]
+        for text in last_ranking.worse[:1]
     ]
     parts = {
-        "worse than the best": [*first, *last.worse[1:]],
-        "not decided": last.undecided,
-        "all runs failed": last.failed,
+        "worse than the best": [*first, *last_ranking.worse[1:]],
+        "not decided": last_ranking.undecided,
+        "all runs failed": last_ranking.failed,
     }
     verdicts = "; ".join(f"{verdict}: {joined(names)}" for verdict, names in parts.items() if names)
-    return f"{title}, after {last.simulations} simulations: {verdicts or 'no tuner is worse'}."
+    return (
+        f"{title}, after {last_ranking.simulations} simulations: {verdicts or 'no tuner is worse'}."
+    )
 
 
 def write_running_times(results: ComparisonReportData) -> list[str]:

@@ -198,7 +198,7 @@ def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
     best = (
         f"{', '.join(ranking.best)} ({ranking.error})" if ranking.best else "none: every run failed"
     )
-    parts = {
+    names_by_verdict = {
         "best": best,
         "worse": ", ".join(ranking.worse),
         "not decided": ", ".join(ranking.undecided),
@@ -208,7 +208,7 @@ def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
         textwrap.fill(
             f"{verdict}: {names}", _LINE_WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
         )
-        for verdict, names in parts.items()
+        for verdict, names in names_by_verdict.items()
         if names
     ]
     lines[0] = f"  after {ranking.simulations}".ljust(12) + lines[0].lstrip()
@@ -282,19 +282,23 @@ def _format_direction_errors(
         statistics: statistics of the comparison.
     """
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
-    part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
-    if kind == "real" or part.empty:
+    shown_lines = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
+    if kind == "real" or shown_lines.empty:
         return ""
-    budget = part["simulations"].max()
+    budget = shown_lines["simulations"].max()
     shown_counts = [k for k in (*_PRINTED_CHECKPOINTS, budget) if k <= budget]
-    part = part[part["simulations"].isin(shown_counts)]
-    part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
-    order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
-    medians = part.pivot(index="tuner", columns="column", values="median")
+    shown_lines = shown_lines[shown_lines["simulations"].isin(shown_counts)]
+    shown_lines = shown_lines.assign(
+        column=shown_lines["metric"].map(titles) + " " + shown_lines["simulations"].astype(str)
+    )
+    order = [
+        f"{t} {k}" for t in titles.values() for k in sorted(shown_lines["simulations"].unique())
+    ]
+    medians = shown_lines.pivot(index="tuner", columns="column", values="median")
     medians = medians[[c for c in order if c in medians]].dropna(axis=1, how="all")
     medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
     title = "median error along stiff and sloppy directions [training widths]"
-    if "heldout_error" in set(part["metric"]):
+    if "heldout_error" in set(shown_lines["metric"]):
         title += f" and RMSE of {channel} in unseen scenarios"
     table = _format_frame(medians.rename(index=statistics.format_label))
     return f"{title}, after N simulations\n{table}"

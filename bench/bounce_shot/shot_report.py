@@ -131,24 +131,29 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
     if not stored:
         print_line("no shot was made")
         return 0
-    rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
+    shot_rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
     for name in _NULLABLE_NUMBERS:
         # A column that is empty has no numeric type.
-        rows[name] = pd.to_numeric(rows[name])
-    lines = add_trust_column(build_result_table(rows), study.experiment)
-    rows = add_trust_column(rows, study.experiment)
-    statuses = add_trust_column(_build_status_rows(rows, study.skipped_tuners), study.experiment)
-    for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
+        shot_rows[name] = pd.to_numeric(shot_rows[name])
+    result_lines = add_trust_column(build_result_table(shot_rows), study.experiment)
+    shot_rows = add_trust_column(shot_rows, study.experiment)
+    statuses = add_trust_column(
+        _build_status_rows(shot_rows, study.skipped_tuners), study.experiment
+    )
+    for name, frame in (("table", result_lines), ("shots", shot_rows), ("status", statuses)):
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
-    pictures = draw_figures(study.experiment, study.config, study.shots, stored, rows, lines)
+    pictures = draw_figures(
+        study.experiment, study.config, study.shots, stored, shot_rows, result_lines
+    )
     figures = [
         figure_output.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
         for name, picture in pictures.items()
     ]
     write_atomically(
-        folder / REPORT_FILE, render_page(study.experiment, str(folder), lines, rows, pictures)
+        folder / REPORT_FILE,
+        render_page(study.experiment, str(folder), result_lines, shot_rows, pictures),
     )
-    for example in select_example_shots(study.shots, stored, rows)[:1]:
+    for example in select_example_shots(study.shots, stored, shot_rows)[:1]:
         figures.append(
             write_animation(folder, study.config, example, stored, study.experiment.trusted)
         )
@@ -156,8 +161,8 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
     journal = folder / SEGMENTS_FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
-    print_line("\n" + format_result_table(lines))
-    failed = rows[rows["status"].isin(NO_SHOT_STATUSES)]
+    print_line("\n" + format_result_table(result_lines))
+    failed = shot_rows[shot_rows["status"].isin(NO_SHOT_STATUSES)]
     _print_failures(failed, study.skipped_tuners, print_line)
     print_line(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:

@@ -264,7 +264,7 @@ def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
     try:
         explanation = explain(recording)
     except Exception:  # the failure of one method is a row of the table
-        last = traceback.format_exc()
+        traceback_text = traceback.format_exc()
         return TunedModel(
             EXPLAIN_METHOD,
             _get_nominal_restitution(),
@@ -272,7 +272,7 @@ def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
             0,
             perf_counter() - started,
             "crashed",
-            last,
+            traceback_text,
         ), {}
     all_effects = {
         name: tuple(number.value for number in numbers.values())

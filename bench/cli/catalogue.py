@@ -320,24 +320,24 @@ def _format_experiment(experiment: JsonDocument) -> list[str]:
 
 def _format_system(system: JsonDocument) -> list[str]:
     """Format a system: its description, then a line for each of its declared quantities."""
-    result = [f"{system['name']}: {_format_sentence(system)}"]
+    lines = [f"{system['name']}: {_format_sentence(system)}"]
     if system["skipped"]:
-        return result
+        return lines
     for p in system["parameters"]:
         low, high = p["bounds"]
         training = p["training"]
         training_text = f", training {training[0]:g} to {training[1]:g}" if training else ""
-        result.append(
+        lines.append(
             f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{training_text}; "
             f"nominal {p['nominal']:g}  {p['says']}"
         )
-    result += [
+    lines += [
         f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
         for c in system["constants"]
     ]
-    result += _format_channels("input", system["inputs"])
-    result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in system["states"]]
-    return result + _format_channels("channel", system["channels"])
+    lines += _format_channels("input", system["inputs"])
+    lines += [f"  state     {s['name']:18} {s['value']:>12g}" for s in system["states"]]
+    return lines + _format_channels("channel", system["channels"])
 
 
 def _format_channels(role: str, channels: list[JsonDocument]) -> list[str]:

@@ -214,14 +214,14 @@ def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSn
     constants = {c.name: np.full((2, 1), c.value) for c in host.constants}
     # Inputs, and all other numbers here, are arbitrary and not zero, SI units.
     inputs = {c.name: np.full((2, 1), 0.3) for c in host.inputs}
-    numbers = np.linspace(0.2, 1.1, 2 * shape[1])
+    values = np.linspace(0.2, 1.1, 2 * shape[1])
     return StateSnapshot(
         system,
         theta,
         constants,
         np.full((2, 1), 0.4),
-        numbers.reshape(shape),
-        -numbers.reshape(shape),
+        values.reshape(shape),
+        -values.reshape(shape),
         inputs,
     )
 

@@ -193,18 +193,20 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     """
     classes = list_effect_places(effect)
     simulator = make_arm_simulator(effect)(observe=OBSERVED_CHANNELS, effects=classes)
-    rows = [np.zeros((1, len(simulator.parameters)))]
+    parameter_rows = [np.zeros((1, len(simulator.parameters)))]
     start = 0
     for effect_class in classes:
         end = start + len(effect_class.coefficients)
         for share in _TESTED_RANGE_SHARES:
-            row = rows[0].copy()
+            row = parameter_rows[0].copy()
             row[:, start:end] = _make_coefficients(effect_class, share)
-            rows.append(row)
+            parameter_rows.append(row)
         start = end
-    lanes = np.concatenate(rows)
+    lanes = np.concatenate(parameter_rows)
     batch_result = simulator.simulate(lanes, make_scenario())
-    single_results = np.concatenate([simulator.simulate(row, make_scenario()) for row in rows])
+    single_results = np.concatenate(
+        [simulator.simulate(row, make_scenario()) for row in parameter_rows]
+    )
     reversed_result = simulator.simulate(lanes[::-1], make_scenario())[::-1]
     is_same = is_bitwise_equal(batch_result, single_results) and is_bitwise_equal(
         batch_result, np.ascontiguousarray(reversed_result)

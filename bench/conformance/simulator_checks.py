@@ -198,14 +198,14 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
     """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step."""
     names = (*simulator.coordinates, *simulator.rates)
     _start_run(simulator)
-    rows = []
+    observed_samples = []
     for i in range(_FORCED_STEPS + 1):
         observation = simulator.observe()
-        rows.append([observed(simulator, observation, name) for name in names])
+        observed_samples.append([observed(simulator, observation, name) for name in names])
         if force is not None:
             simulator.apply_force(force if i == 0 else np.zeros_like(force))
         _make_step(simulator)
-    return np.array(rows)
+    return np.array(observed_samples)
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:

@@ -274,15 +274,15 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
     """
     # Two runs of one instance, because state left by a run must not matter either.
     tuner = make_trained_tuner(kind, 2)
-    first = run_tuner(tuner, 2, 25, seed=3)
+    first_run = run_tuner(tuner, 2, 25, seed=3)
     saved_state = np.random.get_state()  # noqa: NPY002
     np.random.seed(12345)  # noqa: NPY002 - a tuner that draws from it would now differ
     try:
-        second = run_tuner(tuner, 2, 25, seed=3)
+        second_run = run_tuner(tuner, 2, 25, seed=3)
     finally:
         np.random.set_state(saved_state)  # noqa: NPY002
-    is_same = is_bitwise_equal(first.proposals, second.proposals) and is_bitwise_equal(
-        first.recommendations, second.recommendations
+    is_same = is_bitwise_equal(first_run.proposals, second_run.proposals) and is_bitwise_equal(
+        first_run.recommendations, second_run.recommendations
     )
     check(is_same, "the same run for the same seed", "another", f"{kind.__name__}.tune: use rng")
 

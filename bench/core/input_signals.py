@@ -166,17 +166,20 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         raise make_unknown_name_error("signal", name, list(_FORMS))
     compute_form, form = _FORMS[name]
     try:
-        numbers = [float(number) for number in arguments]
+        signal_arguments = [float(number) for number in arguments]
     except ValueError:
-        numbers = []
-    complete = len(numbers) == len(form.split(":")) and np.isfinite(numbers).all()
+        signal_arguments = []
+    complete = len(signal_arguments) == len(form.split(":")) and np.isfinite(signal_arguments).all()
     # All numbers except the first are frequencies or durations.
-    if not complete or min([1.0, *numbers[1:]]) <= 0:
+    if not complete or min([1.0, *signal_arguments[1:]]) <= 0:
         expected = f"{name}:{form} with numbers, all but the first > 0"
         raise InputError(f"signal '{truncate_text(text)}': expected {expected}")
     span = float(times[-1])
-    changes = [span / n if compute_form is _compute_random_steps else span * n for n in numbers[1:]]
-    if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MAX_CHANGES:
+    changes = [
+        span / n if compute_form is _compute_random_steps else span * n
+        for n in signal_arguments[1:]
+    ]
+    if max(map(abs, signal_arguments)) > MAX_NUMBER or max([0.0, *changes]) > _MAX_CHANGES:
         expected = f"numbers within {MAX_NUMBER:g}, and at most {_MAX_CHANGES:g} periods or levels"
         raise InputError(f"signal '{truncate_text(text)}': expected {expected} in its {span:g} s")
-    return compute_form(times, rng, *numbers)
+    return compute_form(times, rng, *signal_arguments)

@@ -1401,17 +1401,17 @@ class _ExplainRun:
             search: the search, with the fitted models.
             finding: result of the diagnosis, with the model of the found effects.
         """
-        evaluator, numbers = (
+        evaluator, estimates = (
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),
         )
         base_values = {
-            p.name: numbers[i]
+            p.name: estimates[i]
             for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
         }
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
         freed_constants = {
-            p.name: numbers[evaluator.system_parameter_count + i].value
+            p.name: estimates[evaluator.system_parameter_count + i].value
             for i, p in enumerate(evaluator.freed_constants)
         }
         added_effects = {}
@@ -1422,7 +1422,7 @@ class _ExplainRun:
             coefficients = evaluator.available_effects[effect].on(evaluator.simulator.system)
             indices = range(*coefficient_slice.indices(len(evaluator.parameters)))
             added_effects[effect] = {
-                coefficient.name: numbers[index]
+                coefficient.name: estimates[index]
                 for coefficient, index in zip(coefficients, indices, strict=True)
             }
         return ExtendedSimulator(

@@ -89,14 +89,16 @@ def select_written_causes(
     """
     selected_causes: dict[str, Mapping[str, FittedValue]] = {}
     causes, left_out = _leave_out_base_effects(causes, base_joints)
-    for effect, numbers in causes.items():
+    for effect, coefficients in causes.items():
         if effect.startswith("numerics."):
-            selected_causes[effect] = numbers
+            selected_causes[effect] = coefficients
             continue
         # Each place of a family is handled alone; coefficients of one place belong together.
-        unidentified = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
+        unidentified = {
+            key.partition("@")[2]: n for key, n in coefficients.items() if not n.is_result
+        }
         selected_numbers = {
-            key: n for key, n in numbers.items() if key.partition("@")[2] not in unidentified
+            key: n for key, n in coefficients.items() if key.partition("@")[2] not in unidentified
         }
         if selected_numbers:
             selected_causes[effect] = selected_numbers

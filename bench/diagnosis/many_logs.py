@@ -94,14 +94,14 @@ def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
     for effects, coefficients in sorted(
         by_cause.items(), key=lambda entry: (-len(entry[1]), entry[0])
     ):
-        numbers = []
+        spans = []
         for name, first in coefficients[0].items():
             values = [c[name]["value"] for c in coefficients if name in c]
             label = "" if name == "coefficient" else f"{name} "
             low, high = min(values), max(values)
             span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            numbers.append(f"{label}{append_unit(span, first['unit'])}")
-        lines.append(f"{effects}: in {len(coefficients)} of {len(rows)} logs, {', '.join(numbers)}")
+            spans.append(f"{label}{append_unit(span, first['unit'])}")
+        lines.append(f"{effects}: in {len(coefficients)} of {len(rows)} logs, {', '.join(spans)}")
     return lines
 
 
@@ -179,14 +179,14 @@ def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     lines = []
     for log_number, row in enumerate(rows, start=1):
         for cause in row.causes:
-            for name, number in cause["coefficients"].items():
-                label = format_label(place_of(name), number["unit"], LONGEST_NAME)
+            for name, estimate in cause["coefficients"].items():
+                label = format_label(place_of(name), estimate["unit"], LONGEST_NAME)
                 label_with_cause = f"{format_cause(cause)}: {label}"
                 cells = {
                     "cause": format_cause(cause),
                     "name": name,
                     "what": label_with_cause,
-                    **number,
+                    **estimate,
                 }
                 lines.append({"number": log_number, "log": row.log, **cells})
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
@@ -265,10 +265,10 @@ def explain_batch(
     Returns:
         Results in the order of the logs.
     """
-    rows = _load_previous_results(out, logs)
-    for row in rows.values():
+    results_by_log = _load_previous_results(out, logs)
+    for row in results_by_log.values():
         report_result(row)
-    remaining = [log for log in logs if log.name not in rows]
+    remaining = [log for log in logs if log.name not in results_by_log]
     # A worker process does not know the figure settings of this process.
     calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in remaining]
     for index, result in pool.iterate_results(calls, np.inf):
@@ -278,13 +278,15 @@ def explain_batch(
             if isinstance(result, LogResult)
             else LogResult(log.name, log.digest, error=_format_error(result))
         )
-        rows[log.name] = row
-        ordered_results = [rows[batch_log.name] for batch_log in logs if batch_log.name in rows]
+        results_by_log[log.name] = row
+        ordered_results = [
+            results_by_log[batch_log.name] for batch_log in logs if batch_log.name in results_by_log
+        ]
         _write_results(out, ordered_results)
         report_result(row)
         if stop():
             break
-    ordered_results = [rows[log.name] for log in logs if log.name in rows]
+    ordered_results = [results_by_log[log.name] for log in logs if log.name in results_by_log]
     _write_results(out, ordered_results)
     return ordered_results
 

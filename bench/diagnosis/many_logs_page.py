@@ -97,8 +97,8 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         batch: Input of the page in addition to the rows.
     """
     logs = many_logs.build_log_table(rows, batch.folders)
-    numbers = many_logs.build_number_table(rows)
-    charts = make_summary_charts(logs, numbers)
+    number_table = many_logs.build_number_table(rows)
+    charts = make_summary_charts(logs, number_table)
     page = HtmlPage()
     tables = {"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables}
     for name, table in tables.items():
@@ -110,7 +110,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         batch=batch,
         table_file=LOGS_TABLE_FILE,
         verdicts=_format_verdicts(rows),
-        causes=_list_causes(rows, numbers, batch),
+        causes=_list_causes(rows, number_table, batch),
         closed=_ClosedShare(
             closed_shares.median(), closed_shares.min(), closed_shares.max(), len(closed_shares)
         )

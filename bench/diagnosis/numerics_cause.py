@@ -58,15 +58,15 @@ class Reusable(Generic[Item]):
 
     def __iter__(self) -> Iterator[Item]:
         """Yield all items from the first; none is computed a second time."""
-        number = 0
+        item_index = 0
         while True:
-            if number == len(self._computed_items):
+            if item_index == len(self._computed_items):
                 try:
                     self._computed_items.append(next(self._remaining_items))
                 except StopIteration:
                     return
-            yield self._computed_items[number]
-            number += 1
+            yield self._computed_items[item_index]
+            item_index += 1
 
 
 def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:

@@ -264,10 +264,10 @@ def _make_gain_terms(
         yield _build_joint_term("stiffness", joint, function, key, ends, notes)
     for joint in dict.fromkeys([*passive, *_group_by_joint(robot, damping)]):
         names = [actuator.name for actuator in robot.actuators if actuator.joint == joint]
-        parts = [_convert_gain_to_joint(robot, damping, name, 2) for name in names]
+        joint_gains = [_convert_gain_to_joint(robot, damping, name, 2) for name in names]
         damping_in_file = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
         damping_ranges = passive.get(joint)
-        parts.append(
+        joint_gains.append(
             _get_ends(damping_ranges[0]) if damping_ranges else (damping_in_file, damping_in_file)
         )
         joint_ranges = [
@@ -276,7 +276,7 @@ def _make_gain_terms(
         ]
         notes = [*(sentences[number_range] for number_range in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
-        yield _build_joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
+        yield _build_joint_term("damping", joint, function, key, _sum_ranges(joint_gains), notes)
 
 
 def _group_by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -514,16 +514,16 @@ def build_range_files(
         return {}
     import tomli_w
 
-    rows = [number_range.document() for number_range in ranges.ranges]
+    range_documents = [number_range.document() for number_range in ranges.ranges]
     assert extended.robot is not None
     document: dict[str, Any] = {
         "format": FORMAT_VERSION,
         "model": extended.robot.to_document(folder)["model"],
         "recording": extended.title,
         "left_out": list(ranges.left_out),
-        "ranges": rows,
+        "ranges": range_documents,
     }
-    table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
+    table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in range_documents]
     tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": format_csv(COLUMNS, table)}
     if not any(number_range.fields for number_range in ranges.ranges):
         return tables

@@ -256,7 +256,7 @@ class VerdictBuilder:
         """
         if finding.verdict == "unknown" and self._is_refuted(search, finding):
             return replace(finding, verdict="adequate")
-        numbers = self.collect_parameter_estimates(search, finding.model)
+        estimates = self.collect_parameter_estimates(search, finding.model)
         unambiguous_causes = [cause for cause in finding.causes if not cause.alternatives]
         coefficient_indices = [
             i
@@ -264,8 +264,8 @@ class VerdictBuilder:
             for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
         ]
         are_results = all(
-            numbers[i].is_result for i in coefficient_indices
-        ) and not self._is_at_bound(numbers)
+            estimates[i].is_result for i in coefficient_indices
+        ) and not self._is_at_bound(estimates)
         return replace(
             finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, are_results)
         )

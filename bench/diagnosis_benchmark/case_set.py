@@ -227,7 +227,7 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     Raises:
         InputError: an effect cannot be hidden in a system.
     """
-    numbers: dict[tuple[Any, ...], int] = {}
+    last_index_by_group: dict[tuple[Any, ...], int] = {}
     questions = []
     for request in settings.case_requests:
         for kind, system, effect, size, circumstances in _iterate_combinations(request):
@@ -235,8 +235,8 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
             # Sizes are not part of the key, so cases of two sizes have different seeds.
             for _ in range(request.count):
                 group = kind, system, effect
-                numbers[group] = numbers.get(group, -1) + 1
-                questions.append(CaseSpec(*key, index=numbers[group]))
+                last_index_by_group[group] = last_index_by_group.get(group, -1) + 1
+                questions.append(CaseSpec(*key, index=last_index_by_group[group]))
     if not settings.sample or settings.sample >= len(questions):
         return questions
     rng = make_rng("diagnosis", "sample", settings.seed)

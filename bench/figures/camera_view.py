@@ -214,7 +214,7 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
 
     floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     corners = np.array(list(product((-1, 1), repeat=3)))
-    parts: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
+    points_by_mobility: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
     shaped = set()
     for g in range(model.ngeom):
         if int(model.geom_type[g]) in floor_types:
@@ -223,11 +223,11 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
         shaped.add(body)
         box = model.geom_aabb[g, :3] + corners * model.geom_aabb[g, 3:]
         turn = data.geom_xmat[g].reshape(3, 3)
-        parts[_is_static_body(model, body)].append(data.geom_xpos[g] + box @ turn.T)
+        points_by_mobility[_is_static_body(model, body)].append(data.geom_xpos[g] + box @ turn.T)
     for body in range(1, model.nbody):
         if body not in shaped:
-            parts[_is_static_body(model, body)].append(data.xipos[body][None])
-    moving_points, static_points = (np.concatenate(part) for part in parts)
+            points_by_mobility[_is_static_body(model, body)].append(data.xipos[body][None])
+    moving_points, static_points = (np.concatenate(part) for part in points_by_mobility)
     return moving_points, static_points
 
 

@@ -52,8 +52,8 @@ def encode_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) ->
     """
     pixels = np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4)
     # Each row begins with the number of its filter: 0 for none.
-    rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
-    colours = rows[:, 1:].reshape(height, width, 3)
+    pixel_rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
+    colours = pixel_rows[:, 1:].reshape(height, width, 3)
     # NumPy copies three long strided rows in a third of the time of many short ones.
     for channel in range(3):
         colours[:, :, channel] = pixels[:, :, channel]
@@ -63,7 +63,7 @@ def encode_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) ->
             _SIGNATURE,
             _make_chunk(b"IHDR", struct.pack(">II5B", width, height, *_EIGHT_BITS_RGB)),
             _make_chunk(b"pHYs", struct.pack(">IIB", density, density, 1)),
-            _make_chunk(b"IDAT", zlib.compress(rows.data, _COMPRESSION_LEVEL)),
+            _make_chunk(b"IDAT", zlib.compress(pixel_rows.data, _COMPRESSION_LEVEL)),
             _make_chunk(b"IEND", b""),
         )
     )

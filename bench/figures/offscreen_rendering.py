@@ -131,9 +131,9 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
         view: camera.
     """
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
-    rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
+    pixel_height, pixel_width = (max(2, round(scale * size)) for size in (view.height, view.width))
     global_options = model.vis.global_
-    global_options.offwidth, global_options.offheight = columns, rows
+    global_options.offwidth, global_options.offheight = pixel_width, pixel_height
     # In an orthographic projection, fovy is the visible height.
     global_options.orthographic, global_options.fovy = 1, view.height
     size = float(np.hypot(view.width, view.height))
@@ -149,7 +149,7 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
     mujoco.mjv_defaultFreeCamera(model, camera)
     camera.azimuth, camera.elevation = view.azimuth, view.elevation
     camera.lookat[:], camera.distance = view.centre, CAMERA_DISTANCE_FACTOR * size
-    with mujoco.Renderer(model, rows, columns) as renderer:
+    with mujoco.Renderer(model, pixel_height, pixel_width) as renderer:
         renderer.update_scene(data, camera)
         colours = renderer.render().astype(np.float64)
         renderer.enable_segmentation_rendering()

@@ -184,17 +184,17 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
         q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
     """
     visible_frames = np.flatnonzero(np.isfinite(q))
-    last = len(visible_frames) - 1
+    last_index = len(visible_frames) - 1
     # q counts downwards: the ball is lowest where q is largest.
     lowest = [
         i
-        for i in range(1, last)
+        for i in range(1, last_index)
         if q[visible_frames[i - 1]] < q[visible_frames[i]] >= q[visible_frames[i + 1]]
     ]
     arcs = []
-    for a, b in pairwise([0, *lowest, last]):
+    for a, b in pairwise([0, *lowest, last_index]):
         # The frame of the bounce itself belongs to no flight.
-        flight_frames = visible_frames[a + (a > 0) : b - (b < last) + 1]
+        flight_frames = visible_frames[a + (a > 0) : b - (b < last_index) + 1]
         if len(flight_frames) < _MIN_FLIGHT_FRAMES or np.ptp(q[flight_frames]) < _MIN_FLIGHT_EXTENT:
             continue
         t = times[flight_frames]

@@ -113,24 +113,27 @@ def track_film(
         raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
 
     first, last = ball_heights.find_release_frame(track), int(track.visible_frames[-1])
-    part = slice(first, last + 1)
+    kept_frames = slice(first, last + 1)
     notes = [*film.notes, *track.notes, *heights.notes]
     if first > track.visible_frames[0]:
         until = f"the ball is held until {track.times[first]:.2f} s"
         notes.append(f"{until}; earlier frames are left out")
-    noise = _estimate_height_noise(track, heights, part)
+    noise = _estimate_height_noise(track, heights, kept_frames)
 
     # The recording and its figures are published together, so that none exists without the others.
-    figures = draw(track, heights, part, f"{video.name}: {heights.method}")
+    figures = draw(track, heights, kept_frames, f"{video.name}: {heights.method}")
     figure_contents = {
         path: content
         for path, content in zip(pictures, figures, strict=True)
         if content is not None
     }
-    recording = _build_recording(track, heights, noise, part, video)
+    recording = _build_recording(track, heights, noise, kept_frames, video)
     write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, extra_files=figure_contents)
 
-    count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
+    count, frames = (
+        int(np.isfinite(heights.z[kept_frames]).sum()),
+        kept_frames.stop - kept_frames.start,
+    )
     lines = (
         f"{out}: {count} of {frames} frames with the ball, z in metres {heights.method}",
         f"noise of one sample: {track.noise:.2g} px, {1e3 * noise:.2g} mm",
@@ -231,11 +234,11 @@ def write_film(
         raise InputError(f"size {pixels}: expected an even number of at least 16 pixels")
     if (system := read_system_name(recording)) != BallSystem.name:
         raise InputError(f"{recording}: expected a recording of system ball, found {system}")
-    data = read_recording(recording, BallSystem, whole=True)
-    runs = {r.name: r for r in data.runs}
+    loaded_recording = read_recording(recording, BallSystem, whole=True)
+    runs = {r.name: r for r in loaded_recording.runs}
     if run is not None and run not in runs:
         raise make_unknown_name_error(f"run in {recording}", run, list(runs))
-    chosen_run = runs[run] if run is not None else data.runs[0]
+    chosen_run = runs[run] if run is not None else loaded_recording.runs[0]
     if "z" not in chosen_run.channels:
         raise InputError(
             f"{recording}: expected the channel z, found {', '.join(chosen_run.channels)}"
@@ -247,7 +250,7 @@ def write_film(
         missing = "has missing samples; a film shows the ball in every frame"
         raise InputError(f"{recording}: run {chosen_run.name}: {missing}")
     check_film_size(recording, len(positions), pixels, force)
-    radius = {**data.constants, **chosen_run.constants}.get(
+    radius = {**loaded_recording.constants, **chosen_run.constants}.get(
         "radius", _get_default_constant("radius")
     )
     rng = make_rng("film", seed)

@@ -48,11 +48,11 @@ def load_joined(
     ]
     if prepared is not None:
         loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
-    first, kind = loaded[0]
+    first_recording, kind = loaded[0]
     if len(loaded) == 1:
-        return split_held_out(first, folds=True), kind
+        return split_held_out(first_recording, folds=True), kind
     for recording, other_kind in loaded[1:]:
-        _refuse_other(first, kind, recording, other_kind)
+        _refuse_other(first_recording, kind, recording, other_kind)
     recordings = [recording for recording, _ in loaded]
     runs_of_all = [run for recording in recordings for run in recording.runs]
     folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
@@ -61,7 +61,7 @@ def load_joined(
     names = make_log_names([recording.path for recording in recordings])
     constants = {
         key: value
-        for key, value in first.constants.items()
+        for key, value in first_recording.constants.items()
         if all(recording.constants.get(key) == value for recording in recordings)
     }
     default_values = {c.name: c.value for c in kind.constants}
@@ -79,8 +79,8 @@ def load_joined(
     ]
     other_count = len(loaded) - 1
     joined_recording = replace(
-        first,
-        title=f"{first.title or first.path.stem} and {other_count} more "
+        first_recording,
+        title=f"{first_recording.title or first_recording.path.stem} and {other_count} more "
         f"log{'s' if other_count > 1 else ''}",
         constants=constants,
         noise=_compute_rms_noise(recordings),

@@ -52,16 +52,20 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     initial = {**experiment.initial, **calibration.initial}
     inputs = {**experiment.inputs, **calibration.inputs}
     runs = []
-    for number in range(calibration.runs):
+    for run_index in range(calibration.runs):
         scene = targets.draw_scenario(
-            experiment, streams.get_held_out_stream(number), initial, inputs
+            experiment, streams.get_held_out_stream(run_index), initial, inputs
         )
         noise_free = problem.world.simulate(theta, scene)[0]
-        rng = TargetStreams(salt, experiment.name, "calibration", 1 + number).get_stream("noise")
+        rng = TargetStreams(salt, experiment.name, "calibration", 1 + run_index).get_stream("noise")
         measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)
         runs.append(
             _run(
-                problem, number, scene, measured, number >= calibration.runs - calibration.held_out
+                problem,
+                run_index,
+                scene,
+                measured,
+                run_index >= calibration.runs - calibration.held_out,
             )
         )
     kind = type(problem.simulator)

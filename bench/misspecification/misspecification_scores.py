@@ -212,7 +212,7 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
         One row per simulator, tuner, metric and parameter; columns as in `SCORE_COLUMNS`.
     """
     lines = []
-    for (model, tuner), part in scores.errors.groupby(["model", "tuner"], sort=False):
+    for (model, tuner), group_errors in scores.errors.groupby(["model", "tuner"], sort=False):
         metrics = [
             (metric, p.name, TRAINING_WIDTHS_UNIT, column)
             for p in scores.parameters
@@ -222,9 +222,13 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
             (PARAMETERS, "", TRAINING_WIDTHS_UNIT, PARAMETERS),
             (PREDICTION, "", scores.unit, PREDICTION),
         ]
-        counts = len(part), int(part["runs"].sum()), int(part["failures"].sum())
+        counts = (
+            len(group_errors),
+            int(group_errors["runs"].sum()),
+            int(group_errors["failures"].sum()),
+        )
         for metric, parameter, unit, column in metrics:
-            values = part[column].to_numpy(dtype=np.float64)
+            values = group_errors[column].to_numpy(dtype=np.float64)
             values = values[np.isfinite(values)][:, None]
             names = (scores.experiment.name, str(model), str(tuner))
             low, high = compute_bootstrap_interval(

@@ -84,16 +84,16 @@ def draw_chart(
     """
     # Without a panel, such as costs of tuners that never reach the error, the figure is empty.
     columns = columns or max(len(panels), 1)
-    rows = max(-(-len(panels) // columns), 1)
+    row_count = max(-(-len(panels) // columns), 1)
     width, height = size or PANEL_SIZE
     shared = all(panel.up == panels[0].up for panel in panels)
     figure, grid = make_panel_grid(
-        rows,
+        row_count,
         columns,
         # Width and height in inches: margins and panels.
-        (1.2 + width * columns, 0.6 + height * rows),
-        sharey=shared or ("row" if rows > 1 else False),
-        sharex=rows > 1,
+        (1.2 + width * columns, 0.6 + height * row_count),
+        sharey=shared or ("row" if row_count > 1 else False),
+        sharex=row_count > 1,
     )
     axes = list(grid.flat)
     for axis in axes[len(panels) :]:
@@ -102,7 +102,7 @@ def draw_chart(
         _draw_panel(axis, panel, tables[panel.table], horizontal)
     for i, axis in enumerate(axes[: len(panels)]):
         # Panels that share an axis have its label once.
-        if i + columns < len(panels) and rows > 1:
+        if i + columns < len(panels) and row_count > 1:
             axis.set_xlabel("")
         if i % columns and axis.get_ylabel() == axes[i - 1].get_ylabel():
             axis.set_ylabel("")

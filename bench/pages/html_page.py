@@ -161,7 +161,7 @@ class HtmlPage:
         own = "\n".join(_read(f"script/{name}.js") for name in _SCRIPTS)
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
         styles = (_CHART_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _read("page.css")
-        data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
+        embedded_data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
         return load_template(Path("page.html")).render(
             title=content.title,
             style=Markup("\n".join([*styles, self._own_style])),
@@ -169,7 +169,7 @@ class HtmlPage:
             sections=self._sections,
             body=Markup(content),
             footer=content.footer,
-            data=Markup(to_embeddable_json(data)),
+            data=Markup(to_embeddable_json(embedded_data)),
             script=Markup(script),
         )
 

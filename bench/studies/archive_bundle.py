@@ -193,16 +193,16 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     entries = packed.infolist()
     if len(entries) > _MAX_FILES:
         raise _make_refusal(archive, f"{len(entries)} files, at most {_MAX_FILES} expected")
-    for entry in entries:
-        if problem := _find_entry_error(entry):
-            raise _make_refusal(archive, f"{entry.filename[:80]!r} {problem}")
+    for member in entries:
+        if problem := _find_entry_error(member):
+            raise _make_refusal(archive, f"{member.filename[:80]!r} {problem}")
     # Two names that a file system treats as equal would overwrite each other's file.
     repeated_names = [
         name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1
     ]
     if repeated_names:
         raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
-    total, size = sum(entry.file_size for entry in entries), archive.stat().st_size
+    total, size = sum(member.file_size for member in entries), archive.stat().st_size
     if total > MAX_UNPACKED_BYTES or (
         total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
     ):

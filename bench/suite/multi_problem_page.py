@@ -119,7 +119,7 @@ def make_runtime_panel(
         styles: Tuners with their styles.
         shares: By tuner, the share reached after 0, 1, 2, ... hundredths of each problem's budget.
     """
-    parts = [
+    tables = [
         pd.DataFrame({"tuner": name, "hundredths": np.arange(len(share)), "share": share})
         for name, share in shares.items()
     ]
@@ -131,7 +131,7 @@ def make_runtime_panel(
     # A margin of 0.02, so that lines at 0 and 1 are visible.
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panel = Panel("All problems", "runtime", "hundredths", series, x_axis, y_axis)
-    return panel, pd.concat(parts, ignore_index=True)
+    return panel, pd.concat(tables, ignore_index=True)
 
 
 def _make_error_panels(page_data: MultiProblemPageData) -> tuple[list[Panel], pd.DataFrame]:

@@ -123,17 +123,17 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
     """
-    parts = []
+    comparisons = []
     for folder in folders:
         stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
         if stored.runs.empty:
             raise InputError(f"{folder}: contains no runs")
-        parts.append(LoadedComparison(ComparisonStatistics(stored), stored.experiment))
-    first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in parts)
+        comparisons.append(LoadedComparison(ComparisonStatistics(stored), stored.experiment))
+    first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in comparisons)
     tuners = [t for t in first_labels if all(t in labels for labels in other_labels)]
     if not tuners:
         raise InputError(f"{', '.join(map(str, folders))}: have no tuner in common")
-    return ComparisonCollection(parts, tuners)
+    return ComparisonCollection(comparisons, tuners)
 
 
 @dataclass(frozen=True)

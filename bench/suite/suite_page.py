@@ -137,19 +137,21 @@ def build_guide(tables: SuiteTables) -> pd.DataFrame:
 def describe_tests(tables: SuiteTables) -> Iterator[str]:
     """Describe at each checkpoint from which methods the best one differs significantly."""
     for k in tables.checkpoints:
-        rows = tables.pairs
-        rows = rows[(rows["training"] == FREE) & (rows["simulations"] == k)]
-        if rows.empty:
+        pair_rows = tables.pairs
+        pair_rows = pair_rows[(pair_rows["training"] == FREE) & (pair_rows["simulations"] == k)]
+        if pair_rows.empty:
             continue
-        best = str(rows["best"].iloc[0])
-        significant = rows[(rows["p_holm"] < _SIGNIFICANCE) & (rows["best_better"] > 0.5)]
+        best = str(pair_rows["best"].iloc[0])
+        significant = pair_rows[
+            (pair_rows["p_holm"] < _SIGNIFICANCE) & (pair_rows["best_better"] > 0.5)
+        ]
         undecided_tuners = [
-            str(name) for name in rows["tuner"] if name not in set(significant["tuner"])
+            str(name) for name in pair_rows["tuner"] if name not in set(significant["tuner"])
         ]
         if significant.empty:
-            yield f"After {k}: none of the {len(rows)} differences from {best} is significant."
+            yield f"After {k}: none of the {len(pair_rows)} differences from {best} is significant."
             continue
-        count = f"{len(significant)} of {len(rows)}"
+        count = f"{len(significant)} of {len(pair_rows)}"
         text = f"After {k}: {best} is significantly better than {count} others"
         yield text + (f"; not decided: {', '.join(undecided_tuners)}." if undecided_tuners else ".")
 

@@ -86,17 +86,17 @@ class SuiteTables:
 
         A cell is a problem with a range of targets, see `suite_runs`.
         """
-        runs, result = self.suite.runs, {}
+        runs, curves_by_cell = self.suite.runs, {}
         for cell in self.suite.cells["cell"]:
             rows = (runs["cell"] == cell).to_numpy()
             keys = runs[rows].reset_index(drop=True)
-            result[str(cell)] = RunCurves(
+            curves_by_cell[str(cell)] = RunCurves(
                 keys,
                 self.suite.errors[rows],
                 keys["simulations"].to_numpy(dtype=np.int64),
                 keys["failed"].to_numpy(dtype=bool),
             )
-        return result
+        return curves_by_cell
 
     @cached_property
     def floors(self) -> dict[str, float]:
@@ -171,7 +171,7 @@ class SuiteTables:
         The key is (training, k): whether the simulations of a training are counted (COUNTED) or not
         (FREE), and the number of simulations.
         """
-        result = {}
+        errors_by_budget = {}
         for training in (FREE, COUNTED):
             for k in self.checkpoints:
                 rows = {
@@ -179,8 +179,8 @@ class SuiteTables:
                     for cell in self.curves
                 }
                 frame = pd.DataFrame(rows).T
-                result[training, k] = frame[[t for t in self.suite.tuners if t in frame]]
-        return result
+                errors_by_budget[training, k] = frame[[t for t in self.suite.tuners if t in frame]]
+        return errors_by_budget
 
     def get_medians(self, k: int, training: str = FREE) -> pd.DataFrame:
         """Return median log errors after k simulations: a row per cell, a column per tuner.

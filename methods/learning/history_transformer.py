@@ -410,7 +410,7 @@ def _minimise_loss(
     """
     import torch
 
-    parts = material.to_tensors()
+    tensors = material.to_tensors()
     watched_parts = monitor and monitor.material.to_tensors()
     # torch's weight_decay is the gradient of half of it times the squared norm.
     decay = 2.0 * design.weight_decay
@@ -419,12 +419,12 @@ def _minimise_loss(
         rate_factor = 0.5 + 0.5 * float(np.cos(np.pi * epoch / design.epochs))
         for group in optimiser.param_groups:
             group["lr"] = design.rate * rate_factor
-        order = rng.permutation(len(parts[0]))
+        order = rng.permutation(len(tensors[0]))
         losses = []
         for first in range(0, len(order), design.batch):
             batch = order[first : first + design.batch]
             optimiser.zero_grad()
-            error = _compute_loss(w, design, [part[batch] for part in parts], draw_histories(rng))
+            error = _compute_loss(w, design, [part[batch] for part in tensors], draw_histories(rng))
             error.backward()
             optimiser.step()
             losses.append(error.detach())

@@ -245,11 +245,11 @@ class ScenarioFeatures:
         Raises:
             ValueError: the scenario has another number of values than those of the training.
         """
-        numbers = self.compute(observations, lengths, scene)
-        if len(scene.initial) != self.initial or numbers.shape[1] != len(self.centre):
+        features = self.compute(observations, lengths, scene)
+        if len(scene.initial) != self.initial or features.shape[1] != len(self.centre):
             raise ValueError(
                 f"the network expects {len(self.centre)} numbers of a scenario, "
-                f"this one has {numbers.shape[1]}; "
+                f"this one has {features.shape[1]}; "
                 "train on scenarios with the same inputs and channels"
             )
         is_varying = self.spread > 0
@@ -257,7 +257,7 @@ class ScenarioFeatures:
         scale = np.where(is_varying, 1.0 / np.where(is_varying, self.spread, 1.0), 0.0)
         # arcsinh is the identity near zero and logarithmic far out, so outliers do not saturate
         # units.
-        return np.asarray(np.arcsinh((numbers - self.centre) * scale), dtype=np.float64)
+        return np.asarray(np.arcsinh((features - self.centre) * scale), dtype=np.float64)
 
 
 def _differs_between_scenarios(numbers: Array) -> bool:

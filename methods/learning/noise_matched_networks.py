@@ -178,26 +178,26 @@ class NoiseMatchedNetworks(Generic[Learner]):
         Raises:
             ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
-        parts: dict[str, dict[str, Array]] = {"clean": {}, "noisy": {}, "limit": {}}
+        arrays_by_part: dict[str, dict[str, Array]] = {"clean": {}, "noisy": {}, "limit": {}}
         for name, array in state.items():
             part, _, array_name = name.partition(".")
-            if part not in parts:
-                raise ValueError(f"expected arrays of {sorted(parts)}, found {name}")
-            parts[part][array_name] = array
-        limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
+            if part not in arrays_by_part:
+                raise ValueError(f"expected arrays of {sorted(arrays_by_part)}, found {name}")
+            arrays_by_part[part][array_name] = array
+        limit = np.array(arrays_by_part["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(
                 "array limit: expected finite numbers of shape (channels,), "
                 f"found shape {limit.shape}"
             )
         has_two_networks = bool(reading.noise) and reading.clean
-        if has_two_networks != bool(parts["noisy"]):
+        if has_two_networks != bool(arrays_by_part["noisy"]):
             raise ValueError(
                 f"expected {'two networks' if has_two_networks else 'one network'}, found another "
                 "number of them"
             )
-        clean_network = restore(parts["clean"])
-        noisy_network = restore(parts["noisy"]) if has_two_networks else clean_network
+        clean_network = restore(arrays_by_part["clean"])
+        noisy_network = restore(arrays_by_part["noisy"]) if has_two_networks else clean_network
         return cls(clean_network, noisy_network, limit)
 
 

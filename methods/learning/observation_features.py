@@ -47,12 +47,12 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
     Raises:
         ValueError: the lengths do not add up to T.
     """
-    n, samples, channels = observations.shape
+    run_count, samples, channels = observations.shape
     if sum(lengths) != samples:
         raise ValueError(
             f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}"
         )
-    resampled = np.empty((n, len(lengths), channels, points))
+    resampled = np.empty((run_count, len(lengths), channels, points))
     first = 0
     for run, length in enumerate(lengths):
         series = observations[:, first : first + length].transpose(0, 2, 1)
@@ -63,10 +63,10 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
             continue
         samples = np.arange(length)
         positions = np.linspace(0, length - 1, points)
-        for i in range(n):
+        for i in range(run_count):
             for c in range(channels):
                 resampled[i, run, c] = _interpolate_channel(positions, samples, series[i, c])
-    return resampled.reshape(n, len(lengths) * channels, points)
+    return resampled.reshape(run_count, len(lengths) * channels, points)
 
 
 def _interpolate_channel(positions: Array, samples: NDArray[np.intp], values: Array) -> Array:
@@ -138,15 +138,15 @@ class ObservationFeatures:
         """
         if not self.chosen.size:
             return np.empty((len(observations), 0))
-        rows = _compute_feature_rows(observations, lengths, self.points, self.plain)
+        raw_features = _compute_feature_rows(observations, lengths, self.points, self.plain)
         chosen_numbers = self.chosen.astype(np.intp)
-        if chosen_numbers.max() >= rows.shape[1]:
+        if chosen_numbers.max() >= raw_features.shape[1]:
             raise ValueError(
                 f"the network reads entry {chosen_numbers.max()} of an observation, "
-                f"this one has {rows.shape[1]}; "
+                f"this one has {raw_features.shape[1]}; "
                 "train on observations of the same runs and channels"
             )
-        centred = rows[:, chosen_numbers] - self.centre
+        centred = raw_features[:, chosen_numbers] - self.centre
         scaled = centred * self.gain
         # A series without any sample is replaced by its mean.
         return np.nan_to_num(scaled)
@@ -203,10 +203,12 @@ def make_weighted_features(
     Returns:
         The inputs; their mean square over the training data is 1.
     """
-    rows = _compute_feature_rows(data.flattened_observations, data.lengths, points, is_raw=False)
-    grouped = rows.reshape(*data.parameters.shape[:2], -1)
+    raw_features = _compute_feature_rows(
+        data.flattened_observations, data.lengths, points, is_raw=False
+    )
+    grouped = raw_features.reshape(*data.parameters.shape[:2], -1)
     spread, explained, unexplained = _compute_sensitivities(data.parameters, grouped)
-    deviation = rows.std(axis=0)
+    deviation = raw_features.std(axis=0)
     scenario_spread = grouped.mean(axis=1).std(axis=0)
     floor = _ROUNDING_SHARE * max(float(deviation.max()), _MIN_DIVISOR)
     reliability = explained / (explained + strictness * unexplained + floor)  # (2)
@@ -232,7 +234,7 @@ def make_weighted_features(
         points,
         False,
         chosen_numbers.astype(np.float64),
-        rows[:, chosen_numbers].mean(axis=0),
+        raw_features[:, chosen_numbers].mean(axis=0),
         gain / rms_input if rms_input > 0 else gain,
     )
 

@@ -261,8 +261,10 @@ class PairTuner(Tuner):
         Raises:
             ValueError: the budget is smaller than two scenarios.
         """
-        scenarios, each = self.choose_training_layout(simulator.dim)
-        data = generate_training_data(simulator, rng, budget, scenarios, each)
+        scenarios, points_per_scenario = self.choose_training_layout(simulator.dim)
+        training_data = generate_training_data(
+            simulator, rng, budget, scenarios, points_per_scenario
+        )
         callback = self.watch
         held_out_data = None
         if callback is not None:
@@ -270,9 +272,9 @@ class PairTuner(Tuner):
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             held_out_data = generate_training_data(
-                ground, stream, ground.budget, scenarios, max(each, 2)
+                ground, stream, ground.budget, scenarios, max(points_per_scenario, 2)
             )
-        self.train_on(data, rng, held_out_data)
+        self.train_on(training_data, rng, held_out_data)
 
     def train_on(
         self, data: TrainingData, rng: np.random.Generator, held_out: TrainingData | None = None

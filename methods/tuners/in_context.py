@@ -202,7 +202,7 @@ class InContextTransformer(Tuner):
             ValueError: the budget is smaller than two scenarios.
         """
         per_scenario = max(self.each, 2 * (simulator.dim + 1))
-        data = generate_training_data(
+        training_data = generate_training_data(
             simulator, rng, budget, self.scenarios, per_scenario, draw_binary_search
         )
         callback = self.watch
@@ -240,7 +240,9 @@ class InContextTransformer(Tuner):
             )
             return TrainedHistoryNetwork(design, features, weights, box)
 
-        self._prepared = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learned)
+        self._prepared = NoiseMatchedNetworks.train(
+            training_data, rng, self.make_feature_config(), learned
+        )
 
     def _draw_histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
         """Draw the histories of a batch from `each` simulations per scenario.

@@ -85,18 +85,20 @@ class NeuralPosteriorEstimation(Tuner):
         """
         dim = simulator.dim
         each = max(self.each, 2 * (dim + 1))
-        data = generate_training_data(simulator, rng, budget, self.scenarios, each)
-        noisy_data = data.with_noise(self.noise * data.flattened_observations.std(axis=(0, 1)), rng)
-        self._read = features = InputFeatures.fit(data, self._make_feature_config())
+        training_data = generate_training_data(simulator, rng, budget, self.scenarios, each)
+        noisy_data = training_data.with_noise(
+            self.noise * training_data.flattened_observations.std(axis=(0, 1)), rng
+        )
+        self._read = features = InputFeatures.fit(training_data, self._make_feature_config())
         # Each simulation is used twice, with and without noise, because targets may be of either
         # kind.
-        rows = np.concatenate(
+        feature_rows = np.concatenate(
             [
                 features.compute_rows(part).reshape(-1, features.feature_count)
-                for part in (data, noisy_data)
+                for part in (training_data, noisy_data)
             ]
         )
-        theta = np.tile(data.parameters.reshape(-1, dim), (2, 1))
+        theta = np.tile(training_data.parameters.reshape(-1, dim), (2, 1))
         with isolated_library_call(rng):
             from sbi import inference
 
@@ -105,11 +107,11 @@ class NeuralPosteriorEstimation(Tuner):
                 tracker=NullTracker(),
                 show_progress_bars=False,
             )
-            trainer.append_simulations(_to_tensor(theta), _to_tensor(rows))
+            trainer.append_simulations(_to_tensor(theta), _to_tensor(feature_rows))
             # The minimum (1), until the loss of sbi's held-out rows no longer decreases.
             self._flow = trainer.train(
                 max_num_epochs=self.epochs,
-                training_batch_size=min(100, len(rows) // 4),
+                training_batch_size=min(100, len(feature_rows) // 4),
             )
 
     def _make_feature_config(self) -> FeatureConfig:

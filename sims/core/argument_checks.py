@@ -300,20 +300,23 @@ def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
         value: value of the argument; a text is split at commas.
         hint: annotation, a list type.
     """
-    (entry,) = get_args(hint)
+    (element_hint,) = get_args(hint)
     if isinstance(value, str):
         # Paths may contain commas, names may not.
-        is_path = get_origin(entry) in (Union, UnionType) and Path in get_args(entry)
+        is_path = get_origin(element_hint) in (Union, UnionType) and Path in get_args(element_hint)
         parts = [value] if is_path else [part.strip() for part in value.split(",")]
     elif isinstance(value, Iterable) and not isinstance(value, Mapping | bytes):
         parts = list(value)
-    elif _is_convertible(value, entry):
+    elif _is_convertible(value, element_hint):
         parts = [value]
     else:
         return _NO_MATCH
-    if isinstance(value, str) and not all(_is_convertible(part, entry) for part in parts):
+    if isinstance(value, str) and not all(_is_convertible(part, element_hint) for part in parts):
         return _NO_MATCH
-    return [_convert_value(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
+    return [
+        _convert_value(f"{place}[{number}]", part, element_hint)
+        for number, part in enumerate(parts)
+    ]
 
 
 def _is_convertible(value: Any, hint: Any) -> bool:

@@ -113,15 +113,15 @@ class Registry(Generic[T]):
         """Load the entry point `name`; it is imported once."""
         if name not in self._imported:
             try:
-                part = self._entry_points[name].load()
+                loaded_part = self._entry_points[name].load()
             except Exception as error:  # a plugin may fail in any way during import
                 self._refuse_stale_installation(name, error)
                 reason = f"{type(error).__name__}: {error}"
                 raise PartUnavailableError(self.kind, name, reason) from error
-            if not self.accepts(part):
-                reason = f"expected a {self.base.__name__}, found {part!r:.80}"
+            if not self.accepts(loaded_part):
+                reason = f"expected a {self.base.__name__}, found {loaded_part!r:.80}"
                 raise PartUnavailableError(self.kind, name, reason)
-            self._imported[name] = part
+            self._imported[name] = loaded_part
         return self._imported[name]
 
     def _refuse_stale_installation(self, name: str, error: Exception) -> None:

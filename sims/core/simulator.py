@@ -501,7 +501,7 @@ def apply_parameter_changes(
                     f"attribute of parameter {name}", attribute, allowed_attributes
                 )
     pairs = ("bounds", "training")  # given as lists in an experiment's file
-    result = []
+    changed_parameters = []
     for p in parameters:
         change = changes.get(p.name, {})
         new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
@@ -513,5 +513,5 @@ def apply_parameter_changes(
             raise InputError(
                 f"parameter {p.name}: bounds must be {condition}, found {changed.bounds}"
             )
-        result.append(changed)
-    return tuple(result)
+        changed_parameters.append(changed)
+    return tuple(changed_parameters)

@@ -168,7 +168,7 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     step_ends = signal.times
     step_starts = step_ends - signal.steps
     cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
-    result = signal.values.copy()
+    averages = signal.values.copy()
     for batch_index in np.flatnonzero(delay[:, 0] > 0):
         # integral of the signal, beginning long before the run
         knots = np.concatenate(
@@ -186,8 +186,8 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
         )
         steps = signal.steps[batch_index]
         has_length = steps > 0
-        result[batch_index, has_length] = (last - first)[has_length] / steps[has_length]
-    return result
+        averages[batch_index, has_length] = (last - first)[has_length] / steps[has_length]
+    return averages
 
 
 def _integrate_signal(knots: Array, integral: Array, t: Array) -> Array:

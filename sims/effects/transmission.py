@@ -117,15 +117,17 @@ class DrivenLoad(HiddenStateEffect):
 
     def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash."""
-        numbers = {
+        coefficients = {
             coefficient.name: values for coefficient, values in zip(self.between, c, strict=True)
         }
         none = np.zeros_like(c[0])
-        compliance = numbers.get("compliance", none)
+        compliance = coefficients.get("compliance", none)
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
         stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _MIN_COMPLIANCE), 0.0)
-        gap = np.maximum(numbers.get("gap", none), 0.0)
-        return SeriesElement(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
+        gap = np.maximum(coefficients.get("gap", none), 0.0)
+        return SeriesElement(
+            stiffness, coefficients.get("damping", none), gap, coefficients["rotor"]
+        )
 
     def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:
         """Return the initial state: moving with the drive, at the static deflection.

@@ -229,7 +229,7 @@ def _average_command(
         Means (L, S).
     """
     count = len(commands) if has_uniform_steps else len(starts)
-    result = np.empty((count, starts.shape[1]))
+    averages = np.empty((count, starts.shape[1]))
     # Process all batch elements with the same scenario in one call.
     order = np.argsort(runs.scenario_index, kind="stable")
     borders = np.flatnonzero(np.diff(runs.scenario_index[order])) + 1
@@ -246,10 +246,10 @@ def _average_command(
         )
         instants = np.concatenate([get_history_times(scenario, name), get_command_times(scenario)])
         signal = _get_command_values(scenario, name, commands[run][name])
-        result[target_rows] = average_signal(
+        averages[target_rows] = average_signal(
             instants, signal, starts[source_rows], ends[source_rows]
         )
-    return runs.expand_rows(result) if has_uniform_steps else result
+    return runs.expand_rows(averages) if has_uniform_steps else averages
 
 
 def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:

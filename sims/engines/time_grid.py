@@ -234,10 +234,14 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
     interval_starts = np.concatenate([start, instants[:, :-1]], axis=1)
     intervals = instants - interval_starts
     # Tolerate rounding where an interval is an integer number of steps.
-    parts = np.ceil(intervals / largest_step - _ROUNDING_SHARE).astype(np.intp)
-    parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
-    steps_per_block = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
-    blocks = -(-parts // steps_per_block)
+    steps_per_interval = np.ceil(intervals / largest_step - _ROUNDING_SHARE).astype(np.intp)
+    steps_per_interval = np.where(intervals > 0, np.maximum(steps_per_interval, 1), 0)
+    steps_per_block = (
+        int(np.bincount(steps_per_interval[steps_per_interval > 0]).argmax())
+        if steps_per_interval.any()
+        else 1
+    )
+    blocks = -(-steps_per_interval // steps_per_block)
     block_ends = np.cumsum(blocks, axis=1)
     max_blocks = max(int(block_ends[:, -1].max()), 1)
     # Arrays with one entry per block: its interval, its number in the batch element, and the
@@ -250,7 +254,7 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
     blocks_before = (block_ends - blocks).ravel()[interval]
     block_in_interval = (block - blocks_before)[:, None]
     step_numbers = block_in_interval * steps_per_block + np.arange(steps_per_block)
-    step_counts = parts.ravel()[interval, None]
+    step_counts = steps_per_interval.ravel()[interval, None]
     step_lengths = intervals.ravel()[interval, None] / step_counts
     steps = np.zeros((elements, max_blocks, steps_per_block))
     step_ends = np.repeat(instants[:, -1], max_blocks * steps_per_block).reshape(

@@ -96,16 +96,16 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
 
 def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of actuators that the model file lacks, without the keys of this module."""
-    result = {}
+    kept_tables = {}
     for name, table in actuators.items():
         if not isinstance(table, dict):
-            result[name] = table
+            kept_tables[name] = table
             continue
         other_entries = {key: value for key, value in table.items() if key not in SWITCH_KEYS}
         # A table with a switch column only belongs to an actuator of the model file.
         if other_entries or not table:
-            result[name] = other_entries
-    return result
+            kept_tables[name] = other_entries
+    return kept_tables
 
 
 def check_switches(
@@ -232,12 +232,12 @@ def split_without_masked(run: Run, off: Mask) -> list[Run]:
     """
     if not off.any():
         return [run]
-    parts = []
+    split_runs = []
     for first, end in spans(~off):
         if end - first < MIN_PART_SAMPLES:
             continue
         name = f"{run.name} from {run.times[first]:.4g} s" if first else run.name
         part = run.part(slice(first, end), name)
         if any(np.isfinite(values).any() for values in part.channels.values()):
-            parts.append(part)
-    return parts
+            split_runs.append(part)
+    return split_runs

@@ -297,15 +297,15 @@ def _read_renamed(
     measured = columns_of(channels)
     input_columns = [column for column in columns_of(inputs) if column not in measured]
     extra_columns = {name: sources.extra[name].columns[0] for name in extra}
-    parts = []
+    renamed_runs = []
     for part in read_table(path, measured, input_columns, list(extra_columns.values())):
         values = {
             name: sources.signals[name].combine(part.columns.__getitem__)
             for name in (*channels, *inputs)
         }
         values |= {name: part.columns[column] for name, column in extra_columns.items()}
-        parts.append(part._replace(columns=values))
-    return parts
+        renamed_runs.append(part._replace(columns=values))
+    return renamed_runs
 
 
 def recording_of_frame(
@@ -466,15 +466,15 @@ def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
     """
     count = len(run.times)
     split_index = (2 * count) // _HELD_OUT_STRIDE
-    parts = (
+    halves = (
         replace(run.part(slice(split_index)), held_out=False),
         replace(run.part(slice(split_index, None)), held_out=True),
     )
-    for part in parts:
+    for part in halves:
         measured = any(np.isfinite(values).any() for values in part.channels.values())
         if len(part.times) < 2 or not measured:
             raise InputError(
                 f"{path}: the only run is too short to hold its last third out: {count} rows; "
                 "expected at least 4, with samples in both parts"
             )
-    return parts
+    return halves

@@ -360,7 +360,7 @@ def _read_wrapped_channels(
         declared: signals that the system declares.
     """
     units = {channel.name: channel.unit for channel in _list_channels(declared)}
-    result = {}
+    commands_by_channel = {}
     for name, column in channels.items():
         value = column.table.get("unwrap", False)
         key = f"channels.{name}.unwrap"
@@ -375,8 +375,8 @@ def _read_wrapped_channels(
                 path, key, f"it with an angle alone ({name} is in {units[name]})", value
             )
         if value:
-            result[name] = value if isinstance(value, str) else ""
-    return result
+            commands_by_channel[name] = value if isinstance(value, str) else ""
+    return commands_by_channel
 
 
 def _read_drive_switches(
@@ -567,15 +567,15 @@ def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]
     Returns:
         The entries by their full names.
     """
-    result: dict[str, Any] = {}
+    flat_table: dict[str, Any] = {}
     for name, value in entries.items():
         is_nested = isinstance(value, dict) and name not in names
         if is_nested and any(known_name.startswith(f"{name}.") for known_name in names):
             flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}
-            result.update(dotted(flat_entries, names))
+            flat_table.update(dotted(flat_entries, names))
         else:
-            result[name] = value
-    return result
+            flat_table[name] = value
+    return flat_table
 
 
 def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
@@ -697,15 +697,15 @@ def _read_extra_columns(
     extra_tables = dotted(
         check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)
     )
-    for name, entry in extra_tables.items():
+    for name, column_table in extra_tables.items():
         if name in used_names:
             remedy = "declare it as channel or input"
             raise InputError(f"{path}: extra.{name}: is declared as a column already; {remedy}")
-        unit = entry.get("unit") if isinstance(entry, dict) else None
+        unit = column_table.get("unit") if isinstance(column_table, dict) else None
         if not isinstance(unit, str):
-            raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
-        _check_known_names(path, f"extra.{name}", entry, ("unit", "file", "column"))
-        tables[name] = entry
+            raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', column_table)
+        _check_known_names(path, f"extra.{name}", column_table, ("unit", "file", "column"))
+        tables[name] = column_table
     return tables
 
 

@@ -96,7 +96,7 @@ def build_frame_description(
     Raises:
         InputError: A column belongs to no signal, or a unit is missing.
     """
-    result: dict[str, Any] = to_toml_value(meta)
+    description: dict[str, Any] = to_toml_value(meta)
     poses = get_floating_state_units(declared)
     usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
     columns = [name for name in frame.columns if name != "run"]
@@ -104,13 +104,13 @@ def build_frame_description(
         # The same dict of units may be used for frames with different columns.
         if name not in columns and name not in usual:
             raise make_unknown_name_error(f"column in units of {path}", name, columns)
-    channels = dotted(check_table(path, "channels", result.get("channels", {})), usual)
-    inputs = dotted(check_table(path, "inputs", result.get("inputs", {})), usual)
-    extra = dotted(check_table(path, "extra", result.get("extra", {})), poses)
-    time = check_table(path, "time", result.get("time", {}))
+    channels = dotted(check_table(path, "channels", description.get("channels", {})), usual)
+    inputs = dotted(check_table(path, "inputs", description.get("inputs", {})), usual)
+    extra = dotted(check_table(path, "extra", description.get("extra", {})), poses)
+    time = check_table(path, "time", description.get("time", {}))
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
-    switches = [switch.column for switch in read_switches(path, result)]
+    switches = [switch.column for switch in read_switches(path, description)]
     stamps = _list_signal_columns("t", time)[0]
     used_columns = {stamps, *extra}
     for name, table in (*channels.items(), *inputs.items(), *extra.items()):
@@ -141,7 +141,7 @@ def build_frame_description(
             f"{path}: expected the unit of each column, found none of "
             f"{', '.join(map(str, missing))}; pass units={missing}, if these are the units"
         )
-    return {**result, **{key: entries for key, entries in tables.items() if entries}}
+    return {**description, **{key: entries for key, entries in tables.items() if entries}}
 
 
 def _list_signal_columns(name: str, table: Any) -> list[str]:

@@ -155,20 +155,20 @@ def _format_description(recording: Recording, declared: DeclaredSignals, folder:
     import tomli_w
 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
-    first = recording.runs[0]
+    first_run = recording.runs[0]
     document: dict[str, Any] = {**_describe_source(recording, folder), "title": recording.title}
     document["channels"] = {
-        n: {"unit": units[n], **_get_stated_noise(recording.noise, n)} for n in first.channels
+        n: {"unit": units[n], **_get_stated_noise(recording.noise, n)} for n in first_run.channels
     }
-    if first.inputs:
+    if first_run.inputs:
         document["inputs"] = {
-            n: {"unit": units[n], **({"hold": "linear"} if n in first.linear else {})}
-            for n in first.inputs
+            n: {"unit": units[n], **({"hold": "linear"} if n in first_run.linear else {})}
+            for n in first_run.inputs
         }
-    if first.offset:
-        document["time"] = {"offset": first.offset}
-    if first.extra:
-        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
+    if first_run.offset:
+        document["time"] = {"offset": first_run.offset}
+    if first_run.extra:
+        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first_run.extra}
     if recording.constants:
         document["constants"] = dict(recording.constants)
     runs = {run.name: _describe_run(run) for run in recording.runs}

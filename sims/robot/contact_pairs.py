@@ -64,16 +64,16 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
         InputError: there are no such geoms; the message lists the existing ones.
     """
     model = robot.compiled
-    numbers = {get_geom_name(model, geom): geom for geom in range(model.ngeom)}
+    geom_ids = {get_geom_name(model, geom): geom for geom in range(model.ngeom)}
     # The name of a geom may contain the separator.
     parts = pair.split(PAIR_SEPARATOR)
     for count in range(1, len(parts)):
         names = (PAIR_SEPARATOR.join(part) for part in (parts[:count], parts[count:]))
-        first, second = (numbers.get(name) for name in names)
+        first, second = (geom_ids.get(name) for name in names)
         if first is not None and second is not None:
             return first, second
-    unknown = next((name for name in parts if name not in numbers), pair)
-    raise make_unknown_name_error(f"geom of {robot.path.name}", unknown, list(numbers) or ["none"])
+    unknown = next((name for name in parts if name not in geom_ids), pair)
+    raise make_unknown_name_error(f"geom of {robot.path.name}", unknown, list(geom_ids) or ["none"])
 
 
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:

@@ -39,15 +39,15 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
     """
     model, second_joint = robot.compiled, robot.joint(name)
     body = int(model.jnt_bodyid[second_joint.id])
-    first, end = int(model.body_jntadr[body]), second_joint.id
+    first_joint_id, end_joint_id = int(model.body_jntadr[body]), second_joint.id
     while body > 0:
-        preceding_joints = [robot.joints[i] for i in range(first, end)]
+        preceding_joints = [robot.joints[i] for i in range(first_joint_id, end_joint_id)]
         preceding_joints = [joint for joint in preceding_joints if joint.name not in robot.series]
         if preceding_joints:
             return preceding_joints[-1] if preceding_joints[-1].kind == second_joint.kind else None
         body = int(model.body_parentid[body])
-        first = int(model.body_jntadr[body])
-        end = first + int(model.body_jntnum[body])
+        first_joint_id = int(model.body_jntadr[body])
+        end_joint_id = first_joint_id + int(model.body_jntnum[body])
     return None
 
 

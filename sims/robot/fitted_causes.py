@@ -82,17 +82,17 @@ class FittedCause:
         has_several = len(self.numbers) > 1
         origin_text = f", fitted to {recording}" if recording else ""
         if self.effect in OPTION_EFFECTS:
-            (number,) = self.numbers.values()
+            (estimate,) = self.numbers.values()
             option = OPTION_EFFECTS[self.effect]
             before, after = (
-                format_option(option, value if value is not None else number.value)
-                for value in (number.stated, number.total)
+                format_option(option, value if value is not None else estimate.value)
+                for value in (estimate.stated, estimate.total)
             )
             if isinstance(after, str):
                 return f"{self.name}: from {before} to {after}{origin_text}"
         numbers = [
-            (f"{name} " if has_several else "") + _format_estimate(number)
-            for name, number in self.numbers.items()
+            (f"{name} " if has_several else "") + _format_estimate(estimate)
+            for name, estimate in self.numbers.items()
         ]
         return f"{self.name}: {', '.join(numbers)}{origin_text}"
 

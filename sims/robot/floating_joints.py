@@ -165,10 +165,10 @@ class FloatingJoints:
 
         Positions move along the axes of the world; rotations are about the axes of the body.
         """
-        result = pose.copy()
+        displaced_pose = pose.copy()
         for axes, quaternion_columns, first in self._joint_addresses:
             place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
-            result[:, place] += displacements[:, first : first + len(axes)]
+            displaced_pose[:, place] += displacements[:, first : first + len(axes)]
             rotation = displacements[
                 :, first + len(axes) : first + len(axes) + len(ANGULAR_VELOCITY_AXES)
             ]
@@ -176,24 +176,24 @@ class FloatingJoints:
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
             quaternion = np.concatenate([np.cos(0.5 * angle), half_sinc * rotation], axis=1)
-            result[:, quaternion_columns] = _multiply_quaternions(
+            displaced_pose[:, quaternion_columns] = _multiply_quaternions(
                 pose[:, quaternion_columns], quaternion
             )
-        return result
+        return displaced_pose
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
-        parts = []
+        columns = []
         for axes, quaternion_columns, _ in self._joint_addresses:
             place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
-            parts.append(pose[:, place] - reference[:, place])
+            columns.append(pose[:, place] - reference[:, place])
             inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
-            parts.append(
+            columns.append(
                 _compute_rotation_vectors(
                     _multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
                 )
             )
-        return np.concatenate(parts, axis=1) if parts else np.zeros((len(pose), 0))
+        return np.concatenate(columns, axis=1) if columns else np.zeros((len(pose), 0))
 
     @cached_property
     def _joint_addresses(self) -> tuple[FloatingJoint, ...]:

@@ -174,22 +174,22 @@ def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
     from sims.robot.integrator_settings import OPTION_EFFECTS, OPTION_WORDS
 
     settings = check_table(source, "numerics", value)
-    for key, entry in settings.items():
+    for key, option_value in settings.items():
         entry_name = f"numerics.{key}"
         if key == "timestep":
-            settings[key] = check_finite(source, entry_name, entry)
+            settings[key] = check_finite(source, entry_name, option_value)
             if settings[key] <= 0:
-                raise make_error(source, entry_name, "more than 0 s", entry)
+                raise make_error(source, entry_name, "more than 0 s", option_value)
         elif key in OPTION_WORDS:
-            if entry not in OPTION_WORDS[key]:
-                raise make_error(source, entry_name, " | ".join(OPTION_WORDS[key]), entry)
+            if option_value not in OPTION_WORDS[key]:
+                raise make_error(source, entry_name, " | ".join(OPTION_WORDS[key]), option_value)
         elif key in OPTION_EFFECTS.values():
-            settings[key] = check_finite(source, entry_name, entry)
+            settings[key] = check_finite(source, entry_name, option_value)
             if settings[key] < 0:
-                raise make_error(source, entry_name, "at least 0", entry)
+                raise make_error(source, entry_name, "at least 0", option_value)
             if key != "impratio":
                 settings[key] = int(settings[key])
         else:
             expectation = f"one of {', '.join(OPTION_EFFECTS.values())}"
-            raise make_error(source, entry_name, expectation, entry)
+            raise make_error(source, entry_name, expectation, option_value)
     return settings

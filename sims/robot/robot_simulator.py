@@ -244,7 +244,7 @@ class RobotSimulator(SystemSimulator):
             v: (L, D) initial velocities.
         """
         max_samples = max(s.times.size for s in runs.unique_scenarios)
-        result = np.full((len(x), max_samples, len(self.channels)), np.nan)
+        all_observations = np.full((len(x), max_samples, len(self.channels)), np.nan)
         derived = find_active_elements(acting, len(x), changes_derived_constants)
         is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
@@ -254,7 +254,7 @@ class RobotSimulator(SystemSimulator):
                 order = np.argsort(runs.scenario_index[group.indices], kind="stable")
                 sorted_indices = group.indices[order]
                 batch_count = max(-(-sorted_indices.size // BATCH_SIZE), 1)
-                for part in np.array_split(sorted_indices, batch_count):
+                for batch_indices in np.array_split(sorted_indices, batch_count):
                     run_batches = [
                         RobotRunBatch(
                             runs.unique_scenarios[run],
@@ -263,12 +263,12 @@ class RobotSimulator(SystemSimulator):
                             x[run_indices],
                             v[run_indices],
                         )
-                        for run, run_indices in group_by_run(runs, part)
+                        for run, run_indices in group_by_run(runs, batch_indices)
                     ]
                     try:
                         run_observations = self._simulate_run_batch(
                             run_batches,
-                            slice_active_effects(acting, part),
+                            slice_active_effects(acting, batch_indices),
                             group.derived,
                             group.is_stepwise,
                             group.added,
@@ -278,12 +278,12 @@ class RobotSimulator(SystemSimulator):
                         # simulated.
                         continue
                     for (_, run_indices), observations in zip(
-                        group_by_run(runs, part), run_observations, strict=True
+                        group_by_run(runs, batch_indices), run_observations, strict=True
                     ):
-                        result[run_indices, : observations.shape[1]] = observations
+                        all_observations[run_indices, : observations.shape[1]] = observations
         # Negative zeros become positive, so that results do not depend on their origin.
-        result += 0.0
-        return result
+        all_observations += 0.0
+        return all_observations
 
     def _simulate_run_batch(
         self,
@@ -316,7 +316,7 @@ class RobotSimulator(SystemSimulator):
         inputs = BatchInputs.concatenate(run_inputs)
         x = np.concatenate([batch.x for batch in run_batches])
         v = np.concatenate([batch.v for batch in run_batches])
-        result = self._simulate_steps(
+        stepped = self._simulate_steps(
             BatchStart(x, v, acting, self._get_floating_states(run_batches)),
             inputs,
             derived,
@@ -328,7 +328,7 @@ class RobotSimulator(SystemSimulator):
         for batch, size in zip(run_batches, sizes, strict=True):
             run_elements = slice(first, first + len(batch.x))
             observations.append(
-                self._compute_observations(result.select(run_elements), batch, batch.times, size)
+                self._compute_observations(stepped.select(run_elements), batch, batch.times, size)
             )
             first += len(batch.x)
         return observations
@@ -377,8 +377,15 @@ class RobotSimulator(SystemSimulator):
             batch: batch elements of the run.
             steps: number of steps.
         """
-        n = len(batch.x)
-        run_arguments = self.time_step, batch.scenario, batch.commands, batch.acting, n, steps
+        batch_size = len(batch.x)
+        run_arguments = (
+            self.time_step,
+            batch.scenario,
+            batch.commands,
+            batch.acting,
+            batch_size,
+            steps,
+        )
         applied_inputs = compute_inputs_over_steps(*run_arguments)
         instant = (
             compute_inputs_over_steps(*run_arguments, SAME_INSTANT_SHARE)
@@ -387,8 +394,8 @@ class RobotSimulator(SystemSimulator):
         )
         step_starts: Array = self.time_step * np.arange(float(steps))
         model = self.robot.compiled
-        controls = np.zeros((n, steps, model.nu))
-        forces = np.zeros((n, steps, model.nv))
+        controls = np.zeros((batch_size, steps, model.nu))
+        forces = np.zeros((batch_size, steps, model.nv))
         instant_controls = np.zeros_like(controls) if self._records_drive_forces else controls
         for actuator in self.robot.actuators:
             name = f"u.{actuator.name}"
@@ -408,9 +415,9 @@ class RobotSimulator(SystemSimulator):
                 forces[:, :, joint.velocity] = applied_inputs[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += compute_time_dependent_forces(
-            self.robotic, batch.acting, step_starts, len(dofs), n
+            self.robotic, batch.acting, step_starts, len(dofs), batch_size
         )
-        initial_activations = np.zeros((n, model.na))
+        initial_activations = np.zeros((batch_size, model.na))
         for activation_filter in activation_filters(self.robot):
             filter_controls = controls[:, :, activation_filter.actuator.control]
             initial_activations[:, activation_filter.address] = self._compute_initial_activation(
@@ -433,7 +440,7 @@ class RobotSimulator(SystemSimulator):
             applied_inputs,
             instant_controls,
             initial_activations,
-            np.broadcast_to(off_mask, (n, *off_mask.shape)),
+            np.broadcast_to(off_mask, (batch_size, *off_mask.shape)),
         )
 
     def _compute_initial_activation(
@@ -564,13 +571,15 @@ class RobotSimulator(SystemSimulator):
             extra_fields: additional fields of MuJoCo's data to record.
             added: elements that effects add to the model.
         """
-        n = len(start.x)
+        batch_size = len(start.x)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
-        mujoco_batch = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
+        mujoco_batch = self._get_batch(derived, 1 if batch_size == 1 else BATCH_SIZE, added)
         joints, series_joints = mujoco_batch.file_joints, mujoco_batch.series_joints
         mujoco_batch.write_effects(
-            pad_coefficients(select_model_field_effects(start.acting), n, mujoco_batch.count)
+            pad_coefficients(
+                select_model_field_effects(start.acting), batch_size, mujoco_batch.count
+            )
         )
         initial_series = mujoco_batch.set_initial_state(start.x, start.v, start.floating_state)
         mujoco_batch.activate(inputs.activations)
@@ -579,7 +588,7 @@ class RobotSimulator(SystemSimulator):
             field_names.append("sensordata")
         field_names = list(dict.fromkeys(field_names))
         if is_stepwise:
-            stiffness = mujoco_batch.get_servo_stiffness(joints)[:n]
+            stiffness = mujoco_batch.get_servo_stiffness(joints)[:batch_size]
             effect_forces = EffectForces(
                 self.robotic, start.acting, inputs.applied_inputs, joints, stiffness, self.time_step
             )

@@ -144,15 +144,17 @@ class RobotSystem(System):
             InputError: there is no such effect, or it has no such place; the message lists the
                 existing ones.
         """
-        base, _, place = name.partition("@")
+        effect_name, _, place = name.partition("@")
         try:
-            registered = library.get_effect(base)
+            registered = library.get_effect(effect_name)
         except PartUnavailableError:
             raise
         cls.placed(registered)
         if name in cls.left_out:
             raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
-        effects_by_name = {placed_effect.name: placed_effect for placed_effect in cls._placed[base]}
+        effects_by_name = {
+            placed_effect.name: placed_effect for placed_effect in cls._placed[effect_name]
+        }
         if name in effects_by_name:
             return effects_by_name[name]
         if registered.at == "contact" and PAIR_SEPARATOR in place:
@@ -160,22 +162,22 @@ class RobotSystem(System):
             spot = make_contact_place(cls.robot, place, (place,))
             return effect_places.make_placed_effect(registered, spot)
         if not effects_by_name:
-            raise InputError(f"robot {cls.name} cannot have effect {base}")
+            raise InputError(f"robot {cls.name} cannot have effect {effect_name}")
         if not place:
             raise InputError(
-                f"effect {base} of robot {cls.name} needs a place; there are: "
+                f"effect {effect_name} of robot {cls.name} needs a place; there are: "
                 + ", ".join(sorted(effects_by_name))
             )
         if registered.at == "body" and place in (cls.robot.aliases or {}):
-            return cls.effect(f"{base}@{cls.robot.body(place).name}")
+            return cls.effect(f"{effect_name}@{cls.robot.body(place).name}")
         place_names = [
             placed_effect.place for placed_effect in effects_by_name.values() if placed_effect.place
         ]
         if place == ALL_PLACES and len(place_names) == 1:
             # If there is one place only, the family is this place.
-            return effects_by_name[f"{base}@{place_names[0]}"]
+            return effects_by_name[f"{effect_name}@{place_names[0]}"]
         raise make_unknown_name_error(
-            f"place of effect {base} in robot {cls.name}", place, place_names or ["none"]
+            f"place of effect {effect_name} in robot {cls.name}", place, place_names or ["none"]
         )
 
     @classmethod
@@ -279,14 +281,14 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     drives: dict[int, tuple[str, ...]] = {}
     servos: dict[int, str] = {}
     gears: dict[int, float] = {}
-    for number, joint in enumerate(joints):
+    for joint_index, joint in enumerate(joints):
         joint_actuators = [a for a in robot.actuators if a.joint == joint.name]
-        drives[number] = tuple(f"u.{a.name}" for a in joint_actuators)
+        drives[joint_index] = tuple(f"u.{a.name}" for a in joint_actuators)
         position_servos = [a for a in joint_actuators if a.kind == "position"]
         # With several servos at one joint, its motion would not show which one has an error.
         if len(position_servos) == 1:
-            servos[number] = f"u.{position_servos[0].name}"
-            gears[number] = float(model.actuator_gear[position_servos[0].id, 0])
+            servos[joint_index] = f"u.{position_servos[0].name}"
+            gears[joint_index] = float(model.actuator_gear[position_servos[0].id, 0])
     attributes: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -354,7 +356,7 @@ FREED_GAIN_RANGE_FACTOR = 9.0
 
 def _make_parameters(effect: type[Effect]) -> list[Parameter]:
     """Make parameters from an effect's coefficients; nominal values keep the file's values."""
-    result = []
+    parameters = []
     for c in effect.coefficients:
         low, high = c.plausible[0]
         # A free gain is a guess, so the true value may be several times as large.
@@ -370,8 +372,8 @@ def _make_parameters(effect: type[Effect]) -> list[Parameter]:
             bounds = max(bounds[0], c.least), min(bounds[1], upper_limit)
         name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
         unit = c.units[0] or "1"
-        result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
-    return result
+        parameters.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
+    return parameters
 
 
 def _list_channels(robot: RobotModel) -> tuple[Channel, ...]:

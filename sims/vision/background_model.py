@@ -67,21 +67,21 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
     times = []
     motions = []
     cuts = []
-    size = 0, 0
+    frame_size = 0, 0
     previous_frame = None
-    for number, (time, picture) in enumerate(frames):
-        if number and picture.shape[1::-1] != size:
-            expected = f"{size[0]} x {size[1]} px as before"
-            raise InputError(f"frame {number}: expected {expected}, found another size")
+    for frame_index, (time, picture) in enumerate(frames):
+        if frame_index and picture.shape[1::-1] != frame_size:
+            expected = f"{frame_size[0]} x {frame_size[1]} px as before"
+            raise InputError(f"frame {frame_index}: expected {expected}, found another size")
         height, width = picture.shape[:2]
-        size = width, height
+        frame_size = width, height
         downsampling = height * width / _SURVEY_PIXELS
         pixel_stride = max(1, int(downsampling**0.5))
         thinned = picture[::pixel_stride, ::pixel_stride].astype(np.int16)
         reference_frame = thinned if previous_frame is None else previous_frame
         change = np.abs(thinned - reference_frame).max(axis=2)
         if np.mean(change > _MIN_PIXEL_CHANGE) > _MIN_CUT_SHARE:
-            cuts.append(number)
+            cuts.append(frame_index)
             # The whole picture has changed, and no ball has moved.
             change[:] = 0
         times.append(time)
@@ -90,7 +90,7 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
         excess = change - 2 * median_change - _COMPRESSION_NOISE
         motions.append(float(np.maximum(excess, 0).mean()))
         previous_frame = thinned
-    return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), size)
+    return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), frame_size)
 
 
 def select_frames(moved: Array) -> list[int]:

@@ -288,7 +288,7 @@ class BallDetector:
             picture: the picture.
             mask: (height, width) pixels that differ from the background.
         """
-        result = np.zeros(mask.shape, np.float32)
+        brightness_ratio = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
         colours = picture[rows, columns].astype(np.float32)
         background_colours = self._plain[rows, columns]
@@ -302,8 +302,8 @@ class BallDetector:
         darkest, lightest = _SHADOW_FACTOR_RANGE
         shade = (symmetric_factor > darkest) & (symmetric_factor < lightest)
         shade &= relative_deviations < max(_MAX_SHADOW_DEVIATION, 3 * self.sigma)
-        result[rows, columns] = np.where(shade, factor, 0)
-        return result
+        brightness_ratio[rows, columns] = np.where(shade, factor, 0)
+        return brightness_ratio
 
     def _measure_object(
         self,

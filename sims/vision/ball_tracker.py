@@ -82,11 +82,11 @@ class TrackedPath:
             Position (u, v), and the maximum distance of a detection from it, which allows for a
             bounce; pixels.
         """
-        last = self.detections[-1]
-        u, v = last.u, last.v
+        last_detection = self.detections[-1]
+        u, v = last_detection.u, last_detection.v
         # A single detection has no direction.
         if len(self.detections) < 2:
-            return u, v, 4 * last.radius + 10
+            return u, v, 4 * last_detection.radius + 10
         previous = self.detections[-2]
         gap = self.frames[-1] - self.frames[-2]
         du = (u - previous.u) / gap
@@ -94,7 +94,7 @@ class TrackedPath:
         frame_gap = frame - self.frames[-1]
         # Twice the distance covered: an object that reverses is that far from its prediction.
         speed = float(np.hypot(du, dv))
-        reach = 2 * speed * frame_gap + last.radius + 2
+        reach = 2 * speed * frame_gap + last_detection.radius + 2
         return u + du * frame_gap, v + dv * frame_gap, reach
 
     def compute_distance(self, frame: int, detection: BallDetection) -> float:
@@ -344,25 +344,31 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     frames = _FrameCache(frames)
     survey = background_model.survey_frames(frames)
     notes: list[str] = []
-    first, end = _find_longest_shot(survey, notes)
-    numbers = [first + k for k in background_model.select_frames(survey.moved[first:end])]
-    wanted_frames = set(numbers)
+    first_frame, end_frame = _find_longest_shot(survey, notes)
+    sample_frames = [
+        first_frame + k for k in background_model.select_frames(survey.moved[first_frame:end_frame])
+    ]
+    wanted_frames = set(sample_frames)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted_frames]
     detector = _make_detector(pictures)
     detections = []
     for number, (_, picture) in enumerate(frames):
-        if first <= number < end:
+        if first_frame <= number < end_frame:
             detections.append(detector.detect(picture))
     paths = link_detections(detections)
     if not paths:
-        raise InputError(_format_no_ball_message(end - first, sum(map(bool, detections))))
+        raise InputError(
+            _format_no_ball_message(end_frame - first_frame, sum(map(bool, detections)))
+        )
     path, other_paths = merge_continuations(paths)
     # An object that hardly moves may be a ball, but its fall cannot be measured.
     if len(path.frames) < _MIN_FRAMES or path.travel < path.radius:
-        raise InputError(_format_no_ball_message(end - first, len(path.frames)))
+        raise InputError(_format_no_ball_message(end_frame - first_frame, len(path.frames)))
     _note_other_objects(path, other_paths, notes)
-    sample_pictures = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
-    return _make_track(survey.times[first:end], path, survey.size, notes, detector, sample_pictures)
+    sample_pictures = {n - first_frame: p for n, p in zip(sample_frames, pictures, strict=True)}
+    return _make_track(
+        survey.times[first_frame:end_frame], path, survey.size, notes, detector, sample_pictures
+    )
 
 
 class _FrameCache:
@@ -424,19 +430,19 @@ def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -
         InputError: the part has too few frames.
     """
     shots = survey.list_shots()
-    first, end = max(shots, key=lambda shot: shot[1] - shot[0])
+    first_frame, end_frame = max(shots, key=lambda shot: shot[1] - shot[0])
     if len(shots) > 1:
         cuts = ", ".join(f"{survey.times[cut_frame]:.2f} s" for cut_frame in survey.cuts[:5])
-        span = f"{survey.times[first]:.2f} to {survey.times[end - 1]:.2f} s"
+        span = f"{survey.times[first_frame]:.2f} to {survey.times[end_frame - 1]:.2f} s"
         notes.append(
             f"the film is cut or the camera moves (at {cuts}); "
             f"only the longest part is tracked, {span}"
         )
-    if end - first < _MIN_FRAMES:
+    if end_frame - first_frame < _MIN_FRAMES:
         raise InputError(
-            f"expected at least {_MIN_FRAMES} frames without a cut, found {end - first}"
+            f"expected at least {_MIN_FRAMES} frames without a cut, found {end_frame - first_frame}"
         )
-    return first, end
+    return first_frame, end_frame
 
 
 def _make_detector(pictures: list[RgbImage]) -> BallDetector:

@@ -69,7 +69,7 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
     y = points[:, 1]
     # Rows: the two components of n, ones for dR, and the residual of (2).
     count = len(points)
-    rows: Array = np.ones((4, count))
+    design: Array = np.ones((4, count))
     for _ in range(_MAX_ITERATIONS):
         away_u = x - u
         away_v = y - v
@@ -82,10 +82,10 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
         )
         weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
         np.maximum(distances, 1e-9, out=distances)
-        rows[0] = away_u / distances
-        rows[1] = away_v / distances
-        rows[3] = residuals
-        step = _solve_gauss_newton_step((rows * weights) @ rows.T)
+        design[0] = away_u / distances
+        design[1] = away_v / distances
+        design[3] = residuals
+        step = _solve_gauss_newton_step((design * weights) @ design.T)
         if step is None:
             return None
         du, dv, dr = step

@@ -160,12 +160,12 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
     from sims.vision.ball_tracker import track_ball
     from sims.vision.video_files import VideoFile, write_video
 
-    rows: Array = np.full(times.size, np.nan)
+    pixel_rows: Array = np.full(times.size, np.nan)
     if not np.isfinite(places).all():
-        return rows
+        return pixel_rows
     # Light, colours and compression are drawn from what the film shows: the same parameters and
     # scenario give the same film, whatever was filmed before.
-    numbers = [
+    film_settings = [
         camera.azimuth,
         camera.distance,
         camera.height,
@@ -173,7 +173,7 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
         radius,
         *places.ravel(),
     ]
-    digest = hashlib.sha256(np.array(numbers).tobytes()).digest()
+    digest = hashlib.sha256(np.array(film_settings).tobytes()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
     appearance = SceneAppearance.draw(rng)
     stage = BallScene(camera, appearance, radius, rng)
@@ -183,10 +183,10 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
             write_video(path, stage.render_frames(places), times, appearance.crf)
             measured = track_ball(VideoFile(path))
     except InputError:  # no ball to be seen: nothing was measured
-        return rows
+        return pixel_rows
     finally:
         stage.close()
     # Frames without a ball are left out of a track: each place is found by its time.
     frames = np.interp(measured.times, times - times[0], np.arange(times.size))
-    rows[np.rint(frames).astype(int)] = measured.v
-    return rows
+    pixel_rows[np.rint(frames).astype(int)] = measured.v
+    return pixel_rows

@@ -171,7 +171,7 @@ class VideoFile:
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
         """Iterate over time in seconds and picture of each readable frame; times increase."""
         self.notes = []
-        last = -np.inf
+        last_time = -np.inf
         count = 0
         dropped_count = 0
         is_broken = False
@@ -184,10 +184,10 @@ class VideoFile:
                 time = count / self.fps if self.fps else seconds
                 count += 1
                 # The times of a recording must increase, those of a file need not.
-                if time <= last:
+                if time <= last_time:
                     dropped_count += 1
                     continue
-                last = time
+                last_time = time
                 yield time, picture
         self._check_pass(count, stated_count, is_broken, dropped_count)
 

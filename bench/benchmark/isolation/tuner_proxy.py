@@ -149,7 +149,7 @@ class IsolatedSteps:
         The budget is limited to 2^62, so that it fits into an int64.
         """
         task = self._task
-        parts = pack_arrays(
+        packed_arrays = pack_arrays(
             {
                 "start": task.start,
                 "observed": task.observed,
@@ -162,7 +162,7 @@ class IsolatedSteps:
                 "stream": self._stream.astype(np.int64),
             }
         )
-        self._child.send(b"T", *parts, deadline=self._deadline)
+        self._child.send(b"T", *packed_arrays, deadline=self._deadline)
         return self._receive_answer()
 
     def send(self, evaluation: Evaluation) -> Array | Proposal:
@@ -199,18 +199,22 @@ class IsolatedSteps:
         message = self._child.receive(max(self._limit, MAX_TEXT_BYTES), self._deadline)
         if message.kind == b"S":
             raise StopIteration(message.to_text())
-        dim, n = self._task.dim, message.size
+        dim, point_count = self._task.dim, message.size
         try:
-            numbers = message.to_array()
+            coordinates = message.to_array()
         except ProtocolError as error:
             raise self._child.fail_with_protocol_error(str(error)) from None
         recommends = message.flags == 1
-        if message.kind != b"A" or not n or numbers.size != (n + recommends) * dim:
+        if (
+            message.kind != b"A"
+            or not point_count
+            or coordinates.size != (point_count + recommends) * dim
+        ):
             raise self._child.fail_with_protocol_error("it requested no points")
         self._waits = True
         if recommends:
-            return Proposal(numbers[dim:].reshape(n, dim), numbers[:dim])
-        return numbers.reshape(n, dim)
+            return Proposal(coordinates[dim:].reshape(point_count, dim), coordinates[:dim])
+        return coordinates.reshape(point_count, dim)
 
     def close(self) -> None:
         """End the run; the process may serve another one.

@@ -151,7 +151,7 @@ def estimate_comparison_need(
     ]
     runs = targets * sum(seeds for seeds, _ in seeds_and_budgets)
     simulations = targets * sum(seeds * budget for seeds, budget in seeds_and_budgets)
-    rows = runs + simulations
+    row_count = runs + simulations
     held_out = experiment.held_out.scenarios if experiment.held_out else 0
     max_budget = max((budget for _, budget in seeds_and_budgets), default=0)
     training_simulations = experiment.training_budget if quantities.learned else 0
@@ -159,7 +159,7 @@ def estimate_comparison_need(
     memory = (
         runs * _RUN_MEMORY
         + targets * (1 + held_out) * quantities.observation
-        + rows * _ROW_MEMORY
+        + row_count * _ROW_MEMORY
         + (0 if cluster else jobs * _WORKER_BYTES)
         + max_budget * (quantities.dim + 1) * BYTES_PER_NUMBER
         + training_simulations * quantities.observation
@@ -168,7 +168,7 @@ def estimate_comparison_need(
     seconds = (
         simulations * quantities.simulation * (1 + held_out) / workers
         + training_simulations * quantities.simulation
-        + rows * _ROW_SECONDS
+        + row_count * _ROW_SECONDS
         + runs * _RUN_SECONDS
     )
     counts = {
@@ -186,7 +186,7 @@ def estimate_comparison_need(
         f"tuners {len(seeds_and_budgets)}, {counts_text}",
         _suggest_reduction(counts),
         memory,
-        rows * _ROW_DISK,
+        row_count * _ROW_DISK,
         runs / _RUNS_PER_PART,
         quantities.steps,
         seconds,

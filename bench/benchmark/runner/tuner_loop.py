@@ -424,7 +424,7 @@ class ProposalEvaluator:
             point.tobytes(): row
             for point, row in zip(proposals, self._stack_evaluated_rows(), strict=True)
         }
-        result = np.empty((len(recommendations), len(self._mean_factors)))
+        mean_squares = np.empty((len(recommendations), len(self._mean_factors)))
         for i, point in enumerate(recommendations):
             # Points are compared by their bytes, so that only an identical point is looked up.
             key = point.tobytes()
@@ -432,8 +432,8 @@ class ProposalEvaluator:
                 rows_by_point[key] = self._sum_squared_errors(
                     self._problem.simulate(point[None], self._scenarios)
                 )[0]
-            result[i] = rows_by_point[key]
-        errors: Array = np.sqrt(result * self._mean_factors)  # (2)
+            mean_squares[i] = rows_by_point[key]
+        errors: Array = np.sqrt(mean_squares * self._mean_factors)  # (2)
         return errors
 
     def _stack_evaluated_rows(self) -> Array:

@@ -96,8 +96,8 @@ def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
         (m, resamples) medians.
     """
     n = len(values)
-    result = np.empty((values.shape[1], counts.shape[1]))
-    for column, medians in zip(values.T, result, strict=True):
+    resampled_medians = np.empty((values.shape[1], counts.shape[1]))
+    for column, medians in zip(values.T, resampled_medians, strict=True):
         order = np.argsort(column)
         cumulative_counts = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
         # With k counted from 0, the k-th smallest value of a resample is the first sorted value
@@ -107,4 +107,4 @@ def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
             for k in ((n - 1) // 2, n // 2)
         )
         medians[:] = 0.5 * (column[order[lower]] + column[order[upper]])
-    return result
+    return resampled_medians

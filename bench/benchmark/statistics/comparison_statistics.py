@@ -236,10 +236,10 @@ class ComparisonStatistics:
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")
         ranges = self.curves.keys["range"]
-        result = {}
+        costs_by_range = {}
         for kind in dict.fromkeys(ranges):
             mask = (ranges == kind).to_numpy(dtype=bool)
-            result[str(kind)] = compute_tuning_costs(
+            costs_by_range[str(kind)] = compute_tuning_costs(
                 self.curves.select_mask(mask),
                 level,
                 self._budget,
@@ -247,7 +247,7 @@ class ComparisonStatistics:
                 in_simulator[mask],
                 self._costs,
             )
-        return result
+        return costs_by_range
 
     @cached_property
     def reference_level(self) -> float:

@@ -175,17 +175,17 @@ def average_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Ar
     Returns:
         (targets, ...) means; NaN where all values of a target are NaN.
     """
-    result = np.empty((len(groups), *values.shape[1:]))
-    counts = np.array([len(rows) for rows in groups])
+    target_means = np.empty((len(groups), *values.shape[1:]))
+    counts = np.array([len(run_rows) for run_rows in groups])
     with warnings.catch_warnings():
         # NumPy warns about the mean of NaN alone; the result NaN is intended.
         warnings.simplefilter("ignore", RuntimeWarning)
         # Targets with the same number of seeds are averaged in one array operation.
         for count in np.unique(counts):
             target_indices = np.flatnonzero(counts == count).tolist()
-            rows = np.array([groups[target] for target in target_indices])
-            result[target_indices] = np.nanmean(values[rows], axis=1)
-    return result
+            run_rows = np.array([groups[target] for target in target_indices])
+            target_means[target_indices] = np.nanmean(values[run_rows], axis=1)
+    return target_means
 
 
 class PrimaryMetric(NamedTuple):
@@ -409,7 +409,7 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
         Table with the columns `MEDIAN_COLUMNS`.
     """
     points = select_curve_points(budget)
-    parts = []
+    tables = []
     for tuner in curves.list_tuners():
         lines = np.maximum(
             _get_values(compute_target_curves(curves.select(tuner=tuner), points)), ERROR_FLOOR
@@ -427,8 +427,8 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
             resamples=_BOOTSTRAP_RESAMPLES,
         )
         columns = (tuner, points, np.median(lines, axis=0), low, high, len(lines))
-        parts.append(pd.DataFrame(dict(zip(MEDIAN_COLUMNS, columns, strict=True))))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=MEDIAN_COLUMNS)
+        tables.append(pd.DataFrame(dict(zip(MEDIAN_COLUMNS, columns, strict=True))))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=MEDIAN_COLUMNS)
 
 
 def find_coinciding_curves(
@@ -512,8 +512,8 @@ def compute_medians_by_distance(
         for tuner, by_target in errors.items():
             values = by_target[k].dropna().clip(lower=ERROR_FLOOR)
             for b, names in groups.items():
-                part = values.reindex(names).dropna().to_numpy()
-                if len(part):
+                group_values = values.reindex(names).dropna().to_numpy()
+                if len(group_values):
                     distance_limits = float(distances[names].min()), float(distances[names].max())
                     lines.append(
                         (
@@ -522,7 +522,7 @@ def compute_medians_by_distance(
                             b,
                             *distance_limits,
                             len(names),
-                            *_compute_median_with_interval(part, tuner, b),
+                            *_compute_median_with_interval(group_values, tuner, b),
                         )
                     )
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)

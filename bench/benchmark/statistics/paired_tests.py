@@ -71,7 +71,7 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
         is better on all targets, -1 if b is. `error_ratio` is the median of a's error over b's.
         Holm's correction is over all pairs of an experiment and range.
     """
-    parts = []
+    tables = []
     for experiment, kind, problem_curves in curves.split_problems():
         logs = build_log_error_table(problem_curves, floor=floor)
         lines = [
@@ -82,8 +82,8 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
         if lines:
             part = pd.DataFrame(lines, columns=PAIR_COLUMNS[:-1])
             part["p_holm"] = correct_holm(part["p_value"].to_numpy())
-            parts.append(part)
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=PAIR_COLUMNS)
+            tables.append(part)
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=PAIR_COLUMNS)
 
 
 def correct_holm(p: Array) -> Array:

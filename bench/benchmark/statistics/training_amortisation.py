@@ -235,17 +235,19 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
     Returns:
         Table with the columns `TIME_PER_TARGET_COLUMNS`.
     """
-    parts = []
+    tables = []
     for kind, by_tuner in prices.items():
         for tuner, price in by_tuner.items():
             seconds = price.compute_seconds_per_target(SIMULATION_COST_GRID, TARGETS_PER_TRAINING)
             # A logarithmic axis cannot show a tuner that needs 0 seconds.
             if np.isfinite(price.effort.compute_ert()) and seconds[0] > 0:
                 columns = (kind, tuner, SIMULATION_COST_GRID, seconds)
-                parts.append(pd.DataFrame(dict(zip(TIME_PER_TARGET_COLUMNS, columns, strict=True))))
+                tables.append(
+                    pd.DataFrame(dict(zip(TIME_PER_TARGET_COLUMNS, columns, strict=True)))
+                )
     return (
-        pd.concat(parts, ignore_index=True)
-        if parts
+        pd.concat(tables, ignore_index=True)
+        if tables
         else pd.DataFrame(columns=TIME_PER_TARGET_COLUMNS)
     )
 

@@ -90,16 +90,16 @@ class CsvTable:
         """
         problem = f"{self._path}: not a complete comparison"
         try:
-            data = self._path.read_bytes()
+            file_content = self._path.read_bytes()
         except OSError as error:
             raise InputError(f"{problem}: {error.strerror}; {self._remedy}") from None
-        if not data.strip():
+        if not file_content.strip():
             raise InputError(f"{problem}: expected a CSV file, found an empty one; {self._remedy}")
         try:
-            return data.decode("utf-8-sig")
+            return file_content.decode("utf-8-sig")
         except UnicodeDecodeError as error:
-            line = data[: error.start].count(b"\n") + 1
-            reason = f"expected UTF-8 text, found byte {data[error.start]:#04x}"
+            line = file_content[: error.start].count(b"\n") + 1
+            reason = f"expected UTF-8 text, found byte {file_content[error.start]:#04x}"
             raise InputError(f"{self._path}, line {line}: {reason}; {self._remedy}") from None
 
     def _convert_columns(self, columns: Columns) -> pa.Table:
@@ -152,15 +152,15 @@ class CsvTable:
             InputError: A record cannot be split into cells.
         """
         reader = csv.reader(io.StringIO(self._text, newline=""), strict=True)
-        first = 1
+        first_line = 1
         try:
             for cells in reader:
                 if len(cells) > 1 or "".join(cells).strip():
-                    yield first, cells
-                first = reader.line_num + 1
+                    yield first_line, cells
+                first_line = reader.line_num + 1
         except csv.Error as error:
             raise InputError(
-                f"{self._path}, line {first}: expected cells, found {error}; {self._remedy}"
+                f"{self._path}, line {first_line}: expected cells, found {error}; {self._remedy}"
             ) from None
 
     def _get_line_number(self, row: int) -> int:
@@ -343,14 +343,18 @@ def _convert_batch(
     except CellError as error:
         row = None if error.row is None else error.row + offset
         raise _shift_error_row(error, row) from None
-    rows = pa.table(typed)
-    rows = rows if last_row is None else pa.concat_tables([last_row, rows]).combine_chunks()
+    batch_rows = pa.table(typed)
+    batch_rows = (
+        batch_rows
+        if last_row is None
+        else pa.concat_tables([last_row, batch_rows]).combine_chunks()
+    )
     try:
-        _check_counts(rows, last_row is not None)
-        _check_same(rows)
+        _check_counts(batch_rows, last_row is not None)
+        _check_same(batch_rows)
     except CellError as error:
         raise _shift_error_row(error, (error.row or 0) + offset - (last_row is not None)) from None
-    return rows
+    return batch_rows
 
 
 def _shift_error_row(error: CellError, row: int | None) -> CellError:

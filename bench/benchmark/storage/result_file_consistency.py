@@ -67,15 +67,15 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
         place = "" if row is None else f", line {row + 1}"
         return InputError(f"{path}{place}: {problem}; {remedy}")
 
-    rows = []
+    planned_runs = []
     for row, name in enumerate(plan):
         parts = name.rsplit("/", 3)
         if len(parts) != 4 or not _SEED_PATTERN.fullmatch(parts[2]):
             raise make_line_error(
                 row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}"
             )
-        rows.append((name, parts[0], parts[1], int(parts[2])))
-    plan_table = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
+        planned_runs.append((name, parts[0], parts[1], int(parts[2])))
+    plan_table = pd.DataFrame(planned_runs, columns=["run", "tuner", "target", "seed"])
     names = plan_table["run"]
     raise_for_first_bad_row(
         names.duplicated(),

@@ -370,7 +370,7 @@ class RunJournal:
         for first in range(0, len(plan_indices), runs):
             chunk = plan_indices[first : first + runs]
             low, high = chunk[0], chunk[-1]
-            parts = [
+            chunk_tables = [
                 _add_place_column(plan_index, rows_by_index[plan_index])
                 for plan_index in chunk
                 if plan_index in rows_by_index
@@ -378,8 +378,8 @@ class RunJournal:
             for path, file_indices in self._index.items():
                 if file_indices[0] <= high and file_indices[-1] >= low:
                     is_in_chunk = (compute.field("place") >= low) & (compute.field("place") <= high)
-                    parts.append(parquet.read_table(path, filters=is_in_chunk))
-            table = pa.concat_tables([part.replace_schema_metadata() for part in parts])
+                    chunk_tables.append(parquet.read_table(path, filters=is_in_chunk))
+            table = pa.concat_tables([part.replace_schema_metadata() for part in chunk_tables])
             order = compute.sort_indices(
                 table, sort_keys=[("place", "ascending"), ("k", "ascending")]
             )

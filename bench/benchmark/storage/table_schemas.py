@@ -343,17 +343,17 @@ def expand_columns(
         channels: Names that replace ``CHANNEL``.
     """
     names = {"PARAMETER": list(parameters), "CHANNEL": list(channels)}
-    result = []
+    expanded_columns = []
     for column in columns:
         placeholders = [placeholder for placeholder in names if placeholder in column.name]
         if not placeholders:
-            result.append(column)
+            expanded_columns.append(column)
         for placeholder in placeholders:
-            result += [
+            expanded_columns += [
                 replace(column, name=column.name.replace(placeholder, n))
                 for n in names[placeholder]
             ]
-    return result
+    return expanded_columns
 
 
 def list_parameters(names: Iterable[str]) -> list[str]:

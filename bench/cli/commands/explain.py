@@ -211,7 +211,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         )
         with pool:
             pool.load_plugins([Plugin(str(path)) for path in options.plugin])
-            rows = explain_batch(
+            log_results = explain_batch(
                 logs,
                 output_folder,
                 settings,
@@ -219,16 +219,16 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
                 print_finished_recording,
                 interrupts.is_stop_requested,
             )
-    remaining = len(logs) - len(rows)
+    remaining = len(logs) - len(log_results)
     folders = {log.name: log.folder for log in logs}
     relevant = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
     command_words = format_explain_command(options.recordings, {**relevant, "out": output_folder})
     recordings = dict(zip(folders, options.recordings, strict=True))
     report = write_summary_page(
-        rows, BatchPageInput(output_folder, folders, recordings, command_words, remaining)
+        log_results, BatchPageInput(output_folder, folders, recordings, command_words, remaining)
     )
     write_explanation_environment(output_folder, started, relevant, options.recordings)
-    summary_lines = summarise_causes(rows)
+    summary_lines = summarise_causes(log_results)
     for line in (
         "",
         *summary_lines,
@@ -236,13 +236,13 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         f"table   {output_folder / LOGS_TABLE_FILE}",
     ):
         print_line(line)
-    code = EXIT_PROBLEMS_FOUND if any(row.error for row in rows) else EXIT_OK
+    code = EXIT_PROBLEMS_FOUND if any(row.error for row in log_results) else EXIT_OK
     if remaining:
         print_line(
             f"{remaining} of {len(logs)} recordings remain; run the same command again to continue"
         )
         code = EXIT_INTERRUPTED
-    results = [{**asdict(row), "folder": folders[row.log]} for row in rows]
+    results = [{**asdict(row), "folder": folders[row.log]} for row in log_results]
     document = {
         "logs": results,
         "together": summary_lines,

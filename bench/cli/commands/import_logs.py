@@ -47,22 +47,23 @@ def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     """
     from bench.api.recordings import ImportRequest, import_logs
 
-    result = import_logs(**collect_options(options, ImportRequest))
+    imported = import_logs(**collect_options(options, ImportRequest))
     print_line(
-        f"{options.out}: {len(result.guessed)} guesses, each marked in the file; nothing was copied"
+        f"{options.out}: {len(imported.guessed)} guesses, each marked in the file; "
+        "nothing was copied"
     )
-    for line in result.checks:
+    for line in imported.checks:
         print_line(f"check: {line}")
-    for line in result.guessed:
+    for line in imported.guessed:
         print_line(f"guess: {line}")
-    for line in result.untold:
+    for line in imported.untold:
         print_line(f"not known: {line}")
     print_line(f"next: simgap inspect {options.out}")
     return CommandResult(
         {
             "description": options.out,
-            "checks": result.checks,
-            "guesses": result.guessed,
-            "untold": result.untold,
+            "checks": imported.checks,
+            "guesses": imported.guessed,
+            "untold": imported.untold,
         }
     )

@@ -130,12 +130,12 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
     )
     simulated = simulate(**{**collect_options(options, SimulationSpec), **spec_args})
     simulated.write(options.out)
-    first = simulated.recording.runs[0]
+    first_run = simulated.recording.runs[0]
     truth = options.out.with_suffix(".truth.toml")
     runs = f"{options.runs} run{'s' if options.runs > 1 else ''}"
     print_line(
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
-        f"{', '.join(first.channels)}"
+        f"{', '.join(first_run.channels)}"
     )
     print_line(f"{truth}: its true parameters")
     return CommandResult(
@@ -147,7 +147,7 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
             "runs": options.runs,
             "seconds": options.seconds,
             "rate": options.rate,
-            "channels": list(first.channels),
-            "inputs": list(first.inputs),
+            "channels": list(first_run.channels),
+            "inputs": list(first_run.inputs),
         }
     )

@@ -458,24 +458,24 @@ def _generate_units(
         signals: signals with the same specified unit.
         recording: the recording.
     """
-    first = signals[0]
+    first_signal = signals[0]
     names = [signal.name for signal in signals]
     text = join_first_names(names, MAX_NAMED)
-    for unit, gain in UNITS.get(first.si, {}).items():
-        scale = first.scale * gain / first.gain
+    for unit, gain in UNITS.get(first_signal.si, {}).items():
+        scale = first_signal.scale * gain / first_signal.gain
         if not math.isclose(scale, 1.0, rel_tol=SAME_UNIT_TOLERANCE):
             unit_words, stated_words = (
-                UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit)
+                UNITS_IN_WORDS.get(one, one) for one in (unit, first_signal.specified_unit)
             )
             yield ConventionHypothesis(
                 f"the numbers of {text} look like {unit_words}, stated as {stated_words}",
                 {name: SignalChange(name, scale) for name in names},
                 unit=unit,
             )
-    if first.si != "rad" or not _are_whole(signals, recording):
+    if first_signal.si != "rad" or not _are_whole(signals, recording):
         return
     for ticks in TICKS_PER_TURN:
-        scale = 2.0 * math.pi / ticks / first.gain
+        scale = 2.0 * math.pi / ticks / first_signal.gain
         for zero in (0.0, math.pi):
             yield ConventionHypothesis(
                 f"the numbers of {text} look like ticks, {ticks:g} a turn",

@@ -36,28 +36,30 @@ def correct_description(
         declared: Simulator of the robot, with the units of its signals.
         differences: Differences to correct, in this order.
     """
-    result = copy.deepcopy(dict(meta))
+    corrected = copy.deepcopy(dict(meta))
     units = {
         "channels": {c.name: c.unit for c in declared.channels},
         "inputs": {c.name: c.unit for c in declared.inputs},
     }
     for kind in KINDS:
-        result[kind] = dotted(result.get(kind, {}), units[kind])
+        corrected[kind] = dotted(corrected.get(kind, {}), units[kind])
     for difference in differences:
         hypothesis = difference.hypothesis
         for kind in KINDS:
-            before = copy.deepcopy(result[kind])
+            before = copy.deepcopy(corrected[kind])
             for name, change in hypothesis.changes.items():
                 if name in before:
                     table = _move_to_column(before, name, change)
-                    result[kind][name] = _change_scale(table, units[kind][name], change, hypothesis)
+                    corrected[kind][name] = _change_scale(
+                        table, units[kind][name], change, hypothesis
+                    )
         if hypothesis.late:
-            time_table = dict(result.get("time", {}))
+            time_table = dict(corrected.get("time", {}))
             time_table["offset"] = _round_value(
                 float(time_table.get("offset", 0.0)) - hypothesis.late
             )
-            result["time"] = time_table
-    return result
+            corrected["time"] = time_table
+    return corrected
 
 
 def _move_to_column(

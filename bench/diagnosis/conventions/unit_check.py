@@ -234,23 +234,27 @@ class Hypothesis:
         `file` is the name of the description file. `factors` has, by signal name, the factor by
         which the recorded values have to be multiplied; it is shown for a wrong unit.
         """
-        first, unit = self.signals[0], self.units[0]
+        first_signal, unit = self.signals[0], self.units[0]
         names = join_first_names([signal.signal_text for signal in self.signals], MAX_NAMED_SIGNALS)
-        table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
-        scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
-        if unit == first.specified_unit and self.scale == -1.0:
+        table = (
+            f"[{first_signal.kind}.{first_signal.name}]"
+            if len(self.signals) == 1
+            else "the tables of each"
+        )
+        scale = f"set scale = {self._get_corrected_scale(first_signal):.9g} in {table} of {file}"
+        if unit == first_signal.specified_unit and self.scale == -1.0:
             return f"The sign of {names} looks reversed: {scale}"
-        if unit == first.specified_unit:
+        if unit == first_signal.specified_unit:
             return f"The recorded numbers of {names} look converted twice: {scale}"
         sign_text = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
         unit_words, stated_words = (
-            UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit)
+            UNITS_IN_WORDS.get(one, one) for one in (unit, first_signal.specified_unit)
         )
         unit_keys = dict.fromkeys(f'unit = "{one}"' for one in self.units)
         return (
             f"The recorded numbers of {names} look like {unit_words}, stated as {stated_words} "
-            f"(factor {abs(factors[first.name]):.4g}): set {' and '.join(unit_keys)} in {table} of "
-            f"{file}{sign_text}"
+            f"(factor {abs(factors[first_signal.name]):.4g}): set {' and '.join(unit_keys)} "
+            f"in {table} of {file}{sign_text}"
         )
 
 

@@ -188,8 +188,8 @@ class _Rows:
 
     def causes(self) -> Iterator[SheetRow]:
         """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
-        for name, numbers in self.extended.effects.items():
-            local_coefficients = list(self.subject.localise_effect(name, numbers))
+        for name, coefficients in self.extended.effects.items():
+            local_coefficients = list(self.subject.localise_effect(name, coefficients))
             for effect, coefficient, fitted_value in local_coefficients:
                 if fitted_value.value == 0:
                     # A coefficient of zero means that the effect is absent; its detection limit is
@@ -208,7 +208,9 @@ class _Rows:
                 place_suffix = (
                     "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
                 )
-                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place_suffix}"
+                parameter = (
+                    name if len(coefficients) == 1 else f"{name}.{coefficient}{place_suffix}"
+                )
                 yield self._add_prediction_interval(row, effect, parameter)
 
     def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
@@ -569,17 +571,17 @@ def format_evidence(row: SheetRow, is_short: bool = False) -> str:
         )
     is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
     unjudged_text = "not tested" if is_short else "the search ended before it was tested"
-    parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
+    phrases = [format_p_value(row.p_value) if is_judged else unjudged_text]
     if row.share is not None:
         closed_share = format_percent(row.share)
-        parts.append(
+        phrases.append(
             f"{closed_share} held out"
             if is_short
             else f"alone it closes {closed_share} of the held-out gap"
         )
     if row.alternatives:
-        parts.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
-    return "; ".join(parts)
+        phrases.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
+    return "; ".join(phrases)
 
 
 def format_detection_limit(row: SheetRow) -> str:

@@ -197,7 +197,7 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
         top: height of the top of the table, as a share of the page.
     """
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
-    rows = [
+    table_cells = [
         (
             title(row, content.is_driven),
             sanitise(format_name(row), 60),
@@ -209,10 +209,10 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
         if row.number is not None
     ]
     is_cause = [row.state == "found" for row in content.rows if row.number is not None]
-    size, columns = _choose_table_layout([heads, *rows])
+    size, columns = _choose_table_layout([heads, *table_cells])
     for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top", fontsize=size)
-    for cells, is_found in zip(rows, is_cause, strict=True):
+    for cells, is_found in zip(table_cells, is_cause, strict=True):
         # Lines of the table are a quarter wider apart than those of a text.
         top -= _LINE * 1.25
         for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
@@ -255,7 +255,7 @@ def _draw_effects_not_shown(
     Returns:
         Height of the top of the table, as a share of the page.
     """
-    rows = []
+    lines_by_effect = []
     names = [format_short_name(row) for row in content.rows if row.number is None]
     name_length = min(max(map(len, names), default=0), _NAME_LETTERS)
     # A character of the monospaced font is 0.602 of its size wide.
@@ -268,14 +268,16 @@ def _draw_effects_not_shown(
                 f" (confounded with {confounding})" if confounding and row.detection_limit else ""
             )
             lines = textwrap.wrap(limit_text, letters)
-            rows.append((format_short_name(row), lines))
+            lines_by_effect.append((format_short_name(row), lines))
     line = _SMALL * 1.2 * size / _SMALL_SIZE
-    heights = [len(lines) for _, lines in rows]
-    split_row = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
+    heights = [len(lines) for _, lines in lines_by_effect]
+    split_row = next(
+        (i for i in range(len(lines_by_effect) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0
+    )
     table_height = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
     # A long table must not overlap the foot of the page.
     table_top = max(table_top, _FOOT_HEIGHT + table_height)
-    for column, part in enumerate((rows[:split_row], rows[split_row:])):
+    for column, part in enumerate((lines_by_effect[:split_row], lines_by_effect[split_row:])):
         x, y = _MARGIN + _HALF_WIDTH * column, table_top
         for name, lines in part:
             figure.text(

@@ -112,32 +112,34 @@ class SheetSubject:
                 yield effect
 
     def localise_effect(
-        self, name: str, numbers: Mapping[str, FittedValue]
+        self, name: str, coefficients: Mapping[str, FittedValue]
     ) -> Iterator[tuple[str, str, FittedValue]]:
         """Yield the coefficients that a fitted effect has here.
 
         Args:
             name: Name of the effect, possibly of a family.
-            numbers: Fitted coefficients.
+            coefficients: Fitted coefficients.
 
         Yields:
             Name of the effect at this place, name of the coefficient, and its value.
         """
-        base, _, place = name.partition("@")
+        effect_name, _, place = name.partition("@")
         if place != ALL_PLACES:
             if self.acts_here(library.find_effect(name, self.kind.system)):
-                yield from ((name, key, number) for key, number in numbers.items())
+                yield from ((name, key, fitted_value) for key, fitted_value in coefficients.items())
             return
         local_places = [
-            local_place.place for local_place in self.list_effects() if local_place.of == base
+            local_place.place
+            for local_place in self.list_effects()
+            if local_place.of == effect_name
         ]
-        for key, number in numbers.items():
+        for key, fitted_value in coefficients.items():
             coefficient, _, named_place = key.partition("@")
             # A family with one coefficient for all places, such as a delay, has the same value
             # here.
             for local_place in [named_place] if named_place else local_places:
                 if local_place in self.places:
-                    yield f"{base}@{local_place}", coefficient, number
+                    yield f"{effect_name}@{local_place}", coefficient, fitted_value
 
     def get_model_file_value(self, effect: str) -> ModelFileValue | None:
         """Return the value in the model file that an effect changes; None if there is none."""

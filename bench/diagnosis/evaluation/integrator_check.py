@@ -184,25 +184,27 @@ class _ReferenceMotions:
         A motion has converged if halving the time step hardly changes it. RK4 is tried first; for
         stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
         """
-        for parts in (1, 2, 5):
+        for division in (1, 2, 5):
             coarse, refined = (
                 self.of(
-                    model_settings._replace(timestep=model_settings.timestep / n, integrator="RK4")
+                    model_settings._replace(
+                        timestep=model_settings.timestep / divisor, integrator="RK4"
+                    )
                 )
-                for n in (parts, 2 * parts)
+                for divisor in (division, 2 * division)
             )
             if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
                 return refined
-        for parts in (2, 5):
+        for division in (2, 5):
             extrapolated = []
-            for n in (parts, 2 * parts):
+            for divisor in (division, 2 * division):
                 coarse, refined = (
                     self.of(
                         model_settings._replace(
                             timestep=model_settings.timestep / k, integrator=STIFF_INTEGRATOR
                         )
                     )
-                    for k in (n, 2 * n)
+                    for k in (divisor, 2 * divisor)
                 )
                 extrapolated.append(2.0 * refined - coarse)  # (1)
             if self.compute_rms_difference(*extrapolated) < CONVERGENCE_TOLERANCE:

@@ -90,21 +90,21 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
     phi = noise.phi.reshape(-1, *extra)
     sigma = noise.sigma.reshape(-1, *extra)
     # A Jacobian is large, and multiplication is faster than division.
-    result: Array = values * (1.0 / sigma)
+    whitened: Array = values * (1.0 / sigma)
 
     # A second pass over all samples, which white noise does not need.
     if phi.any():
         pairs = _has_predecessor(observed_mask)
         has_predecessor = pairs.reshape(*pairs.shape, *extra)
         # Values of missing samples are arbitrary, even NaN, and must not affect the next sample.
-        previous_samples = np.where(has_predecessor, result[:, :-1], 0.0)
-        samples = result[:, 1:]
+        previous_samples = np.where(has_predecessor, whitened[:, :-1], 0.0)
+        samples = whitened[:, 1:]
         innovations = (samples - phi * previous_samples) / np.sqrt(1.0 - phi * phi)
-        result[:, 1:] = np.where(has_predecessor, innovations, samples)
+        whitened[:, 1:] = np.where(has_predecessor, innovations, samples)
 
     if not observed_mask.all():
-        result = np.where(observed_mask.reshape(*observed_mask.shape, *extra), result, 0.0)
-    return result
+        whitened = np.where(observed_mask.reshape(*observed_mask.shape, *extra), whitened, 0.0)
+    return whitened
 
 
 def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:

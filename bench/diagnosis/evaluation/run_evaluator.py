@@ -390,7 +390,7 @@ class RunEvaluator:
             run.
         """
         if self.has_linearisation:
-            result = np.empty((len(theta), *self.observed.shape[1:]))
+            simulated = np.empty((len(theta), *self.observed.shape[1:]))
             elements = zip(theta, runs.tolist(), states, strict=True)
             keys = [
                 b"".join(
@@ -402,14 +402,14 @@ class RunEvaluator:
             new_results = self._simulate_batch(
                 theta[missing_indices], runs[missing_indices], states[missing_indices], share
             )
-            self._cache.fill(keys, missing_indices, new_results, result)
+            self._cache.fill(keys, missing_indices, new_results, simulated)
         else:
             # Results are not cached here: the slowest element of a call sets the steps of all
             # elements, so an element differs in its last digits from call to call.
-            result = self._simulate_batch(theta, runs, states, share)
+            simulated = self._simulate_batch(theta, runs, states, share)
         if self.discretisation_correction is not None:
-            result += self.discretisation_correction[runs]
-        return result
+            simulated += self.discretisation_correction[runs]
+        return simulated
 
     def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
         """Simulate B batch elements in several engine calls, without cache and step correction.
@@ -427,9 +427,9 @@ class RunEvaluator:
         """
         self.simulation_count += len(theta)
         _, length, channels = self.observed.shape
-        result = np.empty((len(theta), length, channels))
+        simulated_runs = np.empty((len(theta), length, channels))
         if not len(theta):
-            return result
+            return simulated_runs
 
         # The slowest element of a call sets its steps, so elements that need many steps are
         # simulated separately.
@@ -439,19 +439,19 @@ class RunEvaluator:
             max_batch_size = min(
                 max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
             )
-        parts, calls = [], []
+        element_indices, calls = [], []
         for group in np.unique(groups):
             elements = np.flatnonzero(groups == group)
             for part in np.array_split(elements, -(-elements.size // max_batch_size)):
-                parts.append(part)
+                element_indices.append(part)
                 calls.append((bool(group >= 2), theta[part], runs[part], states[part], share))
         for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
             if len(calls) == 1 and sample_count == length:
                 return simulated
-            result[parts[number], :sample_count] = simulated
-            result[parts[number], sample_count:] = np.nan
-        return result
+            simulated_runs[element_indices[number], :sample_count] = simulated
+            simulated_runs[element_indices[number], sample_count:] = np.nan
+        return simulated_runs
 
     def with_runs(self, runs: Sequence[Run]) -> RunEvaluator:
         """Return a `RunEvaluator` of other runs that were cut or thinned from these runs.
@@ -594,7 +594,7 @@ class RunEvaluator:
         """
         self.simulation_count += len(theta)
         length = max(scenario.times.size for scenario in scenarios)
-        result = np.full((len(theta), length, len(self.channels)), np.nan)
+        simulated = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
         groups = self.group_compatible(theta)
@@ -607,8 +607,8 @@ class RunEvaluator:
                 observations = simulator.simulate_batch(
                     np.delete(theta[part], freed_indices, 1), part_scenarios, initial
                 )
-                result[part, : observations.shape[1]] = observations
-        return result
+                simulated[part, : observations.shape[1]] = observations
+        return simulated
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
         """Return a scenario whose freed constants, those that a fit estimates, have fitted values.

@@ -355,7 +355,7 @@ class RigModel:
             name: self._limit_command(name, np.full(times.size, self.median_commands[name]))
             for name in self.recorded_scenario.inputs
         }
-        states = self.initial_state.copy()
+        initial_state = self.initial_state.copy()
         limited_inputs = []
         for number, name in enumerate(plan.driven_inputs):
             signal = plan.size * _compute_command(
@@ -367,11 +367,11 @@ class RigModel:
             inputs[name] = self._limit_command(name, command)
             limited_inputs += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
-            states[self.evaluator.state_names.index(name)] = value
+            initial_state[self.evaluator.state_names.index(name)] = value
         constants = {**self.recorded_scenario.constants, **dict(plan.constants)}
         scenario = replace(self.recorded_scenario, times=times, inputs=inputs, constants=constants)
         return CandidateRun(
-            plan, self._describe_plan(plan, inputs, limited_inputs), scenario, states
+            plan, self._describe_plan(plan, inputs, limited_inputs), scenario, initial_state
         )
 
     def _limit_command(self, name: str, values: Array) -> Array:

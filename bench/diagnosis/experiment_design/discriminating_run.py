@@ -279,16 +279,16 @@ def _change_initial_states(
             # A body cannot be released below the ground.
             if above_ground and factor < 0:
                 continue
-            states = first.states.copy()
-            value = float(states[index])
+            initial_state = first.states.copy()
+            value = float(initial_state[index])
             is_nonzero = abs(value) > REST_STATE
             value = factor * value if is_nonzero else factor
             if above_ground:
                 value = max(value, MIN_DROP_HEIGHT)
             value = float(_clip(value, limits.states.get(name)))
-            states[index] = value
+            initial_state[index] = value
             description = f"Start with {name} = {value:.3g} {unit}{first.says}"
-            yield _Run(description, {name: value}, first.scenario, states)
+            yield _Run(description, {name: value}, first.scenario, initial_state)
 
 
 def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:

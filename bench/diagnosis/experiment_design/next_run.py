@@ -177,7 +177,7 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     """
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
-        first = next(
+        best_estimated = next(
             (
                 k
                 for k, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
@@ -185,9 +185,11 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
             ),
             None,
         )
-        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_total_value):
+        if best_estimated is None or (
+            ranked[0].is_exact and ranked[0].value >= ranker.max_total_value
+        ):
             break
-        ranked[first] = ranker.evaluate_exactly(ranked[first])
+        ranked[best_estimated] = ranker.evaluate_exactly(ranked[best_estimated])
         ranked.sort(key=get_sort_key)
     # Runs that are evaluated exactly come before those that are only linearised.
     return sorted(ranked, key=lambda run_value: (not run_value.is_exact, *get_sort_key(run_value)))

@@ -36,7 +36,7 @@ def compute_effect_responses(
         Changes of the runs (K, R, T, C); NaN where they are not finite.
     """
     runs, length, channels = evaluator.observed.shape
-    result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
+    responses: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
     cached_responses = evaluator.cached_responses
     keys = [(name, c.tobytes()) for name, c in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
@@ -46,17 +46,17 @@ def compute_effect_responses(
     ):
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
-            result[missing_indices, run, : values.shape[1]] = values
+            responses[missing_indices, run, : values.shape[1]] = values
         evaluator.simulation_count += simulation_count
-    result[~is_finite_response(result)] = np.nan
+    responses[~is_finite_response(responses)] = np.nan
     for i, key in enumerate(keys):
         if key in cached_responses:
-            result[i] = cached_responses[key]
+            responses[i] = cached_responses[key]
         elif is_series_effect(evaluator.available_effects[key[0]]):
             # Responses without a linearisation are simulated, and are similar in all models near
             # the data.
-            cached_responses[key] = result[i].copy()
-    return result
+            cached_responses[key] = responses[i].copy()
+    return responses
 
 
 def _compute_responses(

@@ -65,18 +65,18 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
             that are far behind.
             Otherwise there is only one round.
     """
-    first = 0
-    while first < iterations or not first:
+    begin = 0
+    while begin < iterations or not begin:
         end = iterations
         if is_racing:
             end = min(
                 iterations,
-                first + ITERATIONS_PER_ROUND if first else MIN_ITERATIONS_BEFORE_ELIMINATION,
+                begin + ITERATIONS_PER_ROUND if begin else MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
-        yield RacingRound(first, end, max(iterations, 1))
+        yield RacingRound(begin, end, max(iterations, 1))
         if not iterations:
             return
-        first = end
+        begin = end
 
 
 def eliminate_losing_fits(fit_states: Sequence[FitState], lowest_cost: float) -> None:

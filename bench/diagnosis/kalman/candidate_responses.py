@@ -540,18 +540,18 @@ class FollowedRuns:
         """
         runs = self.runs
         samples = runs.residuals.shape[1]
-        result = np.zeros((*runs.residuals.shape, s.shape[2]))
+        responses = np.zeros((*runs.residuals.shape, s.shape[2]))
         with np.errstate(all="ignore"):
             for i in range(samples):
-                result[:, i] = runs.readings[:, i] @ s
+                responses[:, i] = runs.readings[:, i] @ s
                 if columns is not None:
-                    result[:, i] += columns.readings[:, i]
+                    responses[:, i] += columns.readings[:, i]
                 if i + 1 < samples:
                     s = runs.states[:, i] @ s
                     if columns is not None:
                         s += runs.inputs[:, i] @ columns.pushed[:, i]
-        result[~(np.abs(result) < MAX_MAGNITUDE)] = 0.0
-        return result
+        responses[~(np.abs(responses) < MAX_MAGNITUDE)] = 0.0
+        return responses
 
     @property
     def has_expected_innovations(self) -> bool:
@@ -614,27 +614,30 @@ class FollowedRuns:
             inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
         """
         coloured, _ = add_noise_states(self.runs, self.noise)
-        number, samples, channels, count = readings.shape
+        run_count, samples, channels, count = readings.shape
         size = self.runs.prior.size
-        result = np.zeros((number, samples, channels, count), dtype=np.float32)
+        responses = np.zeros((run_count, samples, channels, count), dtype=np.float32)
         h, a = coloured.readings.astype(np.float32), coloured.states.astype(np.float32)
         gains = self.filtered.gains.astype(np.float32)
         whiteners = self.filtered.whiteners.astype(np.float32)
         with np.errstate(all="ignore"):
             for first_column in range(0, count, COLUMNS_PER_BATCH):
-                part = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
-                s = np.zeros((number, a.shape[2], part.stop - part.start), dtype=np.float32)
+                batch_columns = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
+                s = np.zeros(
+                    (run_count, a.shape[2], batch_columns.stop - batch_columns.start),
+                    dtype=np.float32,
+                )
                 for i in range(samples):
                     u = h[:, i] @ s
-                    u += readings[:, i, :, part]
-                    np.matmul(whiteners[:, i], u, out=result[:, i, :, part])
+                    u += readings[:, i, :, batch_columns]
+                    np.matmul(whiteners[:, i], u, out=responses[:, i, :, batch_columns])
                     if i + 1 < samples:
                         s -= gains[:, i] @ u
                         s = a[:, i] @ s
-                        added = pushed[:, i, :, part]
+                        added = pushed[:, i, :, batch_columns]
                         s[:, :size] += added if inputs is None else inputs[:, i] @ added
-        result[~np.isfinite(result)] = 0.0
-        return result
+        responses[~np.isfinite(responses)] = 0.0
+        return responses
 
 
 class _NoiseFit(NamedTuple):

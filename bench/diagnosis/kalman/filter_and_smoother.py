@@ -106,16 +106,16 @@ class LinearRuns:
 
         The process noise is fitted on such segments.
         """
-        number, samples, _ = self.residuals.shape
+        run_count, samples, _ = self.residuals.shape
         count = -(-samples // length)
 
         def cut(values: Any) -> Any:
             """Cut an array (R, T or T - 1, ...) into segments; pad the last one with zeros."""
-            padded = np.zeros((number, count * length, *values.shape[2:]), dtype=values.dtype)
+            padded = np.zeros((run_count, count * length, *values.shape[2:]), dtype=values.dtype)
             padded[:, : values.shape[1]] = values
-            parts = padded.reshape(number * count, length, *values.shape[2:])
+            segment_values = padded.reshape(run_count * count, length, *values.shape[2:])
             # A segment has one interval fewer than samples.
-            return parts if values.shape[1] == samples else parts[:, :-1]
+            return segment_values if values.shape[1] == samples else segment_values[:, :-1]
 
         return self._map_arrays(cut)
 
@@ -222,10 +222,10 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     white[coloured_channels] *= AR_FLOOR
     (run_count, samples, channels), size = runs.residuals.shape, runs.prior.size
     noise_count = coloured_channels.size
-    states = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
-    states[:, :, :size, :size] = runs.states
+    transitions = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
+    transitions[:, :, :size, :size] = runs.states
     noise_states = size + np.arange(noise_count)
-    states[:, :, noise_states, noise_states] = noise.phi[coloured_channels]
+    transitions[:, :, noise_states, noise_states] = noise.phi[coloured_channels]
     zeros = np.zeros((run_count, samples - 1, noise_count))
     defects = np.concatenate([runs.defects, zeros], axis=2)
     jumps = np.concatenate([runs.jumps, zeros], axis=2)
@@ -246,7 +246,7 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     prior = np.concatenate([runs.prior, noise.sigma[coloured_channels]])
     runs_with_noise = replace(
         runs,
-        states=states,
+        states=transitions,
         defects=defects,
         forces=forces,
         readings=readings,

@@ -114,9 +114,9 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     values = np.stack([v for v, _ in readings])
     # Use units of the noise, so that both channels have variance one.
     scale = np.stack([n for _, n in readings])[:, None]
-    first = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
+    first_readings = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
     residuals = values.copy()
-    residuals[:, :, 0] -= first[:, None]
+    residuals[:, :, 0] -= first_readings[:, None]
     recorded = np.isfinite(residuals)
     residuals = np.where(recorded, residuals, 0.0) / scale
     reading = np.zeros((count, samples, 2, 3))
@@ -151,7 +151,7 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     best = runs.subset(likeliest)
     smoothed = smooth_runs(best, filtered.subset(likeliest), force[likeliest])
     states = smoothed.states
-    states[:, :, 0] += first[:, None]
+    states[:, :, 0] += first_readings[:, None]
     return list(states)
 
 

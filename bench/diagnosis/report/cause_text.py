@@ -461,7 +461,7 @@ LONGEST_PLACE = 64
 
 def shorten_effect_name(effect: str) -> str:
     """Format an effect for a list: without its article, and without the kind of its place."""
-    base, place = split_effect_name(effect)
+    effect_name, place = split_effect_name(effect)
     if not place:
         return format_effect_name(effect)
     place_text = (
@@ -469,4 +469,4 @@ def shorten_effect_name(effect: str) -> str:
         if place == ALL_PLACES
         else f" at {sanitise(place, LONGEST_PLACE)}"
     )
-    return format_effect_name(base) + place_text
+    return format_effect_name(effect_name) + place_text

@@ -578,14 +578,14 @@ def _draw_signal(
     times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.
     signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
-    rows = decimate(signals[0])
-    t = times[rows]
-    measured, before, after = (signal[rows] for signal in signals)
+    shown_samples = decimate(signals[0])
+    t = times[shown_samples]
+    measured, before, after = (signal[shown_samples] for signal in signals)
 
-    size = 3.6 if rows.size < 250 else 2.6  # points: smaller dots for many samples
+    size = 3.6 if shown_samples.size < 250 else 2.6  # points: smaller dots for many samples
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
     # Thousands of vector outlines would dominate the file size.
-    marks["rasterized"] = rows.size > MAX_OUTLINED_DOTS
+    marks["rasterized"] = shown_samples.size > MAX_OUTLINED_DOTS
     signal_axis.plot(t, measured, "o", label="measured", zorder=4, **marks)
     base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
     signal_axis.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)

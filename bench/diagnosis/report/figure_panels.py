@@ -95,7 +95,7 @@ def has_extended_model(report: DiagnosisReportData) -> bool:
 
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     """Select the runs, channels and phases with the largest gaps, in their original order."""
-    result: list[GapLocation] = []
+    selected: list[GapLocation] = []
     # A part without samples has no RMS.
     measured_locations = [p for p in places if np.isfinite(p.before) and p.samples > 0]
     for kind, max_count in (
@@ -106,8 +106,8 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
         locations_of_kind = [p for p in measured_locations if p.kind == kind]
         worst_locations = sorted(locations_of_kind, key=lambda p: -p.before)[:max_count]
         # The original order is kept, because readers look for run 3 after run 2.
-        result += [p for p in locations_of_kind if p in worst_locations]
-    return result
+        selected += [p for p in locations_of_kind if p in worst_locations]
+    return selected
 
 
 def draw_gap_location_panel(
@@ -120,13 +120,13 @@ def draw_gap_location_panel(
         places: Gap locations to draw.
         report: Report data.
     """
-    rows = _place_rows(axis, places)
+    row_positions = _place_rows(axis, places)
     # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
     noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
-    floor = np.ones(len(rows))
+    floor = np.ones(len(row_positions))
     axis.errorbar(
         floor,
-        rows,
+        row_positions,
         xerr=noise,
         fmt="none",
         ecolor=NULL_LEVEL_GREY,
@@ -137,16 +137,16 @@ def draw_gap_location_panel(
     before_values = [p.before for p in places]
     after_values = [p.after for p in places]
     if has_extended_model(report):
-        axis.hlines(rows, after_values, before_values, color=CONNECTOR_GREY, linewidth=0.9)
-        axis.plot(after_values, rows, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
+        axis.hlines(row_positions, after_values, before_values, color=CONNECTOR_GREY, linewidth=0.9)
+        axis.plot(after_values, row_positions, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
     name = "before" if has_extended_model(report) else "simulated (tuned)"
-    axis.plot(before_values, rows, linestyle="", label=name, **BASE_MODEL_MARKER)
+    axis.plot(before_values, row_positions, linestyle="", label=name, **BASE_MODEL_MARKER)
     shown_values = [*before_values, *after_values] if has_extended_model(report) else before_values
     # The noise floor must be visible, whatever the sizes.
     _use_log_axis_if_needed(axis, [*shown_values, 1.0])
-    axis.set_yticks(rows, place_names(places), linespacing=1.05)
+    axis.set_yticks(row_positions, place_names(places), linespacing=1.05)
     # Rows are one apart, the first at the top; leave space for the last mark.
-    axis.set_ylim(rows[-1] + 0.7, -0.1)
+    axis.set_ylim(row_positions[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
 
 
@@ -163,17 +163,17 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
         axis: axes to draw on.
         places: places of the gap, sorted by kind.
     """
-    rows: list[float] = []
+    row_positions: list[float] = []
     for i, place in enumerate(places):
         is_new_kind = i == 0 or places[i - 1].kind != place.kind
-        if not rows:
-            rows.append(_FIRST)
+        if not row_positions:
+            row_positions.append(_FIRST)
         else:
-            rows.append(rows[-1] + (_NEXT_KIND if is_new_kind else _NEXT))
+            row_positions.append(row_positions[-1] + (_NEXT_KIND if is_new_kind else _NEXT))
         if is_new_kind:
             axis.text(
                 -0.035,
-                rows[-1] - 0.85,
+                row_positions[-1] - 0.85,
                 f"by {place.kind} (samples)",
                 transform=axis.get_yaxis_transform(),
                 ha="right",
@@ -181,7 +181,7 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
                 fontsize=8.5,
                 weight="bold",
             )
-    return rows
+    return row_positions
 
 
 def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:

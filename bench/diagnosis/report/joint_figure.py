@@ -225,10 +225,10 @@ def _draw_motion(
         a[view.row, : len(times), row.motion_channel]
         for a in (split.observed, split.before, split.after)
     ]
-    rows = decimate(signals[0])
-    measured, before, after = (signal[rows] for signal in signals)
-    t = times[rows]
-    size = 4.0 if rows.size < 250 else 3.4  # points: smaller dots for many samples
+    shown_samples = decimate(signals[0])
+    measured, before, after = (signal[shown_samples] for signal in signals)
+    t = times[shown_samples]
+    size = 4.0 if shown_samples.size < 250 else 3.4  # points: smaller dots for many samples
     panel.plot(
         t,
         measured,
@@ -238,7 +238,7 @@ def _draw_motion(
         markeredgewidth=0,
         label="measured",
         zorder=1,
-        rasterized=rows.size > MAX_OUTLINED_DOTS,
+        rasterized=shown_samples.size > MAX_OUTLINED_DOTS,
     )
     base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
     panel.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)

@@ -205,7 +205,7 @@ def iterate_undetermined_numbers(report: DiagnosisReportData) -> Iterator[str]:
     at_bounds = [(name, fitted) for name, fitted in open_numbers if fitted.at_bound is not None]
     without_interval = [name for name, fitted in open_numbers if fitted.at_bound is None]
     if at_bounds:
-        parts = [
+        phrases = [
             f"{name}: {append_unit(format_number(fitted.value), fitted.unit)} is the "
             f"{END[fitted.at_bound or 'high']} bound of its range"
             for name, fitted in at_bounds
@@ -213,9 +213,9 @@ def iterate_undetermined_numbers(report: DiagnosisReportData) -> Iterator[str]:
         has_time_at_bound = any(fitted.unit == "s" for _, fitted in at_bounds)
         remedy = "; for a time, record longer runs" if has_time_at_bound else ""
         yield (
-            f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
-            "suggest a value beyond it, or another cause acts in a similar way. Check units and "
-            f"constants of the recording{remedy}."
+            f"{'; '.join(phrases)}. A value at a bound is not a result and has no interval: the "
+            "data suggest a value beyond it, or another cause acts in a similar way. Check units "
+            f"and constants of the recording{remedy}."
         )
     if without_interval:
         yield (
@@ -309,17 +309,19 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
 
 def _format_unit_errors(errors: Sequence[RecordingFault]) -> Iterator[str]:
     """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do."""
-    first, *further_faults = errors
-    if first.error_after is not None:
+    likeliest_fault, *further_faults = errors
+    if likeliest_fault.error_after is not None:
         before = (
-            f"from {format_number(first.error_before)} " if first.error_before is not None else ""
+            f"from {format_number(likeliest_fault.error_before)} "
+            if likeliest_fault.error_before is not None
+            else ""
         )
         yield (
             "With this correction the error of the tuned simulation on the fitted runs falls "
-            f"{before}to {format_number(first.error_after)} times the noise."
+            f"{before}to {format_number(likeliest_fault.error_after)} times the noise."
         )
-    for text in (*first.alternatives, *(fault.says for fault in further_faults)):
-        yield format_sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")
+    for text in (*likeliest_fault.alternatives, *(fault.says for fault in further_faults)):
+        yield format_sentence(f"{'or' if text in likeliest_fault.alternatives else 'also'}: {text}")
     yield "No causes were searched, since each would only imitate this. Correct it and run again."
 
 
@@ -487,17 +489,17 @@ def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     """
     sizes = []
     for c, channel in enumerate(report.channels):
-        rows = []
+        residual_rows = []
         for split in list_data_splits(report):
-            rows += [*((split.observed - split.before)[:, :, c] / channel.sigma)]
-        residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
+            residual_rows += [*((split.observed - split.before)[:, :, c] / channel.sigma)]
+        residuals = np.concatenate([row[np.isfinite(row)] for row in residual_rows])
         # A single sample has no neighbour, and its square is not a variance.
         if residuals.size < 2:
             sizes.append(np.nan)
             continue
         square = float(np.mean(residuals**2))
         # Products use neighbours within a run; a product with a missing sample is NaN.
-        products = np.concatenate([row[1:] * row[:-1] for row in rows])
+        products = np.concatenate([row[1:] * row[:-1] for row in residual_rows])
         phi = 0.0
         if np.isfinite(products).any() and square:
             phi = float(np.clip(np.nanmean(products) / square, 0.0, MAX_PHI))  # (1)

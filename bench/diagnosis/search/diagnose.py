@@ -332,7 +332,7 @@ def _validate_on_held_out(
     # Parts of the model are included, because an effect that does not help on held-out runs is
     # dropped.
     names = set(model.effects)
-    parts = [m for m in models if set(m.effects) < names]
+    submodels = [m for m in models if set(m.effects) < names]
     singles = [m for m in models if len(m.effects) == 1]
     singles.sort(key=lambda m: -m.penalised_log_likelihood)
     competing_models = select_decisive(search, model, list_competing_models(search, model))
@@ -340,7 +340,7 @@ def _validate_on_held_out(
     # All models are evaluated together, so that initial states start from those of the nearest
     # model.
     validation.evaluate_models(
-        [search.base_model, model, *competing_models, *parts, *singles[:MAX_VALIDATED_SINGLES]]
+        [search.base_model, model, *competing_models, *submodels, *singles[:MAX_VALIDATED_SINGLES]]
     )
     return validation
 

@@ -226,7 +226,7 @@ def generate_neighbouring_end_stops(
         c: (k,) coefficients of the given end stop.
     """
     if evaluator.available_effects[name].coefficients[0].of == "stop":
-        part = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
+        bound_share = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
         # Simulating a robot costs a hundred times as much, so fewer stops are tried.
         times, depths = (
             ((1.0,), END_STOP_DEPTH_SHARES[::2])
@@ -234,7 +234,7 @@ def generate_neighbouring_end_stops(
             else (END_STOP_STIFFNESS_FACTORS, END_STOP_DEPTH_SHARES)
         )
         yield from generate_end_stops(
-            evaluator, name, np.sign(c[0]), [part * t for t in times], depths
+            evaluator, name, np.sign(c[0]), [bound_share * t for t in times], depths
         )
 
 

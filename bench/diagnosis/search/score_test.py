@@ -101,17 +101,17 @@ def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
     groups_by_signs: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
         groups_by_signs.setdefault(group.positive, []).append(i)
-    result = []
+    batches = []
     for positive, group_indices in groups_by_signs.items():
         columns = [members[i].column_indices for i in group_indices]
-        result.append(
+        batches.append(
             GroupBatch(
                 np.array(group_indices, dtype=np.intp),
                 np.array(columns, dtype=np.intp),
                 positive,
             )
         )
-    return result
+    return batches
 
 
 def compute_explained_squares(

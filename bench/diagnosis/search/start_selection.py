@@ -251,31 +251,31 @@ def _list_start_sizes(
         name: name of the effect.
     """
     bounds = compute_coefficient_bounds(evaluator, name)
-    first = direction_set.candidates[group.column_indices[0]]
+    first_probe = direction_set.candidates[group.column_indices[0]]
     # A direction for one full size says nothing about other sizes.
-    if first.is_single_size:
-        yield first.coefficients
-        yield from generate_neighbouring_end_stops(evaluator, name, first.coefficients)
+    if first_probe.is_single_size:
+        yield first_probe.coefficients
+        yield from generate_neighbouring_end_stops(evaluator, name, first_probe.coefficients)
         return
     for share in SIZE_SHARES:
-        c = first.coefficients.copy()
+        coefficients = first_probe.coefficients.copy()
         for column, size in zip(group.column_indices, estimate, strict=True):
             index = direction_set.candidates[column].coefficient_index
-            c[index] = share * float(np.clip(size, *bounds[index]))
-        yield c
-        yield from generate_event_times(evaluator, name, c)
+            coefficients[index] = share * float(np.clip(size, *bounds[index]))
+        yield coefficients
+        yield from generate_event_times(evaluator, name, coefficients)
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
-    index = evaluator.coefficient_slices[name].start + first.coefficient_index
+    index = evaluator.coefficient_slices[name].start + first_probe.coefficient_index
     _, upper_bound = evaluator.parameters[index].bounds
     shares = list(RANGE_SHARES)
-    if first.can_be_negative:
+    if first_probe.can_be_negative:
         shares += [-share for share in RANGE_SHARES]
     for share in shares:
-        c = first.coefficients.copy()
-        c[first.coefficient_index] = share * upper_bound
-        yield c
+        coefficients = first_probe.coefficients.copy()
+        coefficients[first_probe.coefficient_index] = share * upper_bound
+        yield coefficients
 
 
 def _select_nearest_start(

@@ -250,7 +250,7 @@ class WhiteningDesign:
             has_neighbours: whether neighbours are needed; otherwise they are zero.
         """
         run, begin, end = segment.run, segment.begin, segment.end
-        rows = len(values)
+        sample_count = len(values)
         # Include one more sample on either side, as a neighbour of the outermost samples.
         first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
         extended_samples = values[:, run, first:last] * self._weights[run, first:last]
@@ -262,7 +262,7 @@ class WhiteningDesign:
             next_samples = extended_samples[:, begin - first + 1 :]
             neighbour_sums[:, : next_samples.shape[1]] += next_samples
         # The shape is written out, because -1 is ambiguous if there are no rows.
-        size = rows, samples.shape[1] * samples.shape[2]
+        size = sample_count, samples.shape[1] * samples.shape[2]
         flat = samples.reshape(size)
         return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, segment.edge_samples])
 
@@ -376,9 +376,9 @@ class WhiteningDesign:
         powers = self._direction_squares.combine(phi)
 
         # Eq. (2) for the initial states of each run, then for the parameters.
-        states = _compute_matrix_root(normal[:, q:, q:])
+        state_root = _compute_matrix_root(normal[:, q:, q:])
         other_products = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
-        by_states = _project_directions(states, other_products)
+        by_states = _project_directions(state_root, other_products)
         by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
         schur_complement = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
         parameter_root = _compute_matrix_root(schur_complement)
@@ -402,7 +402,9 @@ class WhiteningDesign:
             symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
             is_pair_acting = acting[block][:, :, None] & acting[block][:, None, :]
             grams.append(np.where(is_pair_acting, symmetric, 0.0))
-        return _ReducedDesign(states, by_states, parameter_root, by_own_parameters, grams, acting)
+        return _ReducedDesign(
+            state_root, by_states, parameter_root, by_own_parameters, grams, acting
+        )
 
 
 class InnerProducts:

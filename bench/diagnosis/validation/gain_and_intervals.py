@@ -138,7 +138,7 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     """
     q = fit.free_indices.size
     theta = np.tile(fit.theta, (2, len(steps), 1))
-    states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
+    initial_states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
         for j, index in enumerate(fit.free_indices):
@@ -146,8 +146,8 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
             theta[side, j, index] = np.clip(displaced_value, *bounds[j])
         for j, shift in enumerate(shifts[q:]):
-            states[side, q + j, :, j] += shift
-    return theta, states
+            initial_states[side, q + j, :, j] += shift
+    return theta, initial_states
 
 
 def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
@@ -360,19 +360,19 @@ def compute_held_out_gain(
     sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
     total_sums = sums.sum(axis=0)
     before_sum, after_sum, count = total_sums
-    base = float(np.sqrt(before_sum / count))
-    extended = float(np.sqrt(after_sum / count))
+    rms_before = float(np.sqrt(before_sum / count))
+    rms_after = float(np.sqrt(after_sum / count))
     # Whole runs are drawn, because samples of one run depend on each other.
-    parts = len(sums)
-    rows = rng.integers(parts, size=(BOOTSTRAP_RESAMPLES, parts))
-    resampled = sums[rows].sum(axis=1)
+    part_count = len(sums)
+    drawn_parts = rng.integers(part_count, size=(BOOTSTRAP_RESAMPLES, part_count))
+    resampled = sums[drawn_parts].sum(axis=1)
     shares = _compute_closed_share(resampled, floor)
     low = high = np.nan
     # All resamples of a single part are equal, and would look certain.
-    if parts > 1:
+    if part_count > 1:
         low, high = np.quantile(shares, INTERVAL_QUANTILES).tolist()
     gap_closed = float(_compute_closed_share(total_sums[None], floor)[0])
-    return HeldOutGain(base, extended, floor, gap_closed, low, high)
+    return HeldOutGain(rms_before, rms_after, floor, gap_closed, low, high)
 
 
 def _sum_squared_errors(

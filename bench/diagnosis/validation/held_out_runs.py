@@ -363,7 +363,7 @@ class CrossValidation:
         """
         shape = self.evaluator.observed.shape
         simulated = np.full((len(fits), *shape), np.nan)
-        states = np.stack([fit.initial_states for fit in fits])
+        initial_states = np.stack([fit.initial_states for fit in fits])
         free_state_counts = np.zeros(len(fits))
         for number, fold in enumerate(self._run_folds):
             self.evaluator.search_control.begin_stage(
@@ -373,11 +373,11 @@ class CrossValidation:
             predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
             for i, prediction in enumerate(predicted):
                 simulated[i, fold.rows, : prediction.simulated.shape[1]] = prediction.simulated
-                states[i, fold.rows] = prediction.states
+                initial_states[i, fold.rows] = prediction.states
                 free_state_counts[i] += prediction.freedom
         return [
             self._predict_all_runs(*result)
-            for result in zip(simulated, states, free_state_counts.tolist(), strict=True)
+            for result in zip(simulated, initial_states, free_state_counts.tolist(), strict=True)
         ]
 
     def _predict_all_runs(
@@ -402,14 +402,17 @@ class CrossValidation:
     @cached_property
     def _run_folds(self) -> list[_Fold]:
         """The folds; each has run evaluators for its own runs, with the parameters of the whole."""
-        numbers = np.array([run.fold for run in self.evaluator.runs])
+        fold_numbers = np.array([run.fold for run in self.evaluator.runs])
         folds = []
-        for number in sorted(set(numbers.tolist())):
-            rows = np.flatnonzero(numbers == number)
-            fitted_rows = np.flatnonzero(numbers != number)
+        for fold_number in sorted(set(fold_numbers.tolist())):
+            run_indices = np.flatnonzero(fold_numbers == fold_number)
+            fitted_run_indices = np.flatnonzero(fold_numbers != fold_number)
             folds.append(
                 _Fold(
-                    rows, fitted_rows, self._make_evaluator(fitted_rows), self._make_evaluator(rows)
+                    run_indices,
+                    fitted_run_indices,
+                    self._make_evaluator(fitted_run_indices),
+                    self._make_evaluator(run_indices),
                 )
             )
         return folds

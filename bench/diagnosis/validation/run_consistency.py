@@ -153,16 +153,16 @@ def _compute_motion_covariates(
     if name not in evaluator.channels:
         return
     column = evaluator.channels.index(name)
-    rows = []
+    run_covariates = []
     for run_data, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
         times = run_data.scenario.times
         place = simulated[: times.size, column]
         rate = np.gradient(place, times)
         mean_direction = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))
-        rows.append(
+        run_covariates.append(
             (float(place.std()), float(np.sqrt(np.mean(rate**2))), mean_direction, place.mean())
         )
-    amplitude, speed, direction, position = np.array(rows).T
+    amplitude, speed, direction, position = np.array(run_covariates).T
     yield RunCovariate("amplitude", "the amplitude", amplitude)
     yield RunCovariate("speed", "the speed", speed)
     yield RunCovariate("direction", "the direction of motion", direction)

@@ -429,13 +429,13 @@ def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[R
     rng, held_out = make_case_rng(case.name, "noise"), count_held_out_runs(case)
     hidden = {"foreign": case.effects} if case.kind == "foreign" else {"effects": case.effects}
     true_system, runs = setting.make_true_system(**hidden), []
-    for number, scenario in enumerate(setting.scenarios):
+    for run_index, scenario in enumerate(setting.scenarios):
         if case.source == "mujoco":
             observed = simulate_with_mujoco(true_system, scenario, setting.channels)
         else:
-            observed = simulate_with_scipy(true_system, scenario, setting.channels, number)
+            observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
         recorded = setting.noise.add_to(observed, rng)
         channels = dict(zip(setting.channels, recorded.T, strict=True))
-        last = number >= case.runs - held_out
-        runs.append(Run(str(number), scenario.times, channels, scenario.inputs, {}, {}, last))
+        last = run_index >= case.runs - held_out
+        runs.append(Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, last))
     return tuple(runs)

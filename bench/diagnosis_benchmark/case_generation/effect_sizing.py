@@ -86,18 +86,22 @@ class NuisanceFitter:
             setting.noise_sigmas,
             list(kind.states),
         )
-        base = [setting.parameters[p.name] for p in kind.system.parameters]
-        self.theta = np.array([*base, *(p.nominal for p in self.simulator.parameters[len(base) :])])
+        true_values = [setting.parameters[p.name] for p in kind.system.parameters]
+        self.theta = np.array(
+            [*true_values, *(p.nominal for p in self.simulator.parameters[len(true_values) :])]
+        )
         self.starts = np.array(
             [[s.initial[name] for name in self.states] for s in setting.scenarios]
         )
         low, high = np.array([p.bounds for p in self.simulator.parameters]).T
         self.low, self.high = (
             low,
-            np.where(np.arange(low.size) < len(base), high, low + 2 * (high - low)),
+            np.where(np.arange(low.size) < len(true_values), high, low + 2 * (high - low)),
         )
         # Coefficients are scaled by a tenth of their ranges.
-        self.scales = np.where(np.arange(low.size) < len(base), self.theta, 0.1 * (high - low))
+        self.scales = np.where(
+            np.arange(low.size) < len(true_values), self.theta, 0.1 * (high - low)
+        )
 
     def __call__(
         self,
@@ -179,15 +183,15 @@ class NuisanceFitter:
             The residual (N,) in units of the noise, infinite if the simulation diverges, and the
             Jacobian (N, P) of the simulation in units of the scales.
         """
-        runs, states, count = len(starts), len(self.states), theta.size
-        variant_count = 1 + count + states
+        runs, state_count, count = len(starts), len(self.states), theta.size
+        variant_count = 1 + count + state_count
         thetas, initial_states = (
             np.tile(theta, (runs, variant_count, 1)),
             np.tile(starts[:, None], (1, variant_count, 1)),
         )
         for i in range(count):
             thetas[:, 1 + i, i] += FINITE_DIFFERENCE_STEP * self.scales[i]
-        for i in range(states):
+        for i in range(state_count):
             initial_states[:, 1 + count + i, i] += FINITE_DIFFERENCE_STEP
         initial = {name: initial_states[:, :, i].ravel() for i, name in enumerate(self.states)}
         scenarios = [s for s in self.scenarios for _ in range(variant_count)]
@@ -200,10 +204,12 @@ class NuisanceFitter:
         observations = observations.reshape(runs, variant_count, -1)
         residual = (observed / self.sigma).reshape(runs, -1) - observations[:, 0]
         slopes = (observations[:, 1:] - observations[:, :1]) / FINITE_DIFFERENCE_STEP
-        slope = np.zeros((*residual.shape, count + runs * states))
+        slope = np.zeros((*residual.shape, count + runs * state_count))
         for r in range(runs):
             slope[r, :, :count] = slopes[r, :count].T
-            slope[r, :, count + r * states : count + (r + 1) * states] = slopes[r, count:].T
+            slope[r, :, count + r * state_count : count + (r + 1) * state_count] = slopes[
+                r, count:
+            ].T
         is_finite = (np.abs(observations) < DIVERGED_VALUE).all()
         return residual.ravel() if is_finite else np.full(residual.size, np.inf), slope.reshape(
             residual.size, -1
@@ -239,7 +245,7 @@ def make_gap_function(
         RMS residual after refitting, in units of the noise, as a function of the strength.
     """
     fit = NuisanceFitter(setting)
-    last: list[tuple[float, ResidualFit]] = []
+    last_evaluation: list[tuple[float, ResidualFit]] = []
 
     def compute_size(strength: float) -> float:
         """Return the RMS residual, in units of the noise, that a cause of a strength leaves.
@@ -248,14 +254,15 @@ def make_gap_function(
         values of the last strength, scaled to this strength, which saves iterations.
         """
         theta, starts = fit.theta, fit.starts
-        if last:  # fitted parameters and states change about in proportion to the strength
-            last_strength, fitted = last[-1]
+        # Fitted parameters and states change about in proportion to the strength.
+        if last_evaluation:
+            last_strength, fitted = last_evaluation[-1]
             share = strength / last_strength
             theta = np.clip(theta + share * (fitted.theta - theta), fit.low, fit.high)
             starts = starts + share * (fitted.starts - starts)
         fitted = fit(observed(strength), theta, starts)
         if np.isfinite(fitted.rms_residual):
-            last.append((strength, fitted))
+            last_evaluation.append((strength, fitted))
         return fitted.rms_residual
 
     return compute_size
@@ -343,19 +350,23 @@ def _rank_starts(
     if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
         guesses = [np.array([*base_fit.theta, share * peak]) for share in SATURATION_SHARES]
-        result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
+        residuals_and_starts = [
+            (_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses
+        ]
     elif name == "state.limit":  # an end stop that is not reached has no derivative either
         guesses = [
             np.array([*base_fit.theta, *stop])
             for stop in _iterate_stop_starts(setting, observed[..., 0])
         ]
-        result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
+        residuals_and_starts = [
+            (_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses
+        ]
     else:
-        result = [
+        residuals_and_starts = [
             _estimate_linear_step(fit, observed, shape, base_fit)
             for shape in SHAPE_GRIDS.get(name, [()])
         ]
-    return sorted(result, key=lambda pair: pair[0])
+    return sorted(residuals_and_starts, key=lambda pair: pair[0])
 
 
 def _iterate_stop_starts(

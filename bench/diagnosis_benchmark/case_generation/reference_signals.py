@@ -165,19 +165,19 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
     values, starts, state = [], [], float(levels[0])
     for level, start, end in zip(levels.tolist(), edges.tolist(), end_times, strict=True):
         while start < end and state != level:
-            last = min(start + SLEW_STEP, end)
+            end_of_step = min(start + SLEW_STEP, end)
             deviation = level - state
-            ramp_duration = min(abs(deviation) / max_rate, last - start)
+            ramp_duration = min(abs(deviation) / max_rate, end_of_step - start)
             next_state = (
                 level
                 if ramp_duration >= abs(deviation) / max_rate
                 else state + copysign(max_rate * ramp_duration, deviation)
             )
             # mean over the part, in which the rise may end
-            values.append(0.5 * (state + next_state) * ramp_duration / (last - start))
-            values[-1] += next_state * (1 - ramp_duration / (last - start))
+            values.append(0.5 * (state + next_state) * ramp_duration / (end_of_step - start))
+            values[-1] += next_state * (1 - ramp_duration / (end_of_step - start))
             starts.append(start)
-            state, start = next_state, last
+            state, start = next_state, end_of_step
         if start < end:
             values.append(level)
             starts.append(start)

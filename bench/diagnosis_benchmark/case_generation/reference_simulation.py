@@ -202,12 +202,12 @@ def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
     Returns:
         Lagging readings y, (G, C); at the first grid point y = x.
     """
-    result, y = values.copy(), values[0].copy()
+    lagged, y = values.copy(), values[0].copy()
     for k, h in enumerate(np.diff(grid).tolist()):
         slope = (values[k + 1] - values[k]) / h
         particular_solution = (
             values[k] - slope * lag
         )  # particular solution: `lag` seconds behind the line
         y = particular_solution + slope * h + (y - particular_solution) * exp(-h / lag)
-        result[k + 1] = y
-    return result
+        lagged[k + 1] = y
+    return lagged

@@ -90,7 +90,7 @@ class _ForwardSelection(Diagnoser):
         """
         samples = int(evidence.observed_mask.sum())
         best = _add_refit(evidence, evidence.base.fit)
-        first, candidates = best, list[RefittedModel]()
+        base_model, candidates = best, list[RefittedModel]()
         causes: list[tuple[str, tuple[str, ...]]] = []
         while len(causes) < MAX_EFFECTS and not self.is_sufficient(best, samples):
             candidates = [
@@ -112,7 +112,7 @@ class _ForwardSelection(Diagnoser):
             ]
             best = candidates[0]
             causes.append((best.fit.effects[-1], tuple(alternatives)))
-        return self._make_answer(evidence, first, best, causes, samples)
+        return self._make_answer(evidence, base_model, best, causes, samples)
 
     def _make_answer(
         self,

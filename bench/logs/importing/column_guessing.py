@@ -220,16 +220,16 @@ def match_numbered_joints(
         Joints by column name; empty if a column has no number, numbers repeat, or there are more
             columns than joints.
     """
-    numbers: dict[str, int] = {}
+    column_numbers: dict[str, int] = {}
     for column in columns:
         digits = re.findall(r"\d+", column.bare)
         if not digits:
             return {}
-        numbers[column.name] = int(digits[-1])
-    first = min(numbers.values(), default=0)
-    if len(columns) > len(joints) or len(set(numbers.values())) < len(columns):
+        column_numbers[column.name] = int(digits[-1])
+    first = min(column_numbers.values(), default=0)
+    if len(columns) > len(joints) or len(set(column_numbers.values())) < len(columns):
         return {}
-    order = {name: index - first for name, index in numbers.items()}
+    order = {name: index - first for name, index in column_numbers.items()}
     if max(order.values(), default=0) >= len(joints):
         return {}
     return {name: joints[index] for name, index in order.items()}

@@ -55,23 +55,29 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
     for folder in (path for path in logs if path not in files):
         is_whole = is_bag(folder) or is_dataset(folder)
         parts = [folder] if is_whole else [folder, *sorted(folder.iterdir())]
-        datasets = [part for part in parts if is_dataset(part)]
-        for part in parts:
-            if part in datasets:
-                prefix = f"{part.name}_" if len(datasets) > 1 else ""
+        datasets = [path_or_folder for path_or_folder in parts if is_dataset(path_or_folder)]
+        for path_or_folder in parts:
+            if path_or_folder in datasets:
+                prefix = f"{path_or_folder.name}_" if len(datasets) > 1 else ""
                 runs |= {
                     f"{prefix}{path.parent.name}": RunFiles(path.parent, [path])
-                    for path in list_logs(part)
+                    for path in list_logs(path_or_folder)
                 }
                 continue
-            if is_bag(part):
-                paths = list(list_logs(part))
-            elif part.is_dir():
-                paths = [path for path in list_logs(part) if path.suffix.lower() in TABLE_ENDINGS]
+            if is_bag(path_or_folder):
+                paths = list(list_logs(path_or_folder))
+            elif path_or_folder.is_dir():
+                paths = [
+                    path
+                    for path in list_logs(path_or_folder)
+                    if path.suffix.lower() in TABLE_ENDINGS
+                ]
             else:
                 continue
             if paths:
-                runs[part.stem if part.is_file() else part.name] = RunFiles(part, paths)
+                runs[path_or_folder.stem if path_or_folder.is_file() else path_or_folder.name] = (
+                    RunFiles(path_or_folder, paths)
+                )
     if files and runs:
         raise InputError("expected files of one run, or folders of one run each, found both")
     if files:

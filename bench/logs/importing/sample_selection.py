@@ -127,15 +127,15 @@ def _thin_run(run: Run, stride: int) -> Run:
         run: the run.
         stride: the number k.
     """
-    part = run.part(slice(None, None, stride))
+    thinned_run = run.part(slice(None, None, stride))
     first = np.arange(0, run.times.size, stride)
     spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
-    inputs = dict(part.inputs)
-    for name in part.inputs:
+    inputs = dict(thinned_run.inputs)
+    for name in thinned_run.inputs:
         if name not in run.linear:
             weighted_sums = np.add.reduceat(run.inputs[name] * spans, first)
             inputs[name] = weighted_sums / np.add.reduceat(spans, first)
-    return replace(part, inputs=inputs)
+    return replace(thinned_run, inputs=inputs)
 
 
 LARGEST_SHARE = 0.5

@@ -136,13 +136,13 @@ def bounce(block: Block, impact: float) -> None:
         impact: time of the impact in seconds since the start of the run.
     """
     a = block.a
-    last = block.flags[DIMENSIONS] - 1
+    vertical = block.flags[DIMENSIONS] - 1
     s = impact - a[T, 0]
-    for k in range(last + 1):
+    for k in range(vertical + 1):
         acceleration = a[K1 + k, 0]
         a[X + k, 0] += s * (a[V + k, 0] + s * (0.5 * acceleration))  # (1)
         a[V + k, 0] += s * acceleration  # (2)
     a[T, 0] = impact
-    a[X + last, 0] = a[FLOOR_LEVEL, 0]  # removes the rounding of (1) and (3)
-    compute_rebound_velocity(block, 0, a[K1 + last, 0])
+    a[X + vertical, 0] = a[FLOOR_LEVEL, 0]  # removes the rounding of (1) and (3)
+    compute_rebound_velocity(block, 0, a[K1 + vertical, 0])
     compute_frictionless_acceleration(block, K1)

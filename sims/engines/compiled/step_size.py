@@ -61,9 +61,9 @@ def choose_step_divisions(block: Block) -> None:
     spans = block.max_steps
     divisions = block.divisions
     instants = SAMPLED_INSTANTS if block.inputs.shape[0] > 0 else 1
-    for first in range(0, block.order.size, block.w):
+    for first_order_index in range(0, block.order.size, block.w):
         for i in range(block.w):
-            load_element(block, i, min(first + i, block.order.size - 1))
+            load_element(block, i, min(first_order_index + i, block.order.size - 1))
             if instants > 1:
                 select_sampled_steps(block, i)
         run_part(block, CONSTANTS)
@@ -72,7 +72,7 @@ def choose_step_divisions(block: Block) -> None:
                 set_inputs_at(block, instant)
             for at_rest in range(2):
                 compute_stiffness_and_damping(block, at_rest == 1)
-                for i in range(min(block.w, block.order.size - first)):
+                for i in range(min(block.w, block.order.size - first_order_index)):
                     element = block.n[ELEMENT, i]
                     phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * spans[element]
                     decay = block.a[MAX_FRICTION, i] * spans[element] * PHASE_TO_DECAY_RATIO
@@ -91,21 +91,21 @@ def queue_by_divisions(block: Block) -> None:
         block: force program, batch elements, and buffers of the slots.
     """
     queued_count = 0
-    parts = MAX_STEP_DIVISIONS
-    while parts >= 1.0:
+    division = MAX_STEP_DIVISIONS
+    while division >= 1.0:
         for k in range(block.order.size):
             element = block.order[k]
-            if block.divisions[element] == parts:
+            if block.divisions[element] == division:
                 block.queue[queued_count] = k
                 queued_count += 1
-                if parts > 1.0:
+                if division > 1.0:
                     # Slightly longer than the part, so that rounding does not leave a tiny step
                     # after the last one.
-                    block.max_steps[element] = block.max_steps[element] / parts * (1.0 + 1e-9)
+                    block.max_steps[element] = block.max_steps[element] / division * (1.0 + 1e-9)
                 if block.flags[HAS_HIDDEN_STATES] != 0:
                     # The fine steps that hidden states need count as planned steps.
-                    block.planned_counts[element] *= parts
-        parts -= 1.0
+                    block.planned_counts[element] *= division
+        division -= 1.0
 
 
 def select_sampled_steps(block: Block, i: int) -> None:

@@ -161,14 +161,16 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     rollout = BallRollout(ball, element)
     recorded_steps = set(element.recorded_steps.tolist())
     steps = element.steps.tolist()
-    rows = [rollout.state]
-    for first, counts in split_into_legs(element):
-        states = rollout.advance_leg(steps[first], counts)
+    recorded_states = [rollout.state]
+    for first_step, counts in split_into_legs(element):
+        states = rollout.advance_leg(steps[first_step], counts)
         # A leg may end between two samples, where no state is recorded.
-        rows.extend(states if first + sum(counts) in recorded_steps else states[:-1])
+        recorded_states.extend(
+            states if first_step + sum(counts) in recorded_steps else states[:-1]
+        )
         if not math.isfinite(sum(rollout.state)):
             break
-    return make_trajectory(element, rows)
+    return make_trajectory(element, recorded_states)
 
 
 class BallRollout:
@@ -494,10 +496,10 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     steps = element.steps.tolist()
     t = 0.0
     step = math.nan
-    rows = [(*x, *w, *compute_force(t, x, w))]
-    for first, counts in split_into_legs(element):
-        if steps[first] != step:
-            step = steps[first]
+    recorded_states = [(*x, *w, *compute_force(t, x, w))]
+    for first_step, counts in split_into_legs(element):
+        if steps[first_step] != step:
+            step = steps[first_step]
             ball.set_step(step)
         if forces.acts or changes_impacts:
             states = []
@@ -516,10 +518,12 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
         else:
             # No force must be evaluated: the engine runs from sample to sample.
             states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
-        rows.extend(states if first + sum(counts) in recorded_steps else states[:-1])
-        if not math.isfinite(sum(rows[-1])):
+        recorded_states.extend(
+            states if first_step + sum(counts) in recorded_steps else states[:-1]
+        )
+        if not math.isfinite(sum(recorded_states[-1])):
             break
-    positions, v, effect_forces = make_trajectory(element, rows)
+    positions, v, effect_forces = make_trajectory(element, recorded_states)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
     a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (6)
     for i in np.flatnonzero(np.abs(v[:, 2]) < _MAX_RESTING_SPEED):

@@ -162,7 +162,7 @@ def integrate_batch(
         A failed element stays NaN, and the world is discarded, because it may be in any
         state.
         """
-        for i, element, rows in work[k :: len(rollouts)]:
+        for i, element, output_rows in work[k :: len(rollouts)]:
             trajectory = rollouts[k](element)
             if not is_finite(trajectory):
                 discard()
@@ -170,7 +170,7 @@ def integrate_batch(
             for result, values in zip(
                 (trajectories.x, trajectories.v, trajectories.a), trajectory, strict=True
             ):
-                result[i] = values[rows]
+                result[i] = values[output_rows]
 
     try:
         if len(rollouts) == 1:

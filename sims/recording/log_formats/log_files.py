@@ -122,15 +122,15 @@ class LogFile:
 
     def list_columns(self) -> list[str]:
         """List all numeric columns; columns of lists by their entries."""
-        result = []
+        column_names = []
         for name, values in self.columns.items():
             if name in self.unlisted:
                 continue
             if values.ndim == 1:
-                result.append(name)
+                column_names.append(name)
             else:
-                result += [f"{name}[{k}]" for k in range(values.shape[1])]
-        return result
+                column_names += [f"{name}[{k}]" for k in range(values.shape[1])]
+        return column_names
 
 
 def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:

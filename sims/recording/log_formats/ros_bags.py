@@ -180,16 +180,16 @@ class MessageTable:
         A number that a message lacks is NaN. The table is empty afterwards, since columns
         are released.
         """
-        rows = len(self._stamps)
+        message_count = len(self._stamps)
         stamps = np.array(self._stamps)
         # Header stamps of zero were not filled in: use the times of writing instead.
-        times = stamps if rows and (stamps > 0).all() else np.array(self._written)
+        times = stamps if message_count and (stamps > 0).all() else np.array(self._written)
         order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
         result = {TIME_COLUMN: make_read_only(times if order is None else times[order])}
         for name in list(self._numbers):
             # Release each column after conversion; otherwise a long bag would be in memory twice.
             column = self._numbers.pop(name)
-            column.extend([np.nan] * (rows - len(column)))
+            column.extend([np.nan] * (message_count - len(column)))
             values = np.frombuffer(column)
             result[name] = make_read_only(values if order is None else values[order])
         return result

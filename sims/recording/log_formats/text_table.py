@@ -473,16 +473,16 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
     """
     line = layout.first
     try:
-        for line, last, row in _iterate_rows(path, layout):
+        for line, last_line, row in _iterate_rows(path, layout):
             filled = len(row)
             while filled > layout.width and not row[filled - 1].strip():
                 filled -= 1
             if filled == layout.width:
                 continue
-            if last > line:
+            if last_line > line:
                 return InputError(
-                    f"{path}, row {line}: a quotation mark opens a cell that ends in row {last}; "
-                    "close or delete it"
+                    f"{path}, row {line}: a quotation mark opens a cell that ends in row "
+                    f"{last_line}; close or delete it"
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
@@ -708,19 +708,29 @@ class _CellKind:
         Raises:
             InputError: a cell is not a list, or has another length than the first one.
         """
-        rows: list[list[float]] = []
-        for number, text in enumerate(self.texts):
+        number_lists: list[list[float]] = []
+        for cell_index, text in enumerate(self.texts):
             match = NUMBERS.fullmatch(text)
             try:
                 list_entries = match["inside"].replace(",", " ").split() if match else None
-                row = [float(part) for part in list_entries] if list_entries is not None else None
+                number_list = (
+                    [float(part) for part in list_entries] if list_entries is not None else None
+                )
             except ValueError:
-                row = None
-            if row is None or (rows and len(row) != len(rows[0])) or len(row) > MAX_COLUMNS:
-                expected = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
-                raise self._make_cell_error(path, layout, name, number, expected)
-            rows.append(row)
-        return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+                number_list = None
+            if (
+                number_list is None
+                or (number_lists and len(number_list) != len(number_lists[0]))
+                or len(number_list) > MAX_COLUMNS
+            ):
+                expected = (
+                    f"a list of {len(number_lists[0])} numbers"
+                    if number_lists
+                    else "a list of numbers"
+                )
+                raise self._make_cell_error(path, layout, name, cell_index, expected)
+            number_lists.append(number_list)
+        return np.array(number_lists, dtype=np.float64).reshape(len(number_lists), -1)
 
     def _make_cell_error(
         self, path: Path, layout: Layout, name: str, record: int, expected: str, note: str = ""

@@ -212,10 +212,10 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
         raise InputError(f"{path}: expected tensors of numbers, found {tensor.storage.kind}")
     if np.prod(tensor.size, dtype=np.float64) > MAX_ENTRIES:
         raise InputError(f"{path}: a tensor has more than {MAX_ENTRIES} entries")
-    entry = f"{folder}data/{tensor.storage.key}"
-    if archive.getinfo(entry).file_size > 8 * MAX_ENTRIES:
-        raise InputError(f"{path}: {entry} is too large for a log of tensors")
-    stored_numbers = np.frombuffer(archive.read(entry), dtype=number_type)
+    member_name = f"{folder}data/{tensor.storage.key}"
+    if archive.getinfo(member_name).file_size > 8 * MAX_ENTRIES:
+        raise InputError(f"{path}: {member_name} is too large for a log of tensors")
+    stored_numbers = np.frombuffer(archive.read(member_name), dtype=number_type)
     if tensor.storage.kind == "BFloat16Storage":
         # A bfloat16 is the upper half of a 32-bit number.
         stored_numbers = (stored_numbers.astype(np.uint32) << 16).view(np.float32)
@@ -223,7 +223,7 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
         return make_read_only(np.empty(tensor.size))
     steps = [(n - 1) * s for n, s in zip(tensor.size, tensor.stride, strict=True)]
     if min(tensor.offset, *tensor.stride) < 0 or tensor.offset + sum(steps) >= stored_numbers.size:
-        raise InputError(f"{path}: {entry} has fewer numbers than its tensor")
+        raise InputError(f"{path}: {member_name} has fewer numbers than its tensor")
     indices = np.full((), tensor.offset)
     for length, stride in zip(tensor.size, tensor.stride, strict=True):
         indices = indices[..., None] + stride * np.arange(length)

@@ -169,18 +169,18 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
     )
     if steps < 1 or len(names) < len(scenario.inputs) or not have_equal_times:
         return None
-    first = -steps * step
-    is_included = earlier_times > first
+    start_time = -steps * step
+    is_included = earlier_times > start_time
     times = np.concatenate(
-        [[first], earlier_times[is_included], scenario.times - scenario.times[0]]
+        [[start_time], earlier_times[is_included], scenario.times - scenario.times[0]]
     )
     inputs = {}
     for name, values in scenario.inputs.items():
         earlier_values = scenario.before[name][1]
         if name in scenario.linear:
             ends = np.append(earlier_times, 0.0), np.append(earlier_values, values[0])
-            initial = float(np.interp(first, *ends))
+            initial = float(np.interp(start_time, *ends))
         else:
-            initial = float(earlier_values[np.flatnonzero(earlier_times <= first)[-1]])
+            initial = float(earlier_values[np.flatnonzero(earlier_times <= start_time)[-1]])
         inputs[name] = np.concatenate([[initial], earlier_values[is_included], values])
-    return replace(scenario, times=times - first, inputs=inputs, before={}, off={}), steps
+    return replace(scenario, times=times - start_time, inputs=inputs, before={}, off={}), steps

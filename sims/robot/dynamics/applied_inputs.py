@@ -192,7 +192,7 @@ def compute_changed_inputs(
         Number of the run, name of the input, batch elements (L,), and their applied inputs (L, S).
     """
     requests_by_grid: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
-    for number, run in enumerate(runs):
+    for run_index, run in enumerate(runs):
         fractions, has_sample = (
             run.get_step_fractions(step, share, is_changed=True),
             run.find_steps_with_sample(step),
@@ -207,7 +207,7 @@ def compute_changed_inputs(
             # Inputs are grouped by effects, so that the value of a batch element does not depend on
             # others.
             requests += [
-                _InputRequest(number, run.scenario, name, signal, *part)
+                _InputRequest(run_index, run.scenario, name, signal, *part)
                 for part in _group_by_active_effects(input_effects, run.n)
             ]
     for (steps, fraction_bytes, sample_bytes), requests in requests_by_grid.items():

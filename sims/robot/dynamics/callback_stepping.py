@@ -74,26 +74,26 @@ def step_in_callback(
     callback = _get_callback()
     if callback is None or mujoco.get_mjcb_control() is not None:
         return None
-    n, steps, _ = controls.shape
-    friction_without_effects = mujoco_batch.begin_dry_friction(compiled, n)
+    batch_size, steps, _ = controls.shape
+    friction_without_effects = mujoco_batch.begin_dry_friction(compiled, batch_size)
     has_friction = compiled.has_dry_friction
     if has_friction.any():
         loss = mujoco_batch.fields["dof_frictionloss"]
         batch_indices, joints = np.nonzero(has_friction)
         dofs = compiled.addresses.velocities[joints]
         loss[batch_indices, dofs] = np.maximum(loss[batch_indices, dofs], MIN_FRICTION)
-    mujoco_batch.batch.bind("ctrl")[:n] = controls[:, 0]
+    mujoco_batch.batch.bind("ctrl")[:batch_size] = controls[:, 0]
     predictor = MidpointPredictor(
         mujoco_batch.batch,
         compiled.addresses.positions,
         compiled.addresses.velocities,
         compiled.loaded,
     )
-    mujoco_batch.batch.forward(None if n == mujoco_batch.count else np.arange(n))
-    compiled.begin(predictor.read_joint_states(np.zeros(n, dtype=bool)))
+    mujoco_batch.batch.forward(None if batch_size == mujoco_batch.count else np.arange(batch_size))
+    compiled.begin(predictor.read_joint_states(np.zeros(batch_size, dtype=bool)))
     contexts = _CallbackContexts(mujoco_batch, compiled, friction_without_effects, steps)
     user = mujoco_batch.batch.bind("userdata")
-    user[:n, 0] = contexts.addresses
+    user[:batch_size, 0] = contexts.addresses
     mujoco.set_mjcb_control(callback)
     try:
         return mujoco_batch.step(controls, forces, record, before_call=contexts.reset_accelerations)

@@ -49,15 +49,15 @@ def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps:
     Returns:
         (S, K) whether each of the K actuators is off.
     """
-    result = np.zeros((steps, len(robot.actuators)), dtype=bool)
+    off_steps = np.zeros((steps, len(robot.actuators)), dtype=bool)
     if not scenario.off:
-        return result
+        return off_steps
     stamps = scenario.times - scenario.times[0] + scenario.offset
     middles = step * (np.arange(float(steps)) + SAMPLED_STEP_FRACTION)
-    rows = np.clip(np.searchsorted(stamps, middles, side="right") - 1, 0, stamps.size - 1)
+    sample_indices = np.clip(np.searchsorted(stamps, middles, side="right") - 1, 0, stamps.size - 1)
     for name, off in scenario.off.items():
-        result[:, robot.actuator(name).id] = off[rows]
-    return result
+        off_steps[:, robot.actuator(name).id] = off[sample_indices]
+    return off_steps
 
 
 def iterate_constant_stretches(off: Mask) -> Iterator[slice]:
@@ -149,7 +149,7 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
     kinds = mujoco.mjtIntegrator
     implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
     # Degree of freedom, output (field and column), limit in its units, and limit at the joint.
-    rows: list[tuple[int, tuple[str, int], float, float]] = []
+    force_limits: list[tuple[int, tuple[str, int], float, float]] = []
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
         for k in range(model.nu):
@@ -161,16 +161,16 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
             gains[dof] += gain
             if model.actuator_forcelimited[k] and _is_stiff(model, dof, gain):
                 limit = float(np.abs(model.actuator_forcerange[k]).max())
-                rows.append((dof, ("actuator_force", k), limit, limit * gear))
+                force_limits.append((dof, ("actuator_force", k), limit, limit * gear))
         for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
             dof = int(model.jnt_dofadr[joint])
             if _is_stiff(model, dof, float(gains[dof])):
                 limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
-                rows.append((dof, ("qfrc_actuator", dof), limit, limit))
-    jumps = [_compute_jump(model, dof, force, gains) for dof, *_, force in rows]
+                force_limits.append((dof, ("qfrc_actuator", dof), limit, limit))
+    jumps = [_compute_jump(model, dof, force, gains) for dof, *_, force in force_limits]
     return ForceLimits(
-        tuple(output for _, output, *_ in rows),
-        NEAR_LIMIT_SHARE * np.array([limit for *_, limit, _ in rows]),
+        tuple(output for _, output, *_ in force_limits),
+        NEAR_LIMIT_SHARE * np.array([limit for *_, limit, _ in force_limits]),
         np.array(jumps).reshape(-1, model.nv),
     )
 

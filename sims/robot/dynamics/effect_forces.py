@@ -82,7 +82,7 @@ def compute_time_dependent_forces(
         size: number D of coordinates.
         batch_size: number L of batch elements.
     """
-    result = np.zeros((batch_size, t.size, size))
+    forces = np.zeros((batch_size, t.size, size))
     half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
     at_rest = np.zeros((t.size, size))
     # The force at the middle of a step gives the momentum of the force over the step, to second
@@ -95,8 +95,8 @@ def compute_time_dependent_forces(
             continue
         for batch_index in np.flatnonzero((c != 0).any(axis=0)[:, 0]):
             coefficients = np.repeat(c[:, batch_index : batch_index + 1], t.size, axis=1)
-            result[batch_index] += effect.force(coefficients, snapshots)
-    return result
+            forces[batch_index] += effect.force(coefficients, snapshots)
+    return forces
 
 
 class EffectForces:

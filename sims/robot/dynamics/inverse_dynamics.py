@@ -147,16 +147,16 @@ def coefficient_scales(robot: RobotModel) -> JointScales:
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     last_joint_of_body: dict[tuple[int, str], int] = {}
     # Bodies are numbered from the base outwards, so a parent joint has its final value already.
-    for number, joint in enumerate(joints):
+    for joint_index, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint.id])
         parent = last_joint_of_body.get((body, joint.kind))
         while parent is None and body:
             body = int(model.body_parentid[body])
             parent = last_joint_of_body.get((body, joint.kind))
         if parent is not None:
-            force[number] = max(force[number], MIN_PARENT_SHARE * force[parent])
-            inertia[number] = max(inertia[number], MIN_PARENT_SHARE * inertia[parent])
-        last_joint_of_body[int(model.jnt_bodyid[joint.id]), joint.kind] = number
+            force[joint_index] = max(force[joint_index], MIN_PARENT_SHARE * force[parent])
+            inertia[joint_index] = max(inertia[joint_index], MIN_PARENT_SHARE * inertia[parent])
+        last_joint_of_body[int(model.jnt_bodyid[joint.id]), joint.kind] = joint_index
     return JointScales(force, inertia)
 
 

@@ -297,19 +297,21 @@ class MeasuredLinear(RunLinearisation):
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
         mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
         limits = mujoco_batch.force_limits
-        result = np.zeros((self.knots.size - 1, self._tangent.state_size))
+        state_changes = np.zeros((self.knots.size - 1, self._tangent.state_size))
         if not limits.outputs:
-            return result
+            return state_changes
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             reached = np.abs(self._tangent.limited_forces) >= limits.sizes
         jumps = limits.jumps[:, mujoco_batch.file_joints.velocities]
         for steps, active in self._list_active_intervals():
-            result[active, : jumps.shape[1]] += reached[steps] @ jumps
+            state_changes[active, : jumps.shape[1]] += reached[steps] @ jumps
         # A position servo returns from a jump of position within the interval or later.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
         position_count = self.positions
-        result[:, position_count : 2 * position_count] = result[:, :position_count] / lengths
-        return result
+        state_changes[:, position_count : 2 * position_count] = (
+            state_changes[:, :position_count] / lengths
+        )
+        return state_changes
 
     @cached_property
     def step_errors(self) -> Array:
@@ -416,10 +418,10 @@ class MeasuredLinear(RunLinearisation):
             sensors: sensor effects of each of the K candidates.
             predicted: (T, Z) predicted deviations, to whose readings sensor effects are applied.
         """
-        result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
+        changes_of_readings = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
         changing = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
         if not changing:
-            return result
+            return changes_of_readings
         has_sensor_effect = np.array([bool(sensors[k]) for k in changing])
         # The last row has no sensor effects; it is the reference for the others.
         states = np.zeros((len(changing) + 1, self._motion.x.shape[0], self._tangent.state_size))
@@ -438,8 +440,8 @@ class MeasuredLinear(RunLinearisation):
         without_effects = np.where(
             has_sensor_effect[:, None, None], observations[-1], self.observed
         )
-        result[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
-        return result
+        changes_of_readings[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
+        return changes_of_readings
 
     def propagate_deviations(self, deviations: Array, forces: Array) -> Array:
         """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
@@ -454,16 +456,16 @@ class MeasuredLinear(RunLinearisation):
         points, quotients = tangent.point_of_step, tangent.quotients
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = tangent.defects
-        result = np.zeros((self._motion.x.shape[0], tangent.state_size))
+        deviations_at_steps = np.zeros((self._motion.x.shape[0], tangent.state_size))
         state = deviations[:-1].copy()
         with np.errstate(all="ignore"):
             for steps, active in self._list_active_intervals():
-                result[steps] = state[active]
+                deviations_at_steps[steps] = state[active]
                 ahead = np.einsum("izy,iy->iz", quotients.states[points[steps]], state[active])
                 forced = np.einsum("ize,ie->iz", quotients.forces[points[steps]], forces[active])
                 state[active] = ahead - defects[steps] + forced
-        result[self.knots[-1] :] = deviations[-1]
-        return result
+        deviations_at_steps[self.knots[-1] :] = deviations[-1]
+        return deviations_at_steps
 
     def moved(self, deviations: Array) -> Trajectory:
         """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's."""

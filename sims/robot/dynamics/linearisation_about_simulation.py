@@ -124,7 +124,7 @@ class RunLinearisation:
             else forces_at_start
         )
         act = simulated.fields["act"][0]
-        first = simulated.initial_activations[0][None]
+        first_activations = simulated.initial_activations[0][None]
         data = simulated.fields["sensordata"][0] if self._sensor_channels else np.zeros((steps, 0))
         self._readings = {
             name: data[:, simulator.get_sensor_address(name)] for name in self._sensor_channels
@@ -132,7 +132,7 @@ class RunLinearisation:
         return RobotMotion(
             x=np.concatenate([simulated.x[0], simulated.series[0][0]], axis=1),
             v=np.concatenate([simulated.v[0], simulated.series[1][0]], axis=1),
-            act=np.concatenate([first, act[:-1]]),
+            act=np.concatenate([first_activations, act[:-1]]),
             compute_loads=lambda: carried,
             floating_state=self._get_floating_states(simulated.fields),
             step=simulator.time_step,
@@ -218,11 +218,11 @@ class RunLinearisation:
         before = self._tangent.placed_element_count - self._preparation_count
         # The cost must not depend on earlier calls.
         self._perturbation_cache.clear()
-        result = np.zeros((len(added), *self.observed.shape))
+        responses = np.zeros((len(added), *self.observed.shape))
         (control_changes,) = compute_control_changes([self], added)
         in_series = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
         if in_series:
-            result[in_series] = (
+            responses[in_series] = (
                 self._simulate_with_effects([added[i] for i in in_series]) - self.observed
             )
         for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
@@ -233,14 +233,14 @@ class RunLinearisation:
                 states, readings = self._tangent.propagate(changes, len(block))
                 observations = self._compute_observations(states, readings, sensors)
             not_in_series = np.setdiff1d(block, in_series).astype(np.intp)
-            result[not_in_series] = (observations - self.observed)[not_in_series - block.start]
+            responses[not_in_series] = (observations - self.observed)[not_in_series - block.start]
         placed_count = self._tangent.placed_element_count - before
-        return result, 1 + len(in_series) + placed_count // len(self._motion.controls)
+        return responses, 1 + len(in_series) + placed_count // len(self._motion.controls)
 
     def _list_changes(
         self,
         added: Sequence[EffectWithCoefficients],
-        numbers: range,
+        effect_indices: range,
         control_changes: Mapping[int, Sequence[Perturbation]],
     ) -> tuple[list[Perturbation], list[ActiveEffects]]:
         """Return the perturbations and the sensor effects of some added effects.
@@ -249,7 +249,7 @@ class RunLinearisation:
 
         Args:
             added: effects with their coefficients.
-            numbers: numbers of the effects; the first owns the perturbations with owner 0.
+            effect_indices: indices of the effects; the first owns the perturbations with owner 0.
             control_changes: changes of the controls by effects on inputs, by number of the effect.
 
         Returns:
@@ -257,15 +257,15 @@ class RunLinearisation:
         """
         changes: list[Perturbation] = []
         sensors: list[ActiveEffects] = []
-        for owner, number in enumerate(numbers):
-            effect, c = added[number]
+        for owner, effect_index in enumerate(effect_indices):
+            effect, c = added[effect_index]
             parts = effect.parts(c[:, None, None])
             sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
             for part, k in parts:
                 is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(part)
                 if not is_handled_otherwise and k.any():
                     changes += self._list_perturbations(owner, part, k)
-            changes += [c._replace(owner=owner) for c in control_changes.get(number, ())]
+            changes += [c._replace(owner=owner) for c in control_changes.get(effect_index, ())]
         return changes, sensors
 
     def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
@@ -411,10 +411,10 @@ def compute_control_changes(
     """Compute the changes of controls by added input effects.
 
     Input effects act before the robot, so their changes are computed exactly and only propagated
-    to first order. `rows` lists the effects at one place each as (number, effect, coefficients),
-    one batch element for each. Each changed input is averaged over the whole step, which moves
-    the robot, and, if drive forces are observed, over an instant at its beginning, which a sensor
-    shows; `shares` are these two shares of a step.
+    to first order. `input_effects` lists the effects at one place each as (index in `added`,
+    effect, coefficients), one batch element for each. Each changed input is averaged over the
+    whole step, which moves the robot, and, if drive forces are observed, over an instant at its
+    beginning, which a sensor shows; `shares` are these two shares of a step.
 
     Args:
         runs: linearisations of runs of one simulator.
@@ -423,42 +423,42 @@ def compute_control_changes(
     Returns:
         For each run, the changes by number of the effect.
     """
-    result: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
-    rows: list[tuple[int, Effect, Array]] = []
-    for number, (effect, c) in enumerate(added):
+    changes_by_run: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
+    input_effects: list[tuple[int, Effect, Array]] = []
+    for effect_index, (effect, c) in enumerate(added):
         for part, k in effect.parts(c[:, None, None]):
             if isinstance(part, Input) and k.any():
-                rows.append((number, part, k))
-    if not rows:
-        return result
+                input_effects.append((effect_index, part, k))
+    if not input_effects:
+        return changes_by_run
     simulator, names = runs[0]._simulator, runs[0]._sensor_channels
-    inputs = [run._get_inputs_with_effects(rows) for run in runs]
+    inputs = [run._get_inputs_with_effects(input_effects) for run in runs]
     shares = [1.0]
     if any(name.startswith("tau.") for name in names):
         shares.append(SAME_INSTANT_SHARE)
-    numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
+    control_indices = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
     series: dict[tuple[int, int], list[Array]] = {}
     for share in shares:
         for run, name, elements, values in compute_changed_inputs(
             simulator.time_step, inputs, share
         ):
             for element, series_row in zip(elements.tolist(), values, strict=True):
-                if rows[element][1].signal == name:
+                if input_effects[element][1].signal == name:
                     series.setdefault((run, element), []).append(series_row)
     for (run, element), values_by_share in sorted(series.items()):
-        number, part, _ = rows[element]
-        if part.signal not in numbers:
+        effect_index, part, _ = input_effects[element]
+        if part.signal not in control_indices:
             continue
-        column, motion = numbers[part.signal], runs[run]._motion
+        column, motion = control_indices[part.signal], runs[run]._motion
         change = Perturbation(
-            number,
+            effect_index,
             actuator=column,
             series=values_by_share[0] - motion.controls[:, column],
             instant=values_by_share[-1]
             - (motion.controls, motion.instant)[len(values_by_share) - 1][:, column],
         )
-        result[run].setdefault(number, []).append(change)
-    return result
+        changes_by_run[run].setdefault(effect_index, []).append(change)
+    return changes_by_run
 
 
 def _select_sensor_effects(

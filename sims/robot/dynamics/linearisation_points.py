@@ -206,24 +206,29 @@ class LinearisationPoints:
         states, readings = [], []
         bind, joints, floating = self._mujoco_batch.batch.bind, self._joints, self._floating
         begin = 0  # number of points in earlier batches
-        for n, ids in self._place_points(moved, acting):
+        for point_count, ids in self._place_points(moved, acting):
             for _ in range(steps):
                 self._mujoco_batch.batch.step(ids)
-            parts = [bind("qpos")[:n, joints.positions], bind("qvel")[:n, joints.velocities]]
+            state_columns = [
+                bind("qpos")[:point_count, joints.positions],
+                bind("qvel")[:point_count, joints.velocities],
+            ]
             if self.motion.act.shape[1]:
-                parts.append(bind("act")[:n])
-            parts += [state.v for state in self._next_hidden_states.values()]
+                state_columns.append(bind("act")[:point_count])
+            state_columns += [state.v for state in self._next_hidden_states.values()]
             if floating:
                 unperturbed = self.motion.floating_state.pose[
-                    self.point_steps[begin : begin + n] + 1
+                    self.point_steps[begin : begin + point_count] + 1
                 ]
-                parts.append(
-                    floating.compute_displacement(bind("qpos")[:n, floating.positions], unperturbed)
+                state_columns.append(
+                    floating.compute_displacement(
+                        bind("qpos")[:point_count, floating.positions], unperturbed
+                    )
                 )
-                parts.append(bind("qvel")[:n, floating.velocities])
-            begin += n
-            states.append(np.concatenate(parts, axis=1))
-            readings.append(self._read_outputs(n))
+                state_columns.append(bind("qvel")[:point_count, floating.velocities])
+            begin += point_count
+            states.append(np.concatenate(state_columns, axis=1))
+            readings.append(self._read_outputs(point_count))
         return np.concatenate(states), np.concatenate(readings)
 
     def compute_accelerations(
@@ -320,30 +325,30 @@ class LinearisationPoints:
             ranges = self._mujoco_batch.force_ranges()
         for begin in range(0, self.point_steps.size, count):
             steps = self.point_steps[begin : begin + count]
-            n = steps.size
+            point_count = steps.size
             if ranges is not None:
                 ranges.write(motion.off[steps])
             batch.state[:] = self._reset_state
             if at_centres:
-                x, v = (values[begin : begin + n] for values in self._interval_centres)
+                x, v = (values[begin : begin + point_count] for values in self._interval_centres)
             else:
                 x, v = motion.x[steps], motion.v[steps]
-            qpos[:n, joints.positions] = x
-            qvel[:n, joints.velocities] = v
-            qpos[:n, floating.positions] = motion.floating_state.pose[steps]
-            qvel[:n, floating.velocities] = motion.floating_state.rate[steps]
-            ctrl[:n] = motion.controls[steps]
-            applied[:n] = motion.forces[steps]
+            qpos[:point_count, joints.positions] = x
+            qvel[:point_count, joints.velocities] = v
+            qpos[:point_count, floating.positions] = motion.floating_state.pose[steps]
+            qvel[:point_count, floating.velocities] = motion.floating_state.rate[steps]
+            ctrl[:point_count] = motion.controls[steps]
+            applied[:point_count] = motion.forces[steps]
             if na:
-                bind("act")[:n] = motion.act[steps]
+                bind("act")[:point_count] = motion.act[steps]
             for name, (k, size) in moved.items():
                 if name == "p":
                     poses = floating.displace(motion.floating_state.pose[steps], k, size)
-                    qpos[:n, floating.positions] = poses
+                    qpos[:point_count, floating.positions] = poses
                 elif name != "w":
-                    columns[name](k)[:n] += size
-            self._add_effect_forces(steps, n, dict([moved["w"]]) if "w" in moved else {})
-            yield n, None if n == count else np.arange(n)
+                    columns[name](k)[:point_count] += size
+            self._add_effect_forces(steps, point_count, dict([moved["w"]]) if "w" in moved else {})
+            yield point_count, None if point_count == count else np.arange(point_count)
 
     def _add_effect_forces(
         self, steps: IndexArray, n: int, state_changes: Mapping[int, float]

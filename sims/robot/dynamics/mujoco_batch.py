@@ -336,21 +336,21 @@ class MujocoBatch:
         """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        n = len(positions)
-        qpos[:n, self.file_joints.positions] = positions
-        qvel[:n, self.file_joints.velocities] = velocities
-        qpos[:n, self.floating.positions] = floating_state.pose
-        qvel[:n, self.floating.velocities] = floating_state.rate
+        element_count = len(positions)
+        qpos[:element_count, self.file_joints.positions] = positions
+        qvel[:element_count, self.file_joints.velocities] = velocities
+        qpos[:element_count, self.floating.positions] = floating_state.pose
+        qvel[:element_count, self.floating.velocities] = floating_state.rate
         series = self.series_joints
-        series_positions = np.zeros((n, series.positions.size))
+        series_positions = np.zeros((element_count, series.positions.size))
         if series_positions.size:
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
-            self.batch.forward(self._get_element_ids(n))
-            loads = (passive - bias)[:n, series.velocities].T
+            self.batch.forward(self._get_element_ids(element_count))
+            loads = (passive - bias)[:element_count, series.velocities].T
             series_positions[:] = np.stack(
                 compute_rest_positions(self.fields, self.robot, list(loads)), axis=1
             )
-            qpos[:n, series.positions] = series_positions
+            qpos[:element_count, series.positions] = series_positions
         return series_positions, np.zeros_like(series_positions)
 
     def map_forces(self, forces: Array) -> Array:
@@ -398,22 +398,22 @@ class MujocoBatch:
         if forces.any() or before_call is not None:
             input_kinds |= int(state.mjSTATE_QFRC_APPLIED)
             inputs = np.concatenate([controls, forces], axis=2)
-        n, steps, _ = controls.shape
-        result = self._allocate_records(n, steps, record)
-        for part in self._split_at_switches(n, steps, off):
+        batch_size, steps, _ = controls.shape
+        records = self._allocate_records(batch_size, steps, record)
+        for steps_without_switch in self._split_at_switches(batch_size, steps, off):
             if before_call is not None:
-                before_call(part.start)
+                before_call(steps_without_switch.start)
             recorded = self.batch.rollout(
-                part.stop - part.start,
-                inputs[:, part],
+                steps_without_switch.stop - steps_without_switch.start,
+                inputs[:, steps_without_switch],
                 input_kinds,
                 tuple(record),
-                self._get_element_ids(n),
+                self._get_element_ids(batch_size),
             )
             for name, values in recorded.items():
-                result[name][:, part] = values
-        self._record_failures(n)
-        return result
+                records[name][:, steps_without_switch] = values
+        self._record_failures(batch_size)
+        return records
 
     def _split_at_switches(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
         """Yield the steps in consecutive parts, and switch actuators on or off before each part.
@@ -457,16 +457,16 @@ class MujocoBatch:
         Returns:
             Recorded fields (n, S, ...) by name.
         """
-        n, steps, _ = controls.shape
+        batch_size, steps, _ = controls.shape
         dofs = step_forces.addresses.velocities
         bind = self.batch.bind
         ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
         has_friction = bool(step_forces.has_dry_friction.any())
-        file_friction = self.begin_dry_friction(step_forces, n)
-        result = self._allocate_records(n, steps, record)
-        data_fields = {name: bind(name)[:n] for name in record}
-        ids = self._get_element_ids(n)
+        file_friction = self.begin_dry_friction(step_forces, batch_size)
+        records = self._allocate_records(batch_size, steps, record)
+        data_fields = {name: bind(name)[:batch_size] for name in record}
+        ids = self._get_element_ids(batch_size)
         # This precedes MuJoCo's first evaluation, since fields that are bound later would not
         # contain it.
         predictor = MidpointPredictor(
@@ -474,7 +474,7 @@ class MujocoBatch:
         )
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
         dofs_in_use = predictor.dof_indices
-        ctrl[:n] = controls[:, 0]
+        ctrl[:batch_size] = controls[:, 0]
         switches = (
             {}
             if off is None or not off.any()
@@ -487,22 +487,22 @@ class MujocoBatch:
             ranges.write(switches[0])
         self.batch.forward(ids)
         for k in range(steps):
-            ctrl[:n] = controls[:, k]
+            ctrl[:batch_size] = controls[:, k]
             if ranges is not None and k in switches:
                 ranges.write(switches[k])
                 changes[:, k] = True
             force, limit = step_forces.compute(k, predictor.read_joint_states(changes[:, k]))
-            applied[:n] = forces[:, k]
-            applied[:n, dofs_in_use] += force
+            applied[:batch_size] = forces[:, k]
+            applied[:batch_size, dofs_in_use] += force
             if has_friction:
-                loss[:n, dofs_in_use] = file_friction + np.maximum(limit, 0.0)
+                loss[:batch_size, dofs_in_use] = file_friction + np.maximum(limit, 0.0)
             self.batch.step(ids)
-            for name, values in result.items():
+            for name, values in records.items():
                 values[:, k] = data_fields[name]
         if ranges is not None:
             ranges.restore()
-        self._record_failures(n)
-        return result
+        self._record_failures(batch_size)
+        return records
 
     def begin_dry_friction(self, step_forces: StepwiseForces, n: int) -> Array:
         """Set the solver parameters of dry friction where effects add it.

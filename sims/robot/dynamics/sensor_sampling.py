@@ -91,22 +91,22 @@ def apply_effects_to_readings(
     Returns:
         The changed readings (L, T).
     """
-    result = readings
-    stamps = np.broadcast_to(times, result.shape)
+    affected = readings
+    stamps = np.broadcast_to(times, affected.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
         if effect.filters or type(effect).read is Sensor.read:
             continue
         active_elements = np.flatnonzero(is_active(c))
         signal = Signal(
-            result[active_elements],
-            np.zeros_like(result[active_elements]),
-            result[active_elements, :1],
+            affected[active_elements],
+            np.zeros_like(affected[active_elements]),
+            affected[active_elements, :1],
             stamps[active_elements],
             clock,
         )
-        result[active_elements] = effect.read(c[:, active_elements], signal)
-    return result
+        affected[active_elements] = effect.read(c[:, active_elements], signal)
+    return affected
 
 
 def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
@@ -202,7 +202,7 @@ class DriveSensorModel:
         The readings are changed in place.
         """
         given, mujoco_batch = self.given, self.batch
-        n = len(readings)
+        batch_size = len(readings)
         for actuator in self.robot.actuators:
             control_change = (
                 given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
@@ -212,13 +212,13 @@ class DriveSensorModel:
                 continue
             column = readings[:, :, mujoco_batch.drives[actuator.joint]]
             unshifted = column.copy()
-            column += control_change * self._compute_force_per_control(actuator)[:n, None]
+            column += control_change * self._compute_force_per_control(actuator)[:batch_size, None]
             np.clip(column, *self._get_force_limits(actuator), out=column)
             if actuator.joint in mujoco_batch.robot.coupled:
                 preceding_joint = find_preceding_joint(self.robot, actuator.joint)
                 assert preceding_joint is not None
                 coupling_coefficients: Array = mujoco_batch.fields[COUPLING_FIELD][
-                    :n, get_coupling_address(mujoco_batch.robot, actuator.joint)
+                    :batch_size, get_coupling_address(mujoco_batch.robot, actuator.joint)
                 ]
                 readings[:, :, mujoco_batch.drives[preceding_joint.name]] += coupling_coefficients[
                     :, None

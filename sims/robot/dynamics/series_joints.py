@@ -133,26 +133,26 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     joints = name_unnamed_elements(spec, robot)
     inertias = _compute_joint_inertias(robot)
     for name, effects in group_by_joint(added).items():
-        first = joints[robot.joint(name).id]
+        first_joint = joints[robot.joint(name).id]
         # Default classes of the file apply to the first joint only.
         zero_attributes = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
-        second = first.parent.add_joint(
+        second_joint = first_joint.parent.add_joint(
             name=make_series_joint_name(name, effects),
-            type=first.type,
-            axis=first.axis,
-            pos=first.pos,
+            type=first_joint.type,
+            axis=first_joint.axis,
+            pos=first_joint.pos,
         )
         for attribute, value in zero_attributes.items():
-            setattr(second, attribute, np.full_like(getattr(second, attribute), value))
-        second.springdamper = (0.0, 0.0)
-        second.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+            setattr(second_joint, attribute, np.full_like(getattr(second_joint, attribute), value))
+        second_joint.springdamper = (0.0, 0.0)
+        second_joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         has_backlash = any(effect.endswith("backlash") for effect in effects)
         limited = mujoco.mjtLimited
-        second.limited = limited.mjLIMITED_TRUE if has_backlash else limited.mjLIMITED_FALSE
+        second_joint.limited = limited.mjLIMITED_TRUE if has_backlash else limited.mjLIMITED_FALSE
         if has_backlash:
-            second.range = (-1.0, 1.0)
+            second_joint.range = (-1.0, 1.0)
         # The simulation writes the actual armature; this minimum makes the model compile.
-        first.armature = max(first.armature, COMPILE_INERTIA_SHARE * inertias[name])
+        first_joint.armature = max(first_joint.armature, COMPILE_INERTIA_SHARE * inertias[name])
     # Keyframes lack the new coordinates.
     for key in list(spec.keys):
         spec.delete(key)

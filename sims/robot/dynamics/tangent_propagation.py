@@ -197,18 +197,18 @@ class TangentModel:
         }
         if self._at.steps_joints_by_runge_kutta:
             displaced = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
-            base, base_readings = displaced()
+            unchanged_states, unchanged_readings = displaced()
         else:
             displaced = partial(self._at.step_displaced, acting=self._at.acting)
-            base, base_readings = self._base_step
+            unchanged_states, unchanged_readings = self._base_step
         quotients: list[tuple[Array, Array]] = []
         for kind in ("z", "f", "u"):
-            changes = np.zeros((*base.shape, len(displacements[kind])))
-            readings = np.zeros((*base_readings.shape, len(displacements[kind])))
+            changes = np.zeros((*unchanged_states.shape, len(displacements[kind])))
+            readings = np.zeros((*unchanged_readings.shape, len(displacements[kind])))
             for column, (name, j, difference) in enumerate(displacements[kind]):
                 changed, read = displaced(moved={name: (j, difference)})
-                changes[:, :, column] = (changed - base) / difference
-                readings[:, :, column] = (read - base_readings) / difference
+                changes[:, :, column] = (changed - unchanged_states) / difference
+                readings[:, :, column] = (read - unchanged_readings) / difference
             quotients.append((changes, readings))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
         if self._at.steps_joints_by_runge_kutta:
@@ -423,16 +423,16 @@ class TangentModel:
         simulated motion, and not zero for a measured one.
         """
         motion, joints = self._motion, self._motion.x.shape[1]
-        base, _ = self._every_step
-        result = np.zeros_like(base)
-        result[:, :joints] = motion.x[1:] - base[:, :joints]
-        result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
+        predicted_states, _ = self._every_step
+        defects = np.zeros_like(predicted_states)
+        defects[:, :joints] = motion.x[1:] - predicted_states[:, :joints]
+        defects[:, joints : 2 * joints] = motion.v[1:] - predicted_states[:, joints : 2 * joints]
         moves = motion.floating_state.rate.shape[1]
         if moves:
             # Displacements are relative to the motion itself.
-            result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
-            result[:, -moves:] = motion.floating_state.rate[1:] - base[:, -moves:]
-        return result
+            defects[:, -2 * moves : -moves] = -predicted_states[:, -2 * moves : -moves]
+            defects[:, -moves:] = motion.floating_state.rate[1:] - predicted_states[:, -moves:]
+        return defects
 
     def compute_defect_changes(self, similar: TangentModel) -> Array:
         """Compute how the defects (S, Z) differ from those of a model with other parameters.

@@ -217,36 +217,36 @@ class XmlText:
         child_indent = (
             self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
         )
-        parts = []
+        fragments = []
         inserted = [(child.before, format_element(child.name, child.new)) for child in tag.inserted]
         for comments, element in [*tag.within, *inserted]:
             for line in [
                 *map(self._render_comment, comments),
                 *([element.encode()] if element else []),
             ]:
-                parts += [self._newline + child_indent, line]
-        return b"".join(parts)
+                fragments += [self._newline + child_indent, line]
+        return b"".join(fragments)
 
     def _render_start_tag(self, tag: XmlElement) -> bytes:
         """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
         text = self.text[tag.begin : tag.inside]
         offset = 1 + len(tag.name.encode())
-        parts = [b"<", (tag.renamed or tag.name).encode()]
+        fragments = [b"<", (tag.renamed or tag.name).encode()]
         written_names = set()
         while attribute_match := _ATTRIBUTE.match(text, offset):
             name = attribute_match[2].decode()
             if name in tag.new:
-                parts.append(attribute_match[1] + _render_attribute(name, tag.new[name]))
+                fragments.append(attribute_match[1] + _render_attribute(name, tag.new[name]))
                 written_names.add(name)
             elif name not in tag.removed:
-                parts.append(attribute_match[0])
+                fragments.append(attribute_match[0])
             offset = attribute_match.end()
-        parts += [
+        fragments += [
             b" " + _render_attribute(name, value)
             for name, value in tag.new.items()
             if name not in written_names
         ]
-        return b"".join([*parts, text[offset:]])
+        return b"".join([*fragments, text[offset:]])
 
     def _render_comment(self, text: str) -> bytes:
         """Render text as an XML comment, with the line ends of the file."""
@@ -392,14 +392,14 @@ class MjcfDocument:
         tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
         _compare_with_model(tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators)))
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-        numbers = {
+        pair_ids = {
             frozenset(str(model.geom(geom).name) for geom in geoms): i
             for i, geoms in enumerate(pairs)
         }
         return tags_by_element | {
-            ModelElement("pair", numbers[geoms]): tag
+            ModelElement("pair", pair_ids[geoms]): tag
             for geoms, tag in self.find_pairs().items()
-            if geoms in numbers
+            if geoms in pair_ids
         }
 
     def find_pairs(self) -> dict[frozenset[str], XmlElement]:

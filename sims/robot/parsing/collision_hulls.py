@@ -301,18 +301,24 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         model.mesh_extrema[i] = hull.extrema
         model.mesh_graph[graph_end : graph_end + hull.graph.size] = hull.graph
         graph_end += hull.graph.size
-        rows = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
+        address_range = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
-        model.mesh_polynormal[rows] = hull.normals
-        first_indices, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
+        model.mesh_polynormal[address_range] = hull.normals
+        first_indices, counts = (
+            model.mesh_polyvertadr[address_range],
+            model.mesh_polyvertnum[address_range],
+        )
         corner_end = _write_lists(
             model.mesh_polyvert, first_indices, counts, hull.polygons, corner_end
         )
-        polygon_end = rows.stop
+        polygon_end = address_range.stop
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
-        rows = slice(first_vertex, first_vertex + hull.around.sizes.size)
-        first_indices, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
+        address_range = slice(first_vertex, first_vertex + hull.around.sizes.size)
+        first_indices, counts = (
+            model.mesh_polymapadr[address_range],
+            model.mesh_polymapnum[address_range],
+        )
         polygon_list_end = _write_lists(
             model.mesh_polymap, first_indices, counts, hull.around, polygon_list_end
         )

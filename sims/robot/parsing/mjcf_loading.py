@@ -126,15 +126,15 @@ def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> Non
     `factor` is the product of all counts above the element, since nested replicates multiply.
     """
     for key, value in element.items():
-        numbers = (
+        size_numbers = (
             [_parse_size(number_text) for number_text in value.split()]
             if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
             else []
         )
         max_value = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
         if key in COUNT_ATTRIBUTES:
-            factor *= math.prod(max(number, 1.0) for number in numbers)
-        if max([factor, *numbers]) > max_value or (
+            factor *= math.prod(max(number, 1.0) for number in size_numbers)
+        if max([factor, *size_numbers]) > max_value or (
             key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
         ):
             raise files.make_error(

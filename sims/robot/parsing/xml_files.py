@@ -107,16 +107,16 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
         InputError: the file cannot be read, is too large or is not XML, or it declares something
             that an XML parser would fetch or repeat (a document type, an entity).
     """
-    data = files.read_content(path, MAX_MODEL_BYTES)
+    file_content = files.read_content(path, MAX_MODEL_BYTES)
     files.included.append(path.resolve())
-    files.size += len(data)
+    files.size += len(file_content)
     if files.size > MAX_MODEL_BYTES:
         raise InputError(
             f"{files.path}: with what it includes it has more than {MAX_MODEL_BYTES} bytes"
         )
     # Like MuJoCo's parser, accept blank lines before the declaration and zero bytes after the end.
-    text = data.rstrip(b"\0").lstrip(b" \t\r\n")
-    skipped_lines = data[: data.find(text[:1])].count(b"\n") if text else 0
+    text = file_content.rstrip(b"\0").lstrip(b" \t\r\n")
+    skipped_lines = file_content[: file_content.find(text[:1])].count(b"\n") if text else 0
     parser = expat.ParserCreate()
     builder = _LineTrackingTreeBuilder(files, path, parser, skipped_lines)
     try:

@@ -114,17 +114,17 @@ def list_places(
     may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
     last_joint_of_body = {int(body): i for i, body in enumerate(bodies)}
-    for number, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
-        joint_numbers[joint.name] = number
+    for joint_index, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
+        joint_numbers[joint.name] = joint_index
         places["joint"].append(
             EffectPlace(
                 joint.name,
                 joint.kind,
-                number,
+                joint_index,
                 "",
                 joint.unit,
-                scales.force[number],
-                scales.inertia[number],
+                scales.force[joint_index],
+                scales.inertia[joint_index],
                 _get_file_values(robot, joint.velocity, joint.id),
                 f"joint {joint.name}",
                 last=last_joint_of_body[int(bodies[joint.id])] == joint.id,
