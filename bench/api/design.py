@@ -82,7 +82,15 @@ class NextRecording:
 
 
 def _format_discrimination(design: NextRunDesign) -> list[str]:
-    """Format which causes a run distinguishes, and which it does not."""
+    """Format which causes a run distinguishes from the present one, and which it does not.
+
+    The discrimination of two causes is the squared distance between their predictions, in noise
+    standard deviations. It is proportional to the number of recordings, which gives the number of
+    repeats that would be needed.
+
+    Args:
+        design: the designed run with its discrimination.
+    """
     lines, discrimination = [], design.discrimination
     if design.distinguished_effects:
         distances = [

@@ -85,6 +85,7 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
         for part, coefficients in effect_class().parts(c):
             none = _acts_on(part, coefficients, kind) == ()
             check(none, "no contribution at zero", "one", location)
+        # Shares of the plausible range: no effect, and an arbitrary one.
         lanes = np.concatenate(
             [_make_coefficients(effect_class, 0.0), _make_coefficients(effect_class, 0.7)]
         )
@@ -158,7 +159,11 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
 
 
 def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
-    """Check that an effect family equals its members with the same coefficients, bit for bit."""
+    """Check that an effect family equals its members with the same coefficients, bit for bit.
+
+    A family is an effect at all places of one kind, such as friction in all joints; its members are
+    the effects at single places.
+    """
     kind = make_arm_simulator(effect)
     families = [
         effect_class

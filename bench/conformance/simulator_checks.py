@@ -105,7 +105,10 @@ def _check_inertia(kind: type[OwnSimulator], value: float | Array) -> None:
 
 
 def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that twice as many steps of half the length lead to about the same state."""
+    """Check that twice as many steps of half the length lead to about the same state.
+
+    A step that ignores its `seconds` would go twice as far.
+    """
     if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
     simulator = kind()
@@ -175,7 +178,7 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
             force = np.zeros(len(kind.coordinates))
             force[place] = size
             forced = _simulate_motion(simulator, force)
-            size *= 10.0
+            size *= 10.0  # a heavy system needs a large force to move visibly
         found_text = f"the same motion with forces up to {_MAX_TRIED_FORCE:g}"
         check(
             not is_bitwise_equal(unforced, forced),

@@ -175,7 +175,11 @@ def place_of(name: str) -> str:
 
 
 def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
-    """Build a table with one row per number of each cause, those of the commonest cause first."""
+    """Build a table with one row per number of each cause, those of the commonest cause first.
+
+    Args:
+        rows: results of the diagnoses, one for each log.
+    """
     lines = []
     for log_number, row in enumerate(rows, start=1):
         for cause in row.causes:

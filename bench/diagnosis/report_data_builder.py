@@ -235,7 +235,10 @@ class DiagnosisReportDataBuilder:
             )
 
     def _list_unexplained(self) -> Iterator[str]:
-        """Yield sentences on what the extended model does not explain, and further notes."""
+        """Yield sentences on what the extended model does not explain, and further notes.
+
+        The notes name parameters that the data do not determine, and bounds that a fit has reached.
+        """
         evaluator = self.assessor.fitting_evaluator
         lack_of_fit = self.finding.lack_of_fit
         for channel in lack_of_fit.channels_above_noise:

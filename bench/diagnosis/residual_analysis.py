@@ -84,18 +84,18 @@ def _list_parts(
     """
     observed_mask = np.isfinite(evaluator.observed)
     runs, _, channels = observed_mask.shape
-    parts: list[tuple[str, str, Mask]] = []
+    data_parts: list[tuple[str, str, Mask]] = []
     for r, run_data in enumerate(evaluator.prepared_runs):
         is_run = np.arange(runs) == r
         mask = observed_mask & is_run[:, None, None]
-        parts.append(("run", run_data.name + mark, mask))
+        data_parts.append(("run", run_data.name + mark, mask))
     for c, name in enumerate(evaluator.channels):
         is_channel = np.arange(channels) == c
-        parts.append(("channel", name, observed_mask & is_channel))
+        data_parts.append(("channel", name, observed_mask & is_channel))
     # Phases come from the simulation, because noise of a measured speed would cause false ones.
     for phase, phase_mask in detect_phases(evaluator, simulated).items():
-        parts.append(("phase", phase, observed_mask & phase_mask[:, :, None]))
-    return parts
+        data_parts.append(("phase", phase, observed_mask & phase_mask[:, :, None]))
+    return data_parts
 
 
 def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:

@@ -269,6 +269,7 @@ def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
         ProtocolError: the reported costs are impossible.
     """
     simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
+    # A billion seconds are 32 years; NaN is refused, too.
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
         raise ProtocolError("it reported an impossible number of simulations")
     if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:

@@ -350,7 +350,7 @@ class _EvaluationRun:
         systems = sorted(required_systems & set(simulators.names()))
         codes = {name: make_diagnoser_spec(name) for name in self._study.usable_diagnosers}
         learned_names = [name for name in codes if diagnosers.get(name).learned]
-        pairs = [(name, system) for name in learned_names for system in systems]
+        untrained = [(name, system) for name in learned_names for system in systems]
         budget = self._experiment.training_budget
         calls: list[Call] = [
             (
@@ -365,13 +365,13 @@ class _EvaluationRun:
                     trusted,
                 ),
             )
-            for name, system in pairs
+            for name, system in untrained
         ]
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
         training_costs = []
         step = self._progress("training", len(calls)) if calls else None
         for index, result in workers.iterate_results(calls, math.inf) if calls else ():
-            name, system = pairs[index]
+            name, system = untrained[index]
             if isinstance(result, TrainedDiagnoser):
                 files[name][system] = result.path
                 training_costs.append(

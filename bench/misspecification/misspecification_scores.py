@@ -282,7 +282,7 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
             base_errors, extended_errors, scores.experiment.name, metric
         )
         friedman = [_compute_friedman_p_value(errors) for errors in (base_errors, extended_errors)]
-        numbers = (
+        agreement_numbers = (
             agreement.tau,
             agreement.low,
             agreement.high,
@@ -290,7 +290,9 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
             agreement.p_value,
             *friedman,
         )
-        lines.append((scores.experiment.name, metric, len(tuners), len(targets), *numbers))
+        lines.append(
+            (scores.experiment.name, metric, len(tuners), len(targets), *agreement_numbers)
+        )
     return pd.DataFrame(lines, columns=RANK_AGREEMENT_COLUMNS)
 
 

@@ -270,5 +270,6 @@ def draw_intervals(
     )
     band_extent = None
     if band is not None:
+        # A narrow band is drawn 1.5 pixels wide, so that it remains visible.
         band_extent = to_pixels(band[0]), max(to_pixels(band[1]) - to_pixels(band[0]), 1.5)
     return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

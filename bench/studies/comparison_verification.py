@@ -337,17 +337,22 @@ def _verify_tables(
                 VerificationFailure(path.name, 0, f"expected a column {column}, found none")
             )
             continue
-        a = expected[column].reset_index(drop=True)
-        b = stored_table[column].reset_index(drop=True)
-        if pd.api.types.is_numeric_dtype(a) and a.dtype != bool:
+        expected_values = expected[column].reset_index(drop=True)
+        found_values = stored_table[column].reset_index(drop=True)
+        if pd.api.types.is_numeric_dtype(expected_values) and expected_values.dtype != bool:
             is_equal = np.isclose(
-                a.astype(float), b.astype(float), rtol=_ARITHMETIC_TOLERANCE, equal_nan=True
+                expected_values.astype(float),
+                found_values.astype(float),
+                rtol=_ARITHMETIC_TOLERANCE,
+                equal_nan=True,
             )
         else:
-            is_equal = (a.astype(str) == b.fillna("").astype(str)).to_numpy()
+            is_equal = (
+                expected_values.astype(str) == found_values.fillna("").astype(str)
+            ).to_numpy()
         if not is_equal.all():
             place = int(np.argmin(is_equal))
-            message = f"{column}: expected {a[place]}, found {b[place]}"
+            message = f"{column}: expected {expected_values[place]}, found {found_values[place]}"
             failures.append(VerificationFailure(path.name, int(lines[place]) + 2, message))
     print_line(f"table.csv: {len(stored_table)} rows recomputed from runs.parquet")
     return failures

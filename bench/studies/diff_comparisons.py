@@ -176,20 +176,22 @@ class ComparisonDiff:
         both use the logarithm of each target's mean error over seeds. ``ratio`` is the change of
         the error of b relative to a, and infinite errors count as failures.
         """
-        a, b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
+        errors_a, errors_b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
         shared_targets = self.shared_targets
-        common_keys = [key for key in a.index if key in b.index and key[0] in shared_targets]
+        common_keys = [
+            key for key in errors_a.index if key in errors_b.index and key[0] in shared_targets
+        ]
         is_paired = bool(common_keys)
         if is_paired:
-            a, b = a[common_keys], b[common_keys]
-        target_means = [errors.groupby(level="target").mean() for errors in (a, b)]
+            errors_a, errors_b = errors_a[common_keys], errors_b[common_keys]
+        target_means = [errors.groupby(level="target").mean() for errors in (errors_a, errors_b)]
         log_errors_a, log_errors_b = (
             compute_log_errors(np.asarray(errors, dtype=np.float64)) for errors in target_means
         )
         if is_paired:
-            count, _, _, ratio, p = compare_pair(log_errors_b, log_errors_a)
+            count, _, _, ratio, p_value = compare_pair(log_errors_b, log_errors_a)
         else:
-            count, ratio, p = (
+            count, ratio, p_value = (
                 min(len(log_errors_a), len(log_errors_b)),
                 *_compare_unpaired(log_errors_a, log_errors_b),
             )
@@ -204,9 +206,9 @@ class ComparisonDiff:
             "ratio": ratio,
             "targets": count,
             "paired": is_paired,
-            "p_value": p,
-            "failures_a": int(np.isinf(a).sum()),
-            "failures_b": int(np.isinf(b).sum()),
+            "p_value": p_value,
+            "failures_a": int(np.isinf(errors_a).sum()),
+            "failures_b": int(np.isinf(errors_b).sum()),
         }
 
     @cached_property

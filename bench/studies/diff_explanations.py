@@ -262,7 +262,10 @@ class ExplanationDiff:
         ]
 
     def _compare_candidates(self) -> list[dict[str, Any]]:
-        """Return the best candidates of either explanation, with score and rank in both."""
+        """Return the best candidates of either explanation, with score and rank in both.
+
+        A candidate that one of the explanations does not rank has None as its score and rank there.
+        """
         ranked = [
             {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
             for each in (self.a, self.b)

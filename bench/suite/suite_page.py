@@ -6,6 +6,7 @@ the results.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -315,7 +316,7 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
     mean_ranks, counts = ranks.mean(), ranks.notna().sum(axis=1)
     rows = []
     for tuner in sorted(
-        order, key=lambda t: (t not in tables.complete_tuners, mean_ranks.get(t, 1e9))
+        order, key=lambda t: (t not in tables.complete_tuners, mean_ranks.get(t, math.inf))
     ):
         entries = []
         for cell in map(str, ranks.index):
@@ -347,7 +348,7 @@ def _build_cells(
         styles: styles of marks by name of the tuner.
     """
     points = [k for k in _CURVE_POINTS if k <= tables.suite.budget]
-    parts = []
+    curve_tables = []
     for cell, curves in tables.curves.items():
         for tuner in curves.list_tuners():
             values = curves.select(tuner=tuner).values[:, points]
@@ -357,8 +358,8 @@ def _build_cells(
                 {"cell": cell, "tuner": tuner, "simulations": points, "median": median,
                  "low": low, "high": high}
             )  # fmt: skip
-            parts.append(frame[np.isfinite(frame["median"])])
-    page.add_table("curves", pd.concat(parts, ignore_index=True), _DIGITS)
+            curve_tables.append(frame[np.isfinite(frame["median"])])
+    page.add_table("curves", pd.concat(curve_tables, ignore_index=True), _DIGITS)
     ticks = tuple(float(k) for k in (0, *tables.checkpoints))
     x_axis = Axis("simulations used on the target", "symlog", ("symlog", "linear"), ticks)
     cells = []

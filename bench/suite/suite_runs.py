@@ -124,18 +124,18 @@ def collect_suite_runs(folder: Path) -> SuiteRuns:
     Raises:
         InputError: no comparison is finished, or a folder is damaged.
     """
-    parts = [
+    collected_runs = [
         _collect_comparison(part, condition)
         for part, condition in list_comparison_folders(folder)
         if (part / "runs.parquet").is_file() and not (part / SEGMENTS_FOLDER).exists()
     ]
-    parts = [part for part in parts if len(part.runs)]
-    if not parts:
+    collected_runs = [part for part in collected_runs if len(part.runs)]
+    if not collected_runs:
         raise InputError(
             f"{folder}: expected at least one finished comparison of a suite, found none; finish "
             f"it with simgap compare --resume {folder}"
         )
-    return concatenate(parts)
+    return concatenate(collected_runs)
 
 
 def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:

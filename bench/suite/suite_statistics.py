@@ -283,7 +283,11 @@ class SuiteTables:
 
     @cached_property
     def running_times(self) -> pd.DataFrame:
-        """Expected running times to three error levels, without and with the cost of training."""
+        """Compute expected running times to three error levels, also with the training's cost.
+
+        The levels of a problem from recorded data are multiples of its smallest error, since its
+        true parameters are unknown.
+        """
         lines = []
         for row in self.suite.cells.itertuples():
             cell = str(row.cell)
@@ -342,7 +346,11 @@ class SuiteTables:
         return pd.DataFrame(lines, columns=PROFILE_COLUMNS)
 
     def list_properties(self) -> Iterator[tuple[str, str, list[str]]]:
-        """Yield each property of problems with one of its values, and the cells that have it."""
+        """Yield each property of problems with one of its values, and the cells that have it.
+
+        Cells are those of the tables: one problem with one range of targets each. The properties
+        are the numbers of parameters, noise, range, simulator and data.
+        """
         cells = self.suite.cells
         tags = cells["tags"].str.split(";")
         dimension = cells["parameters"].astype(int)

@@ -225,7 +225,7 @@ def _fit_gaussian_process(points: Array, values: Array) -> Any:
     from gpytorch.mlls import ExactMarginalLogLikelihood
 
     kernel = MaternKernel(
-        nu=2.5,
+        nu=2.5,  # the surrogate is twice differentiable
         ard_num_dims=points.shape[1],
         lengthscale_constraint=Interval(_MIN_LENGTH_SCALE, _MAX_LENGTH_SCALE),
     )

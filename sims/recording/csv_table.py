@@ -193,12 +193,12 @@ class RecordingTable:
             records: cells of each row.
         """
         names: list[str] = []
-        parts: list[list[Array]] = []
+        converted_blocks: list[list[Array]] = []
         while rows := list(islice(records, _ROWS_PER_CHUNK)):
             padded_rows = self._check_row_widths(rows, len(header), len(names))
             by_column = zip(*padded_rows, strict=True)
             cells = dict(zip(header, by_column, strict=True))
-            parts.append(
+            converted_blocks.append(
                 [
                     self._convert_to_numbers(name, cells[name], len(names))
                     for name in self.wanted[1:]
@@ -206,9 +206,9 @@ class RecordingTable:
             )
             names += [name.strip() for name in cells["run"]]
         numeric = self.wanted[1:]
-        if not parts:
+        if not converted_blocks:
             return names, {name: np.empty(0) for name in numeric}
-        columns = map(np.concatenate, zip(*parts, strict=True))
+        columns = map(np.concatenate, zip(*converted_blocks, strict=True))
         return names, dict(zip(numeric, columns, strict=True))
 
     def _iterate_records(self) -> Iterator[list[str]]:
@@ -352,19 +352,19 @@ class RecordingTable:
                     f"run {format_value(name)} continues after another run began; "
                     "expected its rows together",
                 )
-            part = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
+            signals = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
             if end - begin < 2:
                 self.raise_error(
                     begin, "run", f"run {format_value(name)} has one row; expected at least two"
                 )
-            if not any(np.isfinite(part[c]).any() for c in self.channels):
+            if not any(np.isfinite(signals[c]).any() for c in self.channels):
                 self.raise_error(
                     begin,
                     self.channels[0],
                     f"run {format_value(name)} has no sample of any channel",
                 )
             self._check_seconds(columns["t"], begin, end - 1)
-            runs[name] = CsvRun(name, make_read_only(columns["t"][begin:end]), part)
+            runs[name] = CsvRun(name, make_read_only(columns["t"][begin:end]), signals)
         return list(runs.values())
 
     def _check_seconds(self, t: Array, first: int, last: int) -> None:

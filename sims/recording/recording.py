@@ -366,7 +366,13 @@ _HELD_OUT_STRIDE = 3
 
 
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
-    """Make a run in SI units from its table and the metadata of the description."""
+    """Make a run in SI units from its table and the metadata of the description.
+
+    Args:
+        table: CSV file of the run, for error messages.
+        part: columns of the run in the units of the file.
+        description: units, scales and metadata from the TOML file.
+    """
     metadata = description.runs.get(part.name, _UNMARKED)
     channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
     inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}

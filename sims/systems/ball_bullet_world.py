@@ -45,15 +45,17 @@ def build(client: int, constants: Mapping[str, float]) -> int:
         client: Bullet client of an empty world.
         constants: constants of the system by name.
     """
-    p = bullet_world.import_pybullet()
+    pybullet = bullet_world.import_pybullet()
     ground, ball = _create_ground_and_ball(client, constants)
     # There is no push-out, s of (3) is zero, and slow impacts rebound as well.
-    p.setPhysicsEngineParameter(
+    pybullet.setPhysicsEngineParameter(
         contactERP=0.0, contactSlop=0.0, restitutionVelocityThreshold=0.0, physicsClientId=client
     )
     # The contact uses the product of both bodies' values: with 1 for the ground, the ball's own.
-    p.changeDynamics(ground, -1, restitution=1.0, lateralFriction=1.0, physicsClientId=client)
-    p.changeDynamics(
+    pybullet.changeDynamics(
+        ground, -1, restitution=1.0, lateralFriction=1.0, physicsClientId=client
+    )
+    pybullet.changeDynamics(
         ball,
         -1,
         linearDamping=0.0,
@@ -74,17 +76,17 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
         constants: constants of the system by name.
         settings: settings of the engine by name.
     """
-    p = bullet_world.import_pybullet()
+    pybullet = bullet_world.import_pybullet()
     ground, ball = _create_ground_and_ball(client, constants)
     friction = settings["lateral_friction"]
-    p.changeDynamics(
+    pybullet.changeDynamics(
         ground,
         -1,
         restitution=settings["plane_restitution"],
         lateralFriction=friction,
         physicsClientId=client,
     )
-    p.changeDynamics(
+    pybullet.changeDynamics(
         ball,
         -1,
         lateralFriction=friction,

@@ -149,26 +149,28 @@ class TwoLinkArm(OwnSimulator):
         """
         if "_world" not in self.__dict__:
             self._world = BulletWorld()
-        p = self._world
-        p.resetSimulation()
-        p.setGravity(0.0, 0.0, -constants["gravity"])
+        pybullet = self._world
+        pybullet.resetSimulation()
+        pybullet.setGravity(0.0, 0.0, -constants["gravity"])
         # All rounds, whatever the residual: what friction holds must stand still.
-        p.setPhysicsEngineParameter(numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0)
+        pybullet.setPhysicsEngineParameter(
+            numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0
+        )
         self._arm = self._build_arm(theta, constants)
         for joint in (0, 1):
             inertia = constants[f"inertia{joint + 1}"]
             damping = theta[f"damping{joint + 1}"]
-            p.changeDynamics(
+            pybullet.changeDynamics(
                 self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping
             )
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
         # Looked up once: a run has thousands of each.
-        self._place = p.resetJointState
-        self._push = p.setJointMotorControl2
-        self._state = p.getJointState
-        self._go = p.stepSimulation
-        self._torque = p.TORQUE_CONTROL
+        self._place = pybullet.resetJointState
+        self._push = pybullet.setJointMotorControl2
+        self._state = pybullet.getJointState
+        self._go = pybullet.stepSimulation
+        self._torque = pybullet.TORQUE_CONTROL
         self._q = [initial["q1"], initial["q2"]]
         self._v = [initial["qd1"], initial["qd2"]]
 
@@ -179,8 +181,8 @@ class TwoLinkArm(OwnSimulator):
             theta: masses (kg) and distances of the centres of mass (m) by name.
             constants: length of the first link (m).
         """
-        p = self._world
-        arm: int = p.createMultiBody(
+        pybullet = self._world
+        arm: int = pybullet.createMultiBody(
             linkMasses=[theta["mass1"], theta["mass2"]],
             linkCollisionShapeIndices=[-1, -1],
             linkVisualShapeIndices=[-1, -1],
@@ -192,12 +194,14 @@ class TwoLinkArm(OwnSimulator):
             ],
             linkInertialFrameOrientations=[_IDENTITY_QUATERNION, _IDENTITY_QUATERNION],
             linkParentIndices=[0, 1],
-            linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
+            linkJointTypes=[pybullet.JOINT_REVOLUTE, pybullet.JOINT_REVOLUTE],
             linkJointAxis=[_JOINT_AXIS, _JOINT_AXIS],
         )
         # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
-        p.changeDynamics(arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT)
-        p.changeDynamics(arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
+        pybullet.changeDynamics(
+            arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT
+        )
+        pybullet.changeDynamics(arm, -1, activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING)
         return arm
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:

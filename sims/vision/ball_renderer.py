@@ -77,12 +77,14 @@ class SceneAppearance:
             horizontal * np.sin(azimuth),
             np.sin(elevation),
         ]
+        # A ball of any colour, on a ground from grey to weakly coloured, below a bright sky.
         ground = _draw_colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
         ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         while np.max(np.abs(np.subtract(ball, ground))) < _MIN_CONTRAST:
             ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         sky = _draw_colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
         full_turn = 2 * np.pi
+        # Each wave has 0.5 to 6 rad/m and changes the brightness of the ground by up to 4 %.
         bearing = rng.uniform(0, full_turn, _WAVE_COUNT)
         wave_number = rng.uniform(0.5, 6.0, _WAVE_COUNT)
         phase = rng.uniform(0, full_turn, _WAVE_COUNT)
@@ -97,7 +99,7 @@ class SceneAppearance:
             sky,
             make_read_only(waves),
             shadow=rng.uniform(0.2, 0.6),
-            noise=rng.uniform(0.5, 2.5),
+            noise=rng.uniform(0.5, 2.5),  # grey levels
             crf=int(rng.integers(14, 24)),
         )
 
@@ -203,22 +205,22 @@ class BallScene:
         self.appearance = appearance
         self.radius = radius
         self._rng = rng
-        p = bullet_world.import_pybullet()
-        self._client: int = p.connect(p.DIRECT)
-        self.close = weakref.finalize(self, p.disconnect, self._client)
+        pybullet = bullet_world.import_pybullet()
+        self._client: int = pybullet.connect(pybullet.DIRECT)
+        self.close = weakref.finalize(self, pybullet.disconnect, self._client)
         extents = [_HALF_GROUND_SIDE, _HALF_GROUND_SIDE, _HALF_GROUND_THICKNESS]
-        ground = self._create_body(p.GEOM_BOX, appearance.ground, halfExtents=extents)
+        ground = self._create_body(pybullet.GEOM_BOX, appearance.ground, halfExtents=extents)
         self._move_body(ground, (0, 0, -_HALF_GROUND_THICKNESS))
         width, height = camera.size
         full_window = 0, 0, width, height
         self._rays = self._compute_view_directions()
         picture, covered = self._render_body(full_window, 1, ground)
         # Frames are rendered without the ground, because it does not change.
-        p.removeBody(ground, physicsClientId=self._client)
+        pybullet.removeBody(ground, physicsClientId=self._client)
         self._background = self._render_background(picture, covered)
         points, faces = make_sphere_mesh()
         self._ball = self._create_body(
-            p.GEOM_MESH,
+            pybullet.GEOM_MESH,
             appearance.ball,
             vertices=(radius * points).tolist(),
             indices=faces,
@@ -250,15 +252,15 @@ class BallScene:
 
     def _create_body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
         """Create a body that is only drawn; `size` are the arguments of Bullet's shape."""
-        p = bullet_world.import_pybullet()
-        visual = p.createVisualShape(
+        pybullet = bullet_world.import_pybullet()
+        visual = pybullet.createVisualShape(
             shape,
             rgbaColor=[*colour, 1.0],
             physicsClientId=self._client,
             **size,
         )
         # No mass and no collision shape, because nothing is simulated here.
-        body: int = p.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
+        body: int = pybullet.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
         return body
 
     def _compute_view_directions(self) -> Array:
@@ -368,7 +370,7 @@ class BallScene:
         Returns:
             Mean colours of the body (height, width, 3), and its coverage (height, width, 1).
         """
-        p = bullet_world.import_pybullet()
+        pybullet = bullet_world.import_pybullet()
         camera = self.camera
         left, top, right, bottom = window
         width = right - left
@@ -384,7 +386,7 @@ class BallScene:
         right_edge = right - 0.5 - u
         lower_edge = bottom - 0.5 - v
         upper_edge = top - 0.5 - v
-        projection = p.computeProjectionMatrix(
+        projection = pybullet.computeProjectionMatrix(
             pixel_size * left_edge,
             pixel_size * right_edge,
             -pixel_size * lower_edge,
@@ -392,15 +394,15 @@ class BallScene:
             _NEAR_PLANE,
             _FAR_PLANE,
         )
-        view = p.computeViewMatrix(camera.position, camera.target, (0, 0, 1))
-        _, _, colours, _, bodies = p.getCameraImage(
+        view = pybullet.computeViewMatrix(camera.position, camera.target, (0, 0, 1))
+        _, _, colours, _, bodies = pybullet.getCameraImage(
             width * oversampling,
             height * oversampling,
             view,
             projection,
             lightDirection=self.appearance.light.tolist(),
             shadow=0,
-            renderer=p.ER_TINY_RENDERER,
+            renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )
         # Average the fine pixels of each pixel; only colours of the body itself count.

@@ -32,7 +32,12 @@ class Availability:
 
 
 def availability(experiment: Experiment) -> Availability:
-    """Find what is missing for an experiment, or for all experiments that it names."""
+    """Find what is missing for an experiment, or for all experiments that it names.
+
+    These can be a data set, a model file or a recording, a simulator, an engine, or packages of the
+    tuners. A data set that is not yet downloaded may contain the missing files, so it is reported
+    alone.
+    """
     if experiment.experiments:
         return _combine_availability(experiment)
     data_set = _find_missing_data_set(experiment)
@@ -92,18 +97,26 @@ def _combine_availability(experiment: Experiment) -> Availability:
         for part_experiment in expand_sweep(experiment)
     }
     runnable = {
-        n: part for n, part in availability_by_name.items() if not (part.data_set or part.skipped)
+        n: member_availability
+        for n, member_availability in availability_by_name.items()
+        if not (member_availability.data_set or member_availability.skipped)
     }
     if experiment.suite and runnable:
         availability_by_name = runnable
-    data_sets = [part.data_set for part in availability_by_name.values() if part.data_set]
+    data_sets = [
+        member_availability.data_set
+        for member_availability in availability_by_name.values()
+        if member_availability.data_set
+    ]
     skipped = [
-        f"{name} {part.skipped}" for name, part in availability_by_name.items() if part.skipped
+        f"{name} {member_availability.skipped}"
+        for name, member_availability in availability_by_name.items()
+        if member_availability.skipped
     ]
     missing_tuners = {
         label: reason
-        for part in availability_by_name.values()
-        for label, reason in part.tuners.items()
+        for member_availability in availability_by_name.values()
+        for label, reason in member_availability.tuners.items()
     }
     return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
 

@@ -209,18 +209,18 @@ def _list_source_classes(kind: type) -> list[type]:
 
     Their sources together determine the behaviour of the class, so all of them are hashed.
     """
-    parts: list[type] = []
+    classes: list[type] = []
     waiting = [kind]
     while waiting:
         for part in waiting.pop().__mro__:
             # Classes of the standard library are determined by the version of Python. A base that
             # only describes an interface is found there. A class that a metaclass made only names
             # such a module.
-            if part in parts or (_is_standard_library(part) and _is_defined_in_module(part)):
+            if part in classes or (_is_standard_library(part) and _is_defined_in_module(part)):
                 continue
-            parts.append(part)
+            classes.append(part)
             waiting += vars(part).get("made_of", ())
-    return parts
+    return classes
 
 
 def _is_standard_library(kind: type) -> bool:

@@ -472,7 +472,13 @@ def _train_learned_entries(
 
 
 def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exception) -> None:
-    """Store the result of a worker: an outcome, or the error that ended the run."""
+    """Store the result of a worker: an outcome, or the error that ended the run.
+
+    Args:
+        results: results so far; the run is added to its tables and notes.
+        index: position of the run in the plan.
+        outcome: what the worker returned or raised.
+    """
     problem, job = results.problem, results.plan[index]
     # Every run gets rows and a status, because a failure is a result too.
     if isinstance(outcome, TimeoutError):

@@ -149,10 +149,10 @@ def _serve_simulation(
     It serves a learned tuner that trains in an isolated process. A request that is not valid, or
     beyond the budget, is answered by a refusal (message X), and the training can continue.
     """
-    result: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
         try:
-            result = _simulate_points(message, simulator)
+            arrays = _simulate_points(message, simulator)
         except (ValueError, BudgetExceededError) as error:
             kind = "budget" if isinstance(error, BudgetExceededError) else "value"
             refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
@@ -166,7 +166,7 @@ def _serve_simulation(
         "inputs": simulator.scene.inputs,
         "counts": np.array([simulator.used, simulator.budget], dtype=np.int64),
     }
-    child.send(b"O", *pack_arrays({**properties, **result}), deadline=_NO_DEADLINE)
+    child.send(b"O", *pack_arrays({**properties, **arrays}), deadline=_NO_DEADLINE)
 
 
 def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:

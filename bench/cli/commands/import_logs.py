@@ -52,12 +52,12 @@ def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         f"{options.out}: {len(imported.guessed)} guesses, each marked in the file; "
         "nothing was copied"
     )
-    for line in imported.checks:
-        print_line(f"check: {line}")
-    for line in imported.guessed:
-        print_line(f"guess: {line}")
-    for line in imported.untold:
-        print_line(f"not known: {line}")
+    for text in imported.checks:
+        print_line(f"check: {text}")
+    for text in imported.guessed:
+        print_line(f"guess: {text}")
+    for text in imported.untold:
+        print_line(f"not known: {text}")
     print_line(f"next: simgap inspect {options.out}")
     return CommandResult(
         {

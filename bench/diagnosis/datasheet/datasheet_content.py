@@ -124,7 +124,12 @@ class _Rows:
     detection_limits: DetectionLimits
 
     def derived(self) -> Iterator[SheetRow]:
-        """Yield quantities derived from the system's parameters, by error propagation."""
+        """Yield quantities derived from the system's parameters, by error propagation.
+
+        The covariance of the fitted parameters is multiplied by the slopes of each derived
+        quantity, from forward differences. A quantity that needs an unknown or a varying constant
+        is left out.
+        """
         parameters = self.extended.parameters
         values = {name: fitted_value.value for name, fitted_value in parameters.items()}
         values_by_name = {**self.extended.constants, **values}

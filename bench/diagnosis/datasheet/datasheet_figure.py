@@ -222,7 +222,16 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
 
 
 def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
-    """Choose the font size of a table, and the left edges of its columns as shares of the width."""
+    """Choose the font size of a table, and where its columns begin.
+
+    The size is reduced until the table fits between the margins, but not below `_LEAST_SIZE`.
+
+    Args:
+        rows: cells of each row, with the headings as the first row.
+
+    Returns:
+        Font size in points, and left edges of the columns as shares of the page width.
+    """
     size = _TABLE_SIZE
     while True:
         widths = [measure_text_width(column, size, "bold") for column in zip(*rows, strict=True)]

@@ -306,7 +306,16 @@ class _DetectionLimitCalculator:
         self.newton_steps = gradients / np.maximum(self.powers, 1e-300)  # (2)
 
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
-        """Compute the detection limit of each coefficient, at the shape that is detected best."""
+        """Compute the detection limit of each coefficient, at the shape that is detected best.
+
+        A shape is a probe of the coefficient with certain values of the effect's other
+        coefficients. A limit or backlash does not change the runs in proportion to its size, so its
+        limit is the smallest detectable size that was tried.
+
+        Args:
+            prediction_half_widths: half the 95 % interval of each parameter in a run that is not
+                yet recorded, by name; passed on to the result.
+        """
         shapes_by_coefficient: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.direction_set.candidates[k]

@@ -57,6 +57,7 @@ def _compute_factor(run: Run) -> int:
     intervals = np.diff(run.times)
     if not intervals.size:
         return 1
+    # The small addend keeps rounding from reducing a whole number of intervals by one.
     return max(int(MAX_TIME_STEP / float(np.median(intervals)) + 1e-6), 1)
 
 

@@ -327,6 +327,7 @@ def _compute_largest_factor(signal: Array, limits: Interval) -> float:
     ends = zip((float(signal.min()), float(signal.max())), limits, strict=True)
     # No factor reaches a limit of the opposite sign.
     factors = [limit / end for end, limit in ends if np.isfinite(limit) and end * limit > 0]
+    # A factor with three decimals is easy to set.
     return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
 
 

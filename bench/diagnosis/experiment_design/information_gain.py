@@ -310,7 +310,7 @@ class RunRanker:
         fit = competing_model.model.fit
         simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
         target = self._whiten(simulated)[0]
-        theta, states, deviation = (
+        theta, initial_state, deviation = (
             fit.theta.copy(),
             run.states.copy(),
             np.zeros(fit.free_indices.size),
@@ -325,7 +325,7 @@ class RunRanker:
             _, step, state_step = _compute_remaining_difference(
                 target - linearisation.centre, linearisation, competing_model, deviation, damping
             )
-            trial_theta, trial_states = theta.copy(), states.copy()
+            trial_theta, trial_states = theta.copy(), initial_state.copy()
             trial_theta[fit.free_indices] += step * competing_model.spread
             trial_states[self.is_free_state] += state_step
             trial_linearisation = self._linearise_run(
@@ -344,7 +344,7 @@ class RunRanker:
                 damping *= DAMPING_INCREASE
                 continue
             is_converged = lowest_cost - cost < MIN_RELATIVE_DECREASE * lowest_cost
-            theta, states, deviation, linearisation, lowest_cost = (
+            theta, initial_state, deviation, linearisation, lowest_cost = (
                 trial_theta,
                 trial_states,
                 deviation + step,

@@ -277,7 +277,12 @@ class ModelFilters:
         return FilteredSet(self.base, ())
 
     def get_filter(self, model: FittedModel) -> FollowedRuns:
-        """Return the Kalman filter of the runs with a fitted model; it is cached."""
+        """Return the Kalman filter of the runs with a fitted model; it is cached.
+
+        The filter starts from the newest one with the same effects, or from that of the base model,
+        about whose smoothed motion the model is linearised. The share `numerics` of the
+        integrator's step errors is subtracted from the defects of the steps.
+        """
         if not model.effects:
             return self.base
         key = model.fit.theta.tobytes()

@@ -146,7 +146,12 @@ class Confirmation(Inquiry):
         return CauseEvidence(name, (), p_value, gain, name)
 
     def _evaluate_on_held_out_runs(self) -> None:
-        """Predict held-out runs with the model and its competitors, and drop unhelpful effects."""
+        """Predict held-out runs with the model and its competitors, and drop unhelpful effects.
+
+        Competitors are the models of the same size with about the same penalised likelihood.
+        Smaller models are fitted too, so that an effect that does not improve the prediction can be
+        left out. Nothing is done without held-out runs or without a model.
+        """
         if self._held_out is None or self._model is None:
             return
         search, model = self._robot, self._model

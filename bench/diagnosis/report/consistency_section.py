@@ -229,7 +229,11 @@ def _format_span(spread: ParameterConsistency) -> str:
 
 
 def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
-    """Yield sentences on the parameters that increase or decrease from log to log."""
+    """Yield sentences on the parameters that increase or decrease from log to log.
+
+    A drift counts if its p-value, corrected for the number of parameters, is significant, and the
+    logs do not agree on the parameter.
+    """
     logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
     if not logs:
         return

@@ -131,18 +131,18 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     # Width in inches; a title needs at least 7.
     width = max(left_margin + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
-    row = _ROW + _LINE * count_max_lines(names)
+    row_height = _ROW + _LINE * count_max_lines(names)
     handles, labels = _make_legend(report)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
-    height = top + _BOTTOM + row * len(candidates)
+    height = top + _BOTTOM + row_height * len(candidates)
 
     figure, axes = make_panel_grid(
         1, 2 if has_shares else 1, (width, height), layout=None, sharey=True
     )
-    bottom, size = _BOTTOM / height, row * len(candidates) / height
+    bottom, size = _BOTTOM / height, row_height * len(candidates) / height
     scores = axes[0, -1]
     scores.set_position(((left_margin + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
-    _draw_scores(scores, report, candidates, thickness=_BAR / row)
+    _draw_scores(scores, report, candidates, thickness=_BAR / row_height)
     if has_shares:
         shares = axes[0, 0]
         shares.set_position((left_margin / width, bottom, _SHARES_WIDTH / width, size))

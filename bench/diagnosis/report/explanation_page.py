@@ -201,7 +201,11 @@ def list_less_informative_profiles(report: DiagnosisReportData) -> tuple[str, ..
 
 
 def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
-    """Make the panels of the residual profiles, the most informative ones first."""
+    """Make the panels of the residual profiles, the most informative ones first.
+
+    A profile is the mean residual of a channel as a function of another variable, such as a
+    velocity.
+    """
     units = {channel.name: channel.unit for channel in report.channels}
     styles = {
         "after": EXTENDED_MODEL_STYLE._replace(marker="o"),

@@ -204,7 +204,11 @@ def _list_supported_causes(report: DiagnosisReportData) -> list[Cause]:
 
 
 def _list_rows(report: DiagnosisReportData) -> list[_Row]:
-    """List the causes in the order of the numbers, with those of the verdict marked."""
+    """List the causes in the order of the numbers, with those of the verdict marked.
+
+    A cause with alternatives has the status "set", another cause of the verdict "found"; other
+    effects have the word of their identifiability, such as "not identifiable".
+    """
     status_by_effect: dict[str, str] = {}
     for cause in _list_supported_causes(report):
         for name in (cause.effect, *cause.alternatives):

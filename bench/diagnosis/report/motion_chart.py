@@ -110,7 +110,10 @@ def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) ->
 
 
 def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
-    """List all runs by descending RMS residual, but the run of the printed figure first."""
+    """List all runs by descending RMS residual, but the run of the printed figure first.
+
+    The residual is that of the base model, in units of the noise, over all channels.
+    """
     sigma = np.array([c.sigma for c in report.channels])
     worst_run = select_worst_run(report)
     runs = []

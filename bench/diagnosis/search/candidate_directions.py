@@ -216,18 +216,18 @@ def _make_end_stop_probes(
         first_group: number of the first grid point.
     """
     end_stops = [
-        c
+        coefficients
         for side in (1.0, -1.0)
-        for c in generate_end_stops(
+        for coefficients in generate_end_stops(
             evaluator, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
         )
     ]
-    for number, c in enumerate(end_stops, start=first_group):
+    for group, coefficients in enumerate(end_stops, start=first_group):
         yield CandidateDirection(
             effect=name,
-            grid_point=number,
+            grid_point=group,
             coefficient_index=0,
-            coefficients=c,
+            coefficients=coefficients,
             can_be_negative=True,
             is_single_size=True,
         )

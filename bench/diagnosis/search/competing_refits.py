@@ -53,20 +53,22 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     # model replaces the model.
     if noise is not None:
         compared_models = [
-            m
-            for m in competing_models
-            if abs(model.penalised_log_likelihood - m.penalised_log_likelihood)
+            candidate
+            for candidate in competing_models
+            if abs(model.penalised_log_likelihood - candidate.penalised_log_likelihood)
             < MAX_COMPETITOR_DISTANCE
         ] or [model]
-    starts = [m.fit.make_start() for m in competing_models]
-    starts += [m.fit.make_start() for m in submodels]
+    starts = [candidate.fit.make_start() for candidate in competing_models]
+    starts += [candidate.fit.make_start() for candidate in submodels]
     starts += [
-        _make_swapped_start(search, model, m) for m in compared_models if _differs_in_one(model, m)
+        _make_swapped_start(search, model, candidate)
+        for candidate in compared_models
+        if _differs_in_one(model, candidate)
     ]
     search.refit_models([*starts, *neighbour_starts], noise)
     # A refit that ends worse is not stored, so the table contains the best fit of each model.
-    refitted = [search.models[frozenset(m.effects)] for m in compared_models]
-    return max(refitted, key=lambda m: m.penalised_log_likelihood)
+    refitted = [search.models[frozenset(candidate.effects)] for candidate in compared_models]
+    return max(refitted, key=lambda candidate: candidate.penalised_log_likelihood)
 
 
 def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:

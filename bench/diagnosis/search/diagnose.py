@@ -118,6 +118,11 @@ class Inquiry:
     def answered(self) -> DiagnosisResult:
         """Return the result of the complete diagnosis.
 
+        Effects are added to the base model while they explain more of the recording. The best model
+        is then compared with competing models of the same size, checked on held-out runs, and
+        tested for structure that it leaves in the residual. At last, its causes get those
+        alternatives that explain the data equally well.
+
         Raises:
             SearchStoppedError: the search had to end early.
         """

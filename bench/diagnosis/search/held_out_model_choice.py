@@ -88,7 +88,9 @@ class HeldOutValidation:
         while model.effects and model.effects in self.held_out_fits:
             submodels = self._list_smaller_models(search, model)
             models_without_idle_effect = [
-                m for m in submodels if not self._improves_prediction(search, m, model)
+                smaller_model
+                for smaller_model in submodels
+                if not self._improves_prediction(search, smaller_model, model)
             ]
             if not models_without_idle_effect:
                 return model
@@ -96,7 +98,9 @@ class HeldOutValidation:
             # best.
             model = max(
                 models_without_idle_effect,
-                key=lambda m: self.held_out_fits[m.effects].penalised_log_likelihood,
+                key=lambda smaller_model: (
+                    self.held_out_fits[smaller_model.effects].penalised_log_likelihood
+                ),
             )
         return model
 

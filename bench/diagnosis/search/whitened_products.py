@@ -267,7 +267,11 @@ class WhiteningDesign:
         return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, segment.edge_samples])
 
     def _add_section_products(self, segment: RunSegment) -> None:
-        """Add the products of one section of a run to the sums of eq. (1)."""
+        """Add the products of one section of a run to the sums of eq. (1).
+
+        The products are those of the Jacobian with itself and with the directions, the squares of
+        the directions, and the products of directions that act together.
+        """
         jacobian_columns = self._weight_columns(self._jacobian, segment)
         direction_columns = self._weight_columns(self._directions, segment)
         add_cross_products(

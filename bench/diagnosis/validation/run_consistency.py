@@ -411,7 +411,11 @@ def _assess_parameter(consistency: ParameterConsistency, level: float) -> Parame
 
 
 def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
-    """Yield the ways to group the runs: by log, by each differing constant, by single run."""
+    """Yield the ways to group the runs: by log, by each differing constant, by single run.
+
+    Each grouping has the labels of its groups, the indices of the runs in each, and, where they
+    have an order, the values by which a trend can be tested.
+    """
     logs = tuple(dict.fromkeys(run.log for run in runs))
     if len(logs) > 1:
         run_indices = tuple(

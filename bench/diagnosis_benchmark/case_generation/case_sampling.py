@@ -251,17 +251,17 @@ def _draw_single(
         The case; None if it is rejected or no coefficients give this size.
     """
     (name,) = hidden
-    c = find_coefficients(name, setting, target_size, rng)
-    if c is None:
+    coefficients = find_coefficients(name, setting, target_size, rng)
+    if coefficients is None:
         return None
     unexplained = None
     if name in SIMPLER_EFFECTS and target_size >= 1.0:
-        observed = effect_sizing.simulate_observations(setting, {name: c})
+        observed = effect_sizing.simulate_observations(setting, {name: coefficients})
         unexplained = min(
             effect_sizing.compute_refitted_residual(setting, observed, simpler_effect)
             for simpler_effect in SIMPLER_EFFECTS[name]
         )
-    return case.hide({name: c}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
+    return case.hide({name: coefficients}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
 
 
 def find_coefficients(

@@ -66,29 +66,29 @@ class JointDynamics:
             true_system: the true system.
             number: index of the run in the recording.
         """
-        k, p = true_system.constants, true_system.parameters
+        constants, parameters = true_system.constants, true_system.parameters
         self.weight: GravityForce
         self.sideways: GravityForce
         self.latched = number % 2 == 0
         if true_system.system == "pendulum":
-            arm = k["mass"] * k["length"]
-            self.inertia, gravity = p["inertia"], k["gravity"]
+            arm = constants["mass"] * constants["length"]
+            self.inertia, gravity = parameters["inertia"], constants["gravity"]
             self.weight = lambda x: -arm * gravity * sin(x)
             self.sideways = lambda x: arm * cos(x)
         else:
-            self.inertia, gravity = p["mass"], 9.80665
+            self.inertia, gravity = parameters["mass"], 9.80665
             self.weight = lambda x: 0.0
             self.sideways = lambda x: self.inertia
         self.gravity = gravity
         active_effects = {**true_system.effects, **true_system.foreign}
         self.forces = [
-            FORCE_EFFECTS[name](self, list(c))
-            for name, c in active_effects.items()
+            FORCE_EFFECTS[name](self, list(coefficients))
+            for name, coefficients in active_effects.items()
             if name in FORCE_EFFECTS
         ]
         self.limits = [
-            DRY_FRICTION_EFFECTS[name](self, list(c))
-            for name, c in active_effects.items()
+            DRY_FRICTION_EFFECTS[name](self, list(coefficients))
+            for name, coefficients in active_effects.items()
             if name in DRY_FRICTION_EFFECTS
         ]
         self.breaks: list[float] = []
@@ -104,8 +104,8 @@ class JointDynamics:
         )
         total_inertia, gravity_of_all = self.inertia, self.weight
         self.hidden_state_effects: list[Any] = [
-            HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *c)
-            for name, c in active_effects.items()
+            HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *coefficients)
+            for name, coefficients in active_effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
         self.inertia = total_inertia - sum(part.inertia for part in self.hidden_state_effects)

@@ -123,17 +123,17 @@ def apply_input_effects(
     lag = 0.0
     if "input.hold" in effects:
         levels, edges = _interpolate_input(levels, edges, effects["input.hold"][0])
-    for name, c in effects.items():
+    for name, coefficients in effects.items():
         if name in NONLINEAR_INPUT_EFFECTS and lag:
             raise NotImplementedError(f"{name} behind input.lag")
         if name == "input.delay":
-            edges = edges + c[0]
+            edges = edges + coefficients[0]
         elif name == "input.lag":
-            lag = c[0]
+            lag = coefficients[0]
         elif name == "input.rate":
-            levels, edges = _limit_input_rate(levels, edges, c[0])
+            levels, edges = _limit_input_rate(levels, edges, coefficients[0])
         elif name in STEPWISE_INPUT_EFFECTS:
-            levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
+            levels = STEPWISE_INPUT_EFFECTS[name](levels, *coefficients)
     return levels, edges, lag
 
 

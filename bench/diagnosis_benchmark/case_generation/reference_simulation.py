@@ -93,11 +93,11 @@ def simulate_with_scipy(
     """
     times = scenario.times - scenario.times[0]
     instants = times
-    for name, c in true_system.effects.items():
+    for name, coefficients in true_system.effects.items():
         if name == "sensor.delay":
-            instants = instants - c[0]
+            instants = instants - coefficients[0]
         elif name == "clock.skew":
-            instants = instants * (1 + c[0])
+            instants = instants * (1 + coefficients[0])
     instants = np.maximum.accumulate(np.maximum(instants, 0.0))
     grid, rows = (
         _refine_time_grid(instants)
@@ -112,13 +112,13 @@ def simulate_with_scipy(
     states = simulate_motion(true_system, scenario, number, grid)
     observed = states[:, [CHANNELS[true_system.system].index(name) for name in channels]]
     read_column = _get_read_column(true_system.system, channels)
-    for name, c in true_system.effects.items():
+    for name, coefficients in true_system.effects.items():
         if name in SENSOR_EFFECTS:
             observed[:, read_column] = SENSOR_EFFECTS[name](
-                observed[:, read_column], c, grid, scenario.times[0] + grid
+                observed[:, read_column], coefficients, grid, scenario.times[0] + grid
             )
         elif name == "sensor.lag":
-            observed = _apply_lag(observed, grid, c[0])
+            observed = _apply_lag(observed, grid, coefficients[0])
     return observed[rows]
 
 

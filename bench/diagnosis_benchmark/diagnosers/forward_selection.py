@@ -401,6 +401,7 @@ def _choose_starts(
     bounds = compute_coefficient_bounds(evaluator, name)
     sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
     starts = []
+    # The second start is smaller than the linear estimate, for effects that are not linear.
     for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         c = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):

@@ -171,6 +171,7 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     forms = ("steps:{a}:{b}", "sine:{a}:{c}", "chirp:{a}:0.3:{c}")
     inputs = dict(default_recording.inputs)
     if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
+        # Torque in N m or force in N, duration of a step in s, frequency in Hz.
         size = rng.uniform(0.05, 0.2) if system.kind == "rotary" else rng.uniform(0.5, 4.0)
         text = str(rng.choice(forms)).format(
             a=f"{size:.3g}", b=f"{rng.uniform(0.25, 1.0):.3g}", c=f"{rng.uniform(0.3, 2.5):.3g}"

@@ -275,7 +275,7 @@ class RegressionEvidence:
 
         evaluator, system = self.evaluator, self.evaluator.simulator.system
         runs, length, channels, _ = values.shape
-        result = np.full_like(values, np.nan)
+        filtered_runs = np.full_like(values, np.nan)
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
@@ -290,11 +290,14 @@ class RegressionEvidence:
                 is_rate = name in pairs
                 if not is_rate and name not in system.coordinates:
                     continue
-                part = values[r, :size, c]
+                channel_values = values[r, :size, c]
                 order = 1 if is_rate else 2
 
                 def smooth(
-                    deriv: int, part: Array = part, window: int = window, step: float = step
+                    deriv: int,
+                    channel_values: Array = channel_values,
+                    window: int = window,
+                    step: float = step,
                 ) -> Array:
                     """Compute a derivative (T, K) by local polynomials (Savitzky-Golay filter).
 
@@ -302,12 +305,12 @@ class RegressionEvidence:
 
                     Args:
                         deriv: order of the derivative; 0 for the smoothed values.
-                        part: trajectories of the channel, (T, K).
+                        channel_values: trajectories of the channel, (T, K).
                         window: number of samples of the window.
                         step: sampling interval, s.
                     """
                     filtered: Array = savgol_filter(
-                        part, window, POLYNOMIAL_DEGREE, deriv=deriv, delta=step, axis=0
+                        channel_values, window, POLYNOMIAL_DEGREE, deriv=deriv, delta=step, axis=0
                     )
                     return filtered
 
@@ -318,11 +321,11 @@ class RegressionEvidence:
                 else:
                     filtered_residual -= stiffness[:size, coordinate, None] * smooth(0)
                     filtered_residual -= damping[:size, coordinate, None] * smooth(1)
-                result[r, :size, c] = filtered_residual
+                filtered_runs[r, :size, c] = filtered_residual
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
                 is_used[r, :size, c] = self._find_smooth_samples(r, size, window)
-        return result, sigma, is_used & self.observed_mask
+        return filtered_runs, sigma, is_used & self.observed_mask
 
     def _find_smooth_samples(self, run: int, size: int, window: int) -> Mask:
         """Return a mask (T,) of the samples whose window has no impact and no end of the run.

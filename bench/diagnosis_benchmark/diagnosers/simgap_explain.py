@@ -12,7 +12,11 @@ class SimgapExplain(Diagnoser):
     name = "simgap"
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Return the verdict of `simgap explain` on the recording."""
+        """Return the verdict of `simgap explain` on the recording.
+
+        Args:
+            case: recording, and random generator from which the seed of the search is drawn.
+        """
         from bench.diagnosis.explain import explain
 
         verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer

@@ -166,6 +166,7 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
         """
         from pysindy import optimizers
 
+        # Terms that equal a sum of others to six digits would get huge coefficients.
         size = float(np.abs(np.linalg.lstsq(library, residual, rcond=1e-6)[0]).max())
         # The threshold of the best model is unknown, so it is varied over three decades.
         for threshold in size * np.geomspace(1.0, 1e-3, 16):

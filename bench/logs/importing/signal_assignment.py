@@ -624,7 +624,12 @@ class ColumnAssigner:
         self._add_signal(self._signals.inputs, name, column, signal)
 
     def assign_efforts(self) -> None:
-        """Assign measured torques to motors without a command and to undriven joints."""
+        """Assign measured torques to motors without a command and to undriven joints.
+
+        Columns with a torque are used as the command of a motor, or as the force on a joint of a
+        model that has no actuators. If several columns fit one input, the only measured one is
+        taken.
+        """
         signals = self._signals
         columns = [column for column in self._select_by_role("force") if _is_torque(column)]
         torques: dict[str, list[tuple[LogColumn, Joint, Placement]]] = {}

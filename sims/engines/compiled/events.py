@@ -255,6 +255,7 @@ def detect_event(block: Block, i: int) -> bool:
                 if awaits_break_away
                 else 0.0
             ):
+                # Just after the linear estimate of the zero, so that the excess is not negative.
                 seconds = h * (
                     value_before / (value_before - value_after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE
                 )

@@ -168,7 +168,7 @@ class _BulletMover:
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, without contact points of the previous rollout."""
-        p = bullet_world.import_pybullet()
+        pybullet = bullet_world.import_pybullet()
         self._mass = constants["mass"]
         self._contact = (math.nan, math.nan)
         self._client, self._body = self._world.get_body(constants)
@@ -176,8 +176,10 @@ class _BulletMover:
         # contact points survive a reset, and Bullet would use them as old contacts, which changes
         # the results by rounding. They are removed by placing the ball where it touches nothing.
         distant_position = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
-        p.resetBasePositionAndOrientation(self._body, distant_position, _NO_ROTATION, self._client)
-        p.performCollisionDetection(self._client)
+        pybullet.resetBasePositionAndOrientation(
+            self._body, distant_position, _NO_ROTATION, self._client
+        )
+        pybullet.performCollisionDetection(self._client)
 
     def set_step(self, step: float) -> None:
         """Set the step in seconds."""

@@ -120,8 +120,8 @@ def create_jointed_body(
     Returns:
         The id of the body, whose joint has the index 0.
     """
-    p = import_pybullet()
-    body: int = p.createMultiBody(
+    pybullet = import_pybullet()
+    body: int = pybullet.createMultiBody(
         linkMasses=[mass],
         linkCollisionShapeIndices=[-1],
         linkVisualShapeIndices=[-1],
@@ -136,17 +136,19 @@ def create_jointed_body(
     )
     # By default Bullet adds air resistance, sleeping, a speed limit of 100, and a motor that brakes
     # the joint.
-    p.changeDynamics(
+    pybullet.changeDynamics(
         body,
         -1,
         linearDamping=0.0,
         angularDamping=0.0,
-        activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING,
+        activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
         maxJointVelocity=NO_LIMIT,
         physicsClientId=client,
     )
     # Replace the default motor of the joint by one without force.
-    p.setJointMotorControl2(body, 0, p.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
+    pybullet.setJointMotorControl2(
+        body, 0, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client
+    )
     return body
 
 

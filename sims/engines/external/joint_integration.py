@@ -285,7 +285,7 @@ def _integrate_open_loop(
     v = float(element.v[0])
     step = math.nan
     drive_force = forces[0]
-    rows = [(x, w, step, drive_force)]
+    step_records = [(x, w, step, drive_force)]
     for first, counts in split_into_legs(element, drive):
         h = steps[first]
         u = forces[first]
@@ -314,10 +314,10 @@ def _integrate_open_loop(
         # A leg may end between two samples, where the input changes and no state is recorded.
         if end not in recorded_steps:
             states.pop()
-        rows.extend((*state, h, u) for state in states)
-    if len(rows) < element.recorded_steps.size:
+        step_records.extend((*state, h, u) for state in states)
+    if len(step_records) < element.recorded_steps.size:
         return _make_failed_trajectory(element)
-    return _read_trajectory(element, np.array(rows), inertia, damping)
+    return _read_trajectory(element, np.array(step_records), inertia, damping)
 
 
 def _read_trajectory(
@@ -412,7 +412,7 @@ def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) 
     inverse = 1.0 / inertia
     forces.linearise(t, x, v)
     recorded_steps = set(element.recorded_steps.tolist())
-    rows = [(x, v, forces.compute_acceleration(v))]
+    step_records = [(x, v, forces.compute_acceleration(v))]
     for i, h in enumerate(element.steps.tolist()):
         if i and forces.set_inputs(i):
             forces.linearise(t, x, v)
@@ -434,10 +434,10 @@ def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) 
         forces.linearise(t, x, 2.0 * w - v)
         v = forces.compute_end_velocity(w, h)  # (3)
         if i + 1 in recorded_steps:
-            rows.append((x, v, forces.compute_acceleration(v)))
-    if len(rows) < element.recorded_steps.size:
+            step_records.append((x, v, forces.compute_acceleration(v)))
+    if len(step_records) < element.recorded_steps.size:
         return _make_failed_trajectory(element)
-    x_at, v_at, a_at = np.array(rows).T[:, :, None]
+    x_at, v_at, a_at = np.array(step_records).T[:, :, None]
     return x_at, v_at, a_at
 
 

@@ -275,6 +275,7 @@ def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
         from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
             (1).
     """
+    # The normalised position has a range of 100 or 200 percent over these degrees.
     degrees = 360.0 / (COUNTS_PER_TURN - 1) * (motor.highest - motor.lowest)
     sign = -1.0 if motor.reversed else 1.0
     if from_zero:

@@ -468,7 +468,13 @@ class MeasuredLinear(RunLinearisation):
         return deviations_at_steps
 
     def moved(self, deviations: Array) -> Trajectory:
-        """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's."""
+        """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's.
+
+        Args:
+            deviations: (S + 1, Z) deviations at the beginnings of the S steps and at the end:
+                positions and velocities of the joints, activations, hidden states, and pose and
+                rate of a floating base.
+        """
         # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < MAX_DEVIATION, deviations, 0.0)
         joints, motion = len(self._simulator.addresses.positions), self._motion

@@ -107,7 +107,10 @@ class RunLinearisation:
         return observed
 
     def _simulate_nominal_motion(self) -> RobotMotion:
-        """Simulate the motion of the run, plus one step that begins at the run's end."""
+        """Simulate the motion of the run, plus one step that begins at the run's end.
+
+        The sensors' readings at the beginnings of these steps are kept in `_readings`.
+        """
         simulator = self._simulator
         steps = self._steps + 1
         inputs = simulator.compute_controls(self._work, steps)

@@ -228,7 +228,11 @@ class XmlText:
         return b"".join(fragments)
 
     def _render_start_tag(self, tag: XmlElement) -> bytes:
-        """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
+        """Return the changed start tag; unchanged attributes keep their spaces and quotes.
+
+        Args:
+            tag: element with its new and removed attributes, and where it stands in the text.
+        """
         text = self.text[tag.begin : tag.inside]
         offset = 1 + len(tag.name.encode())
         fragments = [b"<", (tag.renamed or tag.name).encode()]

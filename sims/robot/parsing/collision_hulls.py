@@ -240,6 +240,7 @@ def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[st
         # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
         # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
         count = int(1.5 * np.max(missing_sizes / (15, 2, 6))) + 8
+        # A Fibonacci lattice: equal steps in height, each turned by the golden angle.
         z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
         x, y = np.sqrt(1.0 - z**2) * _compute_rotations(
             np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))

@@ -62,7 +62,11 @@ class MeshLookup:
         return self.found[name], ""
 
     def _list_candidate_paths(self, name: str) -> list[Path]:
-        """Return the possible paths of a mesh, in the order in which they are tried."""
+        """Return the possible paths of a mesh, in the order in which they are tried.
+
+        A plain name is sought in the folder that the model file states and next to the model file.
+        A name with ``package://`` or ``model://`` is sought in the folders above, as ROS does.
+        """
         model_folder = self.files.path.parent
         scheme, separator, uri_path = name.partition("://")
         if not separator:

@@ -241,7 +241,7 @@ def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array
     data = mujoco.MjData(model)
     rng = np.random.default_rng(11)
     inertia = np.zeros((model.nv, model.nv))
-    parts = []
+    biases_and_inertias = []
     for _ in range(POSE_COUNT):
         data.qpos[:] = model.qpos0
         for joint in joints:
@@ -254,5 +254,5 @@ def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array
         mujoco.mj_fullM(model, data, inertia)
         bias = np.zeros(model.nv)
         mujoco.mj_rne(model, data, 0, bias)
-        parts += [bias, inertia.ravel().copy()]
-    return np.concatenate(parts)
+        biases_and_inertias += [bias, inertia.ravel().copy()]
+    return np.concatenate(biases_and_inertias)
