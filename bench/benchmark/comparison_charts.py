@@ -466,8 +466,14 @@ def _make_panel(
 ) -> Panel:
     """Make a panel of one range of targets, whose title has the number of targets.
 
-    `table` is the name of the panel's table and `x` its column for the horizontal axis `x_axis`;
-    `y_axis` is the vertical axis.
+    Args:
+        view: comparison with its names, styles and metric.
+        kind: range of the targets, such as ``wide``.
+        table: name of the panel's table.
+        x: column of the table for the horizontal axis.
+        series: curves of the panel, one for each tuner.
+        x_axis: horizontal axis.
+        y_axis: vertical axis.
     """
     counted = "starting points" if kind == "real" else "targets"
     title = f"{PANEL_TITLES[kind]} ({view.statistics.target_counts[kind]} {counted})"
@@ -497,8 +503,14 @@ def _make_tuner_series(
 ) -> tuple[Series, ...]:
     """Make a series for each tuner of a table.
 
-    `y` is the column that is drawn, `low` and `high` are the columns of its interval (empty for
-    none). `where` selects rows by further columns.
+    Args:
+        view: comparison with the style of each tuner.
+        table: table with a column ``tuner``.
+        y: column that is drawn.
+        draw: how it is drawn, such as a line or points.
+        low: column of the lower end of the interval; empty for none.
+        high: column of the upper end.
+        where: values of further columns, by which the rows are selected.
     """
     styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
     return tuple(

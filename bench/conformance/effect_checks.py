@@ -166,9 +166,13 @@ def _compute_contributions(
 ) -> list[tuple[Array, Array]]:
     """Return pairs of the hook's result and the expected result of an inactive effect.
 
-    `c` are coefficients of zero, at which the effect must do nothing: a force must be zero, and a
-    sensor must return its input. `host` is the simulator, `system` the system on which the effect
-    acts.
+    An inactive effect must do nothing: a force must be zero, and a sensor must return its input.
+
+    Args:
+        active_effect: the effect, with one of the hooks of its kind.
+        c: coefficients of zero, (K, 2, 1) for two batch elements.
+        host: simulator, which declares constants and inputs.
+        system: system on which the effect acts.
     """
     moment = _make_state_snapshot(host, system)
     # Arbitrary impact speeds (m/s), restitutions, signals and times (s) of two batch elements.

@@ -143,7 +143,10 @@ _MIN_MOTION = 1e-9
 def _compute_scaled_change(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
     """Compute the change (C,) of each of C channels over a run, in units of its scale.
 
-    The run has `steps` steps of `seconds` each, with constant inputs.
+    Args:
+        simulator: simulator that is started anew; its inputs are constant.
+        seconds: length of each step in seconds.
+        steps: number of steps.
     """
     inputs = {c.name: c.scale for c in simulator.inputs}
 

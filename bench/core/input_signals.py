@@ -42,7 +42,14 @@ def _compute_sine(
     amplitude: float,
     frequency: float,
 ) -> Array:
-    """Compute amplitude sin(2 pi frequency t), with `frequency` in Hz, at times `t` (T,) in s."""
+    """Compute amplitude sin(2 pi frequency t).
+
+    Args:
+        t: (T,) times in s.
+        rng: unused; other forms draw from it.
+        amplitude: amplitude in the unit of the input.
+        frequency: frequency in Hz.
+    """
     signal: Array = amplitude * np.sin(_TAU * frequency * t)
     return signal
 
@@ -55,7 +62,11 @@ def _compute_square_wave(
 ) -> Array:
     """Compute a square wave: +amplitude in each first half period, -amplitude in each second one.
 
-    `frequency` is in Hz, `t` (T,) are times in s.
+    Args:
+        t: (T,) times in s.
+        rng: unused; other forms draw from it.
+        amplitude: amplitude in the unit of the input.
+        frequency: frequency in Hz.
     """
     half_periods = np.floor(2 * frequency * t)
     return np.where(half_periods % 2 == 0, amplitude, -amplitude)
@@ -66,7 +77,11 @@ def _compute_random_steps(
 ) -> Array:
     """Compute random levels, uniform within +-amplitude, each held for the given number of seconds.
 
-    `t` (T,) are times in s. `place` is the index of the level at each time.
+    Args:
+        t: (T,) times in s.
+        rng: draws the levels.
+        amplitude: largest absolute level, in the unit of the input.
+        seconds: duration of each level.
     """
     place = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
     levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
@@ -81,9 +96,14 @@ def _compute_chirp(
     low: float,
     high: float,
 ) -> Array:
-    """Compute a linear chirp: a sine whose frequency goes from `low` to `high` (Hz) until the end.
+    """Compute a linear chirp: a sine whose frequency changes linearly until the end.
 
-    `t` (T,) are times in s from 0; their last value is the end of the sweep.
+    Args:
+        t: (T,) times in s from 0; the last one is the end of the sweep.
+        rng: unused; other forms draw from it.
+        amplitude: amplitude in the unit of the input.
+        low: frequency at the beginning, Hz.
+        high: frequency at the end, Hz.
     """
     # The phase is the integral of a frequency that increases linearly with time.
     periods = low * t + (high - low) * t * t / (2 * t[-1])
@@ -94,10 +114,16 @@ def _compute_chirp(
 def _compute_multisine(
     t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float
 ) -> Array:
-    """Compute a sum of `_MULTISINE_COUNT` sines from `low` to `high` (Hz), with random phases.
+    """Compute a sum of `_MULTISINE_COUNT` sines with random phases.
 
-    The amplitude rises from zero at first, and the largest absolute value of the result is
-    `amplitude`. `t` (T,) are times in s.
+    The amplitude rises from zero at first.
+
+    Args:
+        t: (T,) times in s.
+        rng: draws the phases.
+        amplitude: largest absolute value of the result, in the unit of the input.
+        low: lowest frequency, Hz.
+        high: highest frequency, Hz.
     """
     frequencies = np.geomspace(low, high, _MULTISINE_COUNT)
     phases = rng.uniform(0.0, _TAU, _MULTISINE_COUNT)

@@ -772,8 +772,12 @@ class _ExplainRun:
         """Create a search that starts from the base fit.
 
         It is a prediction-error search if the runs of a robot could be filtered, because it needs
-        fewer simulations; otherwise it is a beam search. `attributes` are further fields of the
-        search.
+        fewer simulations; otherwise it is a beam search.
+
+        Args:
+            base: fitted base model.
+            rng: random numbers of the search, such as those of surrogate data.
+            attributes: further fields of the search.
         """
         kind = EffectSearch
         if self.fitting.filtered_runs is not None:
@@ -972,6 +976,10 @@ class _ExplainRun:
 
         Far from the noise, only effects at contacts are tried: others would not imitate an option.
         Laws with many shapes are not tried, because an option is the simpler explanation.
+
+        Args:
+            options: the other solver options, with the base model fitted to them.
+            file_options: options of the model file, with the base model fitted to them.
         """
         # This import is needed for robots only.
         from bench.diagnosis.search.contact_search import (

@@ -79,8 +79,12 @@ def _list_parts(
 ) -> list[tuple[str, str, Mask]]:
     """List the parts of the data for which the residual is reported: runs, channels and phases.
 
-    Each has its kind, its label and the mask (R, T, C) of its samples. `mark` is appended to the
-    names of runs. `simulated` (R, T, C) determines the phases of the motion.
+    Each has its kind, its label and the mask (R, T, C) of its samples.
+
+    Args:
+        evaluator: run evaluator with the recorded runs.
+        simulated: (R, T, C) simulated runs, which determine the phases of the motion.
+        mark: text that is appended to the names of runs.
     """
     observed_mask = np.isfinite(evaluator.observed)
     runs, _, channels = observed_mask.shape

@@ -239,7 +239,10 @@ def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
 def _summarise_errors(evaluator: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
     """Summarise the RMS error of each channel, and that of all in units of the noise.
 
-    `squares` (R, T, C) has the squared errors, zero where no sample exists; `sigma` (C,) the noise.
+    Args:
+        evaluator: run evaluator with the recorded runs.
+        squares: (R, T, C) squared errors, zero where no sample exists.
+        sigma: (C,) standard deviation of the noise of each channel.
     """
     observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))

@@ -435,9 +435,14 @@ def arrange_labels(
 def _draw_label_column(
     axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float
 ) -> None:
-    """Write a column of labels at `x` metres.
+    """Write a column of labels.
 
-    `scale` is in inches per metre, `tall` is the height of the column in inches.
+    Args:
+        axis: axes of the figure, in metres.
+        labels: labels from top to bottom.
+        x: horizontal position of the column, m.
+        scale: inches per metre.
+        tall: height of the column in inches.
     """
     sizes = [label.height / scale for label in labels]
     half_height = tall / scale / 2

@@ -173,6 +173,12 @@ def _convert_to_heights(
 
     The best available scale is used unless `scale` names one: a calibrated camera whose file lies
     next to the film, the known diameter of the ball (m), or the acceleration of free fall.
+
+    Args:
+        track: position and radius of the ball in each frame, pixels.
+        video: path of the film.
+        diameter: diameter of the ball in metres, if it is known.
+        scale: name of the scale to use; None for the best one available.
     """
     camera_file = get_camera_file_path(video)
     if scale == "camera" or (scale is None and camera_file.is_file()):
@@ -187,8 +193,12 @@ def _build_recording(
 ) -> Recording:
     """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.
 
-    `part` selects the frames after the release of the ball. `noise` is the standard deviation of z,
-    m.
+    Args:
+        track: position and radius of the ball in each frame, pixels.
+        heights: height of the ball in each frame, m.
+        noise: standard deviation of z, m.
+        part: frames after the release of the ball.
+        video: path of the film, for the title.
     """
     pixels = {"u": track.u, "v": track.v, "radius_px": track.radius}
     run = Run(

@@ -290,7 +290,14 @@ def _format_exceeded_range(
 ) -> Iterator[str]:
     """Yield a line if a recorded signal leaves the range that the model file states.
 
-    The line has the runs and the extreme values. `model` is the name of the model file.
+    The line has the runs and the extreme values.
+
+    Args:
+        recording: the recording.
+        name: name of the channel or input.
+        limits: range of the model file; None if it states none.
+        unit: unit of signal and range.
+        model: name of the model file.
     """
     if limits is None:
         return

@@ -114,8 +114,11 @@ def draw_chart(
 def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizontal: bool) -> None:
     """Draw a panel of a chart: background spans, series, axes and title.
 
-    `table` has the values of the series. If `horizontal`, the axes are exchanged, so that x runs
-    upwards.
+    Args:
+        axis: axes of the figure.
+        panel: the panel.
+        table: values of the series.
+        horizontal: exchange the axes, so that x runs upwards.
     """
     style_axis(axis)
     for span in panel.spans:
@@ -165,9 +168,14 @@ def _draw_series(
 ) -> None:
     """Draw a series of N values as points with error bars, or as a line with a band.
 
-    `values` has the arrays x and y (N,), and low and high (N,) if the series has an interval.
-    `ends` (2, N) has the lengths of the error bars below and above the points. Only points can be
-    drawn horizontally.
+    `ends` (2, N) has the lengths of the error bars below and above the points.
+
+    Args:
+        axis: axes of the figure.
+        panel: panel of the series.
+        series: the series with its style.
+        values: arrays x and y (N,), and low and high (N,) if the series has an interval.
+        horizontal: exchange the axes; only for points.
     """
     x, y = values["x"] + series.shift, values["y"]
     ends = None

@@ -199,7 +199,13 @@ def _verify_runs_table(
 def _verify_errors(
     problem: TuningProblem, target: Target, rows: pd.DataFrame
 ) -> Iterator[VerificationFailure]:
-    """Yield rows of a target whose errors do not follow from its true parameters."""
+    """Yield rows of a target whose errors do not follow from its true parameters.
+
+    Args:
+        problem: problem with the simulator and its parameters.
+        target: the target with its true parameters.
+        rows: rows of all runs on the target.
+    """
     if target.truth is None:
         return
     names = [parameter.name for parameter in problem.cube.parameters]
@@ -224,6 +230,11 @@ def _verify_losses(
     The proposals are simulated again for the losses, the recommendations for the errors on the
     fitted and on the held-out scenarios. The row k = 0 of a run has no proposal, only the first
     recommendation.
+
+    Args:
+        problem: problem with the simulator and its scenarios.
+        target: the target with its observations.
+        rows: rows of all runs on the target.
     """
     names = [parameter.name for parameter in problem.cube.parameters]
     channel = problem.error_channel
@@ -272,7 +283,15 @@ def _find_first_difference(
     relative_tolerance: float,
     absolute_tolerance: float,
 ) -> Iterator[VerificationFailure]:
-    """Yield the first row in which a column differs from the expected values."""
+    """Yield the first row in which a column differs from the expected values.
+
+    Args:
+        rows: rows of all runs on one target.
+        column: name of the column.
+        expected: (n,) expected values.
+        relative_tolerance: allowed difference as a share of the expected value.
+        absolute_tolerance: allowed difference in the unit of the column.
+    """
     if column not in rows:
         return
     values = rows[column].to_numpy(dtype=float)

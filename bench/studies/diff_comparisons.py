@@ -175,6 +175,11 @@ class ComparisonDiff:
         On shared targets the test is Wilcoxon's signed-rank test, otherwise the Mann-Whitney test;
         both use the logarithm of each target's mean error over seeds. ``ratio`` is the change of
         the error of b relative to a, and infinite errors count as failures.
+
+        Args:
+            kind: range of the targets, such as ``wide``.
+            tuner: label of the tuner.
+            k: number of simulations.
         """
         errors_a, errors_b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
         shared_targets = self.shared_targets

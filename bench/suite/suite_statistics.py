@@ -317,7 +317,10 @@ class SuiteTables:
     ) -> tuple[float, ...]:
         """Compute the expected running time (ERT) to an error threshold, with interval and cost.
 
-        `share` is the part of the training cost that falls on one target, in simulations.
+        Args:
+            curves: errors of the runs of one tuner over the number of simulations.
+            threshold: error to be reached.
+            share: part of the training cost that falls on one target, in simulations.
 
         Returns:
             ERT, its 95 % interval (two numbers), ERT with training, successes and number of runs.

@@ -404,9 +404,15 @@ def _minimise_loss(
 ) -> None:
     """Minimise the loss with Adam; the weights are changed in place.
 
-    The learning rate falls to zero along half a cosine. `w` are the weights, `material` the
-    training simulations, and `draw_histories` draws the histories of one batch. `monitor` gets the
-    losses on training and held-out data after each epoch; None for none.
+    The learning rate falls to zero along half a cosine.
+
+    Args:
+        w: weights as tensors, by name.
+        material: training simulations.
+        draw_histories: draws the histories of one batch.
+        design: sizes and learning settings of the network.
+        rng: draws the batches.
+        monitor: gets the losses on training and held-out data after each epoch; None for none.
     """
     import torch
 

@@ -282,9 +282,12 @@ def _make_loss(
     It is the mean squared error of the estimated parameter differences, relative to their size.
 
     The function's arguments are the input rows of the proposed side (n, m, D) and of the target's
-    side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations. `w` are the
-    weights as tensors. `is_target_only` is True for a network that sees the target only (direct
-    regression).
+    side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations.
+
+    Args:
+        design: sizes and learning settings of the network.
+        w: weights as tensors, by name.
+        is_target_only: whether the network sees the target only (direct regression).
     """
     import torch
     from torch.nn.functional import softplus
@@ -345,9 +348,15 @@ def _run_optimiser(
     """Minimise the loss (3) by gradient descent; the weights are changed in place.
 
     The method is Adam with a learning rate that falls along half a cosine, or as published plain
-    gradient descent with a rate that falls exponentially. `data` are the tensors of
-    `_convert_to_tensors`. `monitor` gets the losses on training and held-out data after each epoch;
-    None for none.
+    gradient descent with a rate that falls exponentially.
+
+    Args:
+        loss: loss of one batch.
+        weights: weights as tensors.
+        data: the tensors of `_convert_to_tensors`.
+        design: sizes and learning settings of the network.
+        generator: draws the batches.
+        monitor: gets the losses on training and held-out data after each epoch; None for none.
     """
     import torch
 

@@ -322,8 +322,13 @@ def _build_training_histories(
 ) -> TrainingHistories:
     """Build the training data: simulations without noise, targets with the sensor's noise.
 
-    `box` (2, dim) are the corners of the training range; parameters are scaled to half widths from
-    its middle, as in the network's input.
+    Parameters are scaled to half widths from the middle of the training range, as in the network's
+    input.
+
+    Args:
+        features: converts observations to inputs of the network.
+        data: training simulations.
+        box: (2, dim) corners of the training range.
     """
     half_widths = (box[1] - box[0]) / 2.0
     parameters = (data.parameters - box.mean(axis=0)) / half_widths

@@ -277,6 +277,11 @@ class BroydenSearch:
         This is done after a setback. The step to the middle of the interval is limited, because the
         middle is far away if the other end is one of the first points; a guess that is already
         close would be lost if the estimates are inaccurate.
+
+        Args:
+            guess: (1,) the next point, in the unit cube.
+            point: (1,) the present point.
+            residual: (1,) estimated step from the present point to the target.
         """
         if residual[0] > 0.0:
             self._low = max(self._low, point[0])

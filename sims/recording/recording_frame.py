@@ -159,7 +159,14 @@ def _list_signal_columns(name: str, table: Any) -> list[str]:
 def _state_unit(
     table: dict[str, Any], column: str, units: Mapping[str, str], noted_units: Mapping[str, Any]
 ) -> bool:
-    """Write the unit of a column into its table, and return whether a unit is known."""
+    """Write the unit of a column into its table, and return whether a unit is known.
+
+    Args:
+        table: table of the column in the description; changed in place.
+        column: name of the column.
+        units: units that the caller states, by column.
+        noted_units: units that the data frame itself notes.
+    """
     if column in units:
         table["unit"] = units[column]
     elif "unit" not in table and column in noted_units:

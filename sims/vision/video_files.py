@@ -97,10 +97,13 @@ def write_video(
 
 
 def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
-    """Encode frames as H.264 with their own times in s; the same frames give the same file.
+    """Encode frames as H.264 with their own times; the same frames give the same file.
 
-    `crf` is the constant rate factor of x264: larger numbers mean smaller files and less
-    quality.
+    Args:
+        path: file to write.
+        frames: pictures, all of the same size.
+        times: (n,) times of the frames, s.
+        crf: constant rate factor of x264: larger numbers mean smaller files and less quality.
     """
     av = import_package("av")
     ticks = np.rint((times - times[0]) * _TICKS_PER_SECOND).astype(int)

@@ -169,7 +169,13 @@ class BpfInstruction(NamedTuple):
 def _emit_conditional(
     opcode: int, operand: int, body: list[BpfInstruction]
 ) -> list[BpfInstruction]:
-    """Return instructions that execute the body if a comparison with the operand holds."""
+    """Return instructions that execute the body if a comparison with the operand holds.
+
+    Args:
+        opcode: BPF code of the comparison, such as equality.
+        operand: constant with which the loaded word is compared.
+        body: instructions to execute if the comparison holds.
+    """
     return [BpfInstruction(opcode, operand, skip_if_false=len(body)), *body]
 
 

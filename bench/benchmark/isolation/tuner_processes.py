@@ -181,7 +181,13 @@ class ForkServerClient:
     def _send_request(
         self, request: Mapping[str, Any], modules: Iterable[str], descriptors: tuple[int, ...] = ()
     ) -> None:
-        """Send a request, with modules to be loaded that have not been loaded before."""
+        """Send a request, with modules to be loaded that have not been loaded before.
+
+        Args:
+            request: request as JSON values.
+            modules: names of modules that the service will need.
+            descriptors: file descriptors to pass to the server.
+        """
         missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
         try:
             fork_server.send_request(self._link, {**request, "modules": missing}, descriptors)

@@ -148,6 +148,11 @@ def _serve_simulation(
 
     It serves a learned tuner that trains in an isolated process. A request that is not valid, or
     beyond the budget, is answered by a refusal (message X), and the training can continue.
+
+    Args:
+        child: isolated process with the tuner.
+        message: request of the tuner.
+        simulator: training simulator, which counts the simulations.
     """
     arrays: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
@@ -358,10 +363,13 @@ def _train_or_read_weights(
 ) -> TrainingResult:
     """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
 
-    The request names the tuner's entry and the seed, and how to build the tuner in isolation.
-    `callback` gets the losses of each epoch. `is_repeated` trains even if the cache has the
-    weights. `earlier_requests` are hashes of the simulations requested before an external kill; the
-    repeated training must make the same requests.
+    Args:
+        experiment: experiment with simulator, training ranges and budget.
+        request: names the tuner's entry and the seed, and how to build the tuner in isolation.
+        callback: gets the losses of each epoch.
+        is_repeated: train even if the cache has the weights.
+        earlier_requests: hashes of the simulations requested before an external kill; the repeated
+            training must make the same requests.
     """
     entry, seed = request.entry, request.seed
     name = compute_training_key(experiment, entry, seed)

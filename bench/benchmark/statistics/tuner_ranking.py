@@ -173,7 +173,12 @@ def _build_verdict_rows(
 
     The test is Wilcoxon's signed-rank test over targets with Holm's correction for several tests. A
     tuner is WORSE if the difference is significant, EQUAL if it shares the first rank, and
-    otherwise UNDECIDED. `key` are the first columns of each row.
+    otherwise UNDECIDED.
+
+    Args:
+        ranking: tuners in the order of their median errors.
+        curves: errors of each run over the number of simulations.
+        key: first columns of each row.
     """
     logs, ranks, order = ranking
     runs = {t: curves.select(tuner=t).failed for t in order}

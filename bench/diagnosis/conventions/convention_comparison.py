@@ -340,6 +340,11 @@ class ConventionComparison:
         The forces are computed by inverse dynamics, and the logarithms of all joints are added. If
         the forces cannot be computed, or the hypothesis is about another quantity than positions
         and inputs, the result is minus infinity.
+
+        Args:
+            hypothesis: assumed conventions, such as another sign of a joint.
+            recording: recording that is converted by the hypothesis.
+            run: index of the run.
         """
         kind: Any = self.subject.kind
         robot: RobotModel = kind.robot

@@ -391,6 +391,11 @@ def _generate_joint_orders(
     Pairs of suspects are exchanged. Orders of all joints are the alphabetical one, the reversed
     one, and the one in which positions follow commands best. An order maps the index of a joint to
     the index of the joint whose columns it has.
+
+    Args:
+        joints: signals of all joints, in the order of the model.
+        recording: the recording, whose commands the positions may follow.
+        suspects: joints whose columns may be exchanged.
     """
     indices = range(len(joints))
     has_commands = all(len(joint.inputs) == 1 for joint in joints)

@@ -88,6 +88,12 @@ def _change_scale(
     With the gain g of the specified unit and the old scale k and offset b of the table, recorded
     values r are g (k r + b) in SI units. The change converts them to c (g (k r + b)) + d, with its
     factor c and its offset d in SI units.
+
+    Args:
+        table: present table of the signal in the description.
+        si: SI unit of the signal.
+        change: factor and offset that convert the present values to the right ones.
+        hypothesis: the correction to which the change belongs, with the right unit if it has one.
     """
     gain = compute_unit_scale(table["unit"], si).gain
     factor, offset = change.scale, change.offset

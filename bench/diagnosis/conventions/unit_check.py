@@ -484,6 +484,11 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
     """Compute the RMS residual beyond the noise, as a share of each channel's deviation (C,).
 
     It is 0 for a channel that does not move beyond its noise.
+
+    Args:
+        evaluator: run evaluator with the recorded runs.
+        residual: (R, T, C) residual of the base model; zero where no sample exists.
+        noise: noise of each channel.
     """
     shares = []
     for c, sigma in enumerate(noise.sigma.tolist()):
@@ -499,7 +504,13 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
 
 
 def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
-    """Return the RMS of a residual (R, T, C) over its samples, in units of the noise."""
+    """Return the RMS of a residual over its samples, in units of the noise.
+
+    Args:
+        residual: (R, T, C) residual.
+        is_recorded: (R, T, C) mask of the recorded samples.
+        noise: noise of each channel.
+    """
     scaled = (residual / noise.sigma)[is_recorded]
     rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
     return rms if np.isfinite(rms) else np.inf

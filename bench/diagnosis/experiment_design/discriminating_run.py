@@ -295,6 +295,11 @@ def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) ->
     """Yield runs that differ from the first one in the size of one input.
 
     An input is never scaled beyond the limits of its command.
+
+    Args:
+        evaluator: run evaluator with the recorded runs.
+        first: the recorded run to be changed.
+        limits: limits of commands that the model file states.
     """
     factors = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
     for name, signal in first.scenario.inputs.items():
@@ -352,8 +357,14 @@ def _compute_discrimination(
 ) -> float:
     """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
 
-    The larger it is, the more clearly the run shows which model is right. `sigma` (C,) has the
-    noise.
+    The larger it is, the more clearly the run shows which model is right.
+
+    Args:
+        evaluator: run evaluator that simulates the run.
+        run: the run.
+        model: fitted model with one of the causes.
+        competing_model: fitted model with the other one.
+        sigma: (C,) standard deviation of the noise of each channel.
     """
     model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.

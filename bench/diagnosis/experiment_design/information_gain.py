@@ -237,7 +237,13 @@ class RunRanker:
     def _simulate_run(
         self, run: CandidateRun, thetas: Sequence[Array], states: Sequence[Array]
     ) -> Array:
-        """Simulate the run (L, T, C) with each parameter vector and initial state."""
+        """Simulate the run (L, T, C) with each parameter vector and initial state.
+
+        Args:
+            run: the run.
+            thetas: L parameter vectors (P,).
+            states: L initial states (s,).
+        """
         scenarios = [run.scenario] * len(thetas)
         return self.evaluator.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
 

@@ -222,10 +222,15 @@ def _assemble_normal_equations(
 def _apply_damping(
     equations: _ArrowheadEquations, damping: float, known_mask: Mask
 ) -> _ArrowheadEquations:
-    """Add the damping λ times their own diagonals to U and V, and hold known initial states fixed.
+    """Add the damping times their own diagonals to U and V, and hold known initial states fixed.
 
     A small ridge is always added to U, so that it can be inverted if parameters have the same
-    response. `known_mask` (R, s) marks the known initial states.
+    response.
+
+    Args:
+        equations: normal equations with the blocks U of the parameters and V of the initial states.
+        damping: damping λ, without unit.
+        known_mask: (R, s) mask of the known initial states.
     """
     diagonal = np.einsum("rii->ri", equations.inner)
     inner = equations.inner + damping * diagonal[:, :, None] * np.eye(equations.inner.shape[1])

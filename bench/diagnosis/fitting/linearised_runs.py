@@ -68,8 +68,14 @@ def _compute_responses(
 ) -> tuple[Array, int]:
     """Compute how one run changes by each of K added effects (K, T, C); runs in a worker.
 
-    The second result is the number of simulations that were needed. `states` (s,) is the initial
-    state of the run.
+    The second result is the number of simulations that were needed.
+
+    Args:
+        evaluator: run evaluator of all runs.
+        run: index of the run.
+        theta: (P,) parameters of the present model.
+        states: (s,) initial state of the run.
+        added: name and coefficients of each added effect.
     """
     linearisation = _get_linearisation(evaluator, run, theta, states)
     return linearisation.compute_effect_responses(
@@ -138,7 +144,12 @@ def _get_linearisation(
     """Return the linearised dynamics along one run of a robot, about given parameters.
 
     The latest ones are cached, one per run on average, because most are used more than once.
-    `theta` is (P,), `states` (s,): positions first, then velocities.
+
+    Args:
+        evaluator: run evaluator of all runs.
+        run: index of the run.
+        theta: (P,) parameters.
+        states: (s,) initial state: positions first, then velocities.
     """
     key = run, theta.tobytes(), states.tobytes()
     cache = evaluator.cached_linearisations

@@ -577,6 +577,11 @@ class TrajectoryFitter:
 
         It is the cost, eq. (1) of `levenberg_marquardt_step`, and infinite if the simulation was
         abandoned.
+
+        Args:
+            simulated: (R, T, C) simulated runs.
+            states: (R, s) initial states.
+            sample_mask: (R, T, C) mask of the samples that count.
         """
         residual = self._compute_residual(simulated, sample_mask)
         # An abandoned batch element is NaN, which cannot be compared.

@@ -174,6 +174,11 @@ def _format_message(
 
     No column of the recording shows when these drives are on. The note says how a column can be
     stated that does.
+
+    Args:
+        recording: the recording.
+        drives: drives that are off in a part of it.
+        inactive_masks: (T,) mask of each run, of the samples that were left out.
     """
     joints = ", ".join(drive.joint for drive in drives)
     sample_text = spans_of_runs(recording.runs, inactive_masks)

@@ -367,7 +367,13 @@ def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list
 
 
 def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
-    """Format the coefficient of a cause at a place for a label; empty for several coefficients."""
+    """Format the coefficient of a cause at a place for a label; empty for several coefficients.
+
+    Args:
+        cause: the cause with its coefficients.
+        effect: name of the effect, with its place.
+        place: place of the label, such as a joint.
+    """
     at_place = [
         n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
     ]

@@ -310,10 +310,14 @@ def _list_hidden(
 def _make_panels(
     report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], is_wide: bool
 ) -> tuple[Panel, Panel]:
-    """Make two panels of channel number c of a run: its motion, and its residual in noise units.
+    """Make two panels of one channel of a run: its motion, and its residual in noise units.
 
-    `facets` has the values of the switches that show these panels. If `is_wide`, the panels are
-    placed side by side.
+    Args:
+        report: content of the report.
+        run: the run.
+        c: number of the channel.
+        facets: values of the switches that show these panels.
+        is_wide: place the panels side by side.
     """
     channel = report.channels[c]
     selection = {

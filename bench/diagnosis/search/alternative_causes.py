@@ -106,6 +106,12 @@ class AlternativeFinder:
         """Return the p-value of a gain about the model without the effect.
 
         It is the smaller one of the p-values of the gain and of the best score.
+
+        Args:
+            reduced_model: the model without the effect.
+            effect: name of the effect.
+            gain: gain of the model with the effect over the model without it, in twice the
+                log-likelihood.
         """
         search = self.search
         key = frozenset(reduced_model.effects)

@@ -331,8 +331,10 @@ def _find_observable_probes(
 ) -> Mask:
     """Return the mask (K,) of the probes that change the runs by more than rounding errors.
 
-    `values` (K, R, T, C) has the direction of each probe; times the size of the probe it is the
-    change.
+    Args:
+        evaluator: run evaluator with the recorded runs.
+        probes: the K probes.
+        values: (K, R, T, C) direction of each probe; times the size of the probe it is the change.
     """
     rounding = ROUNDING_SHARE * np.nanmax(np.abs(evaluator.observed), axis=(0, 1))
     # One changed channel is sufficient, because effects of a sensor show only in its channel.
@@ -362,8 +364,12 @@ def _make_modifier_probes(
     """Yield combinations of modifiers: coefficients that act only together with an active one.
 
     An example is a wind speed, which only matters if there is drag. A coefficient counts as a
-    modifier if its probe changes nothing (`acting`) although another coefficient of its effect
-    does.
+    modifier if its probe changes nothing although another coefficient of its effect does.
+
+    Args:
+        evaluator: run evaluator, which has the coefficients of the effects.
+        probes: the K probes of single coefficients.
+        acting: (K,) mask of the probes that change the runs.
     """
     leading: dict[str, CandidateDirection] = {}
     idle_probes: list[CandidateDirection] = []
@@ -390,7 +396,13 @@ def _make_modifier_probes(
 def _iterate_grid_points(
     evaluator: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
 ) -> Iterator[CandidateDirection]:
-    """Yield the first active probe of an effect with all combinations of modifier values."""
+    """Yield the first active probe of an effect with all combinations of modifier values.
+
+    Args:
+        evaluator: run evaluator, which has the bounds of the coefficients.
+        first: the first active probe.
+        modifiers: probes of coefficients that act only together with it.
+    """
     parameters = list_coefficients(evaluator, first.effect)
     points = product(MODIFIER_SHARES, repeat=len(modifiers))
     for group, point in enumerate(points, start=1):

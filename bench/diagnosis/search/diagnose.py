@@ -332,6 +332,11 @@ def _validate_on_held_out(
 
     They are the base model, the result, models with a part of its effects, models that explain the
     data nearly as well, and the best models of a single effect.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the result of the search.
+        held_out: predicts held-out runs.
     """
     models = search.models.values()
     # Parts of the model are included, because an effect that does not help on held-out runs is
@@ -423,7 +428,13 @@ def compute_gap_closed(
 
 
 def _compute_normalised_rms(search: EffectSearch, model: FittedModel, noise: Array) -> float:
-    """Return the RMS over all samples of a model's residual divided by the noise `sigma` (C,)."""
+    """Return the RMS over all samples of a model's residual divided by the noise.
+
+    Args:
+        search: the search with the recorded runs.
+        model: the fitted model.
+        noise: (C,) standard deviation of each channel.
+    """
     normalised_residual = search.compute_residual(model.fit) / noise
     squares = np.square(normalised_residual[search.observed_mask])
     return float(np.sqrt(squares.mean()))

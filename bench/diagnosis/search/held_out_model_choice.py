@@ -142,6 +142,11 @@ class HeldOutValidation:
 
         The value is one if the reduction is just enough; the worse of fitted and held-out runs
         counts.
+
+        Args:
+            search: the search, which computes the excess on the fitted runs.
+            model: the smaller model.
+            larger: a model with all its effects and further ones.
         """
         required_ratio = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (
             len(larger.effects) - len(model.effects)

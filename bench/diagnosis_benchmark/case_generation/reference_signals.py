@@ -155,7 +155,12 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
 
 
 def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Array, Array]:
-    """Limit the rate of an input to `max_rate` per second, in short parts of constant level.
+    """Limit the rate of an input, in short parts of constant level.
+
+    Args:
+        levels: (N,) levels of the input.
+        edges: (N,) times at which they begin, s.
+        max_rate: largest change per second, in the unit of the input.
 
     Returns:
         Levels and begins of the parts.

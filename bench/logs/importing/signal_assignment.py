@@ -264,6 +264,12 @@ def _compare_with_derivative(
     """Compare a velocity column with the derivative of its joint's position, over the first runs.
 
     Return None if no run has enough motion for a comparison.
+
+    Args:
+        logs: files of the runs.
+        column: velocity column.
+        position: position signal of the joint.
+        joint: the joint.
     """
     runs = []
     for name in list(logs.runs)[:MAX_RUNS]:

@@ -394,6 +394,11 @@ def _compare_position_with_command(recording: Recording, command: str, position:
     """Compute slope and correlation of a position against a command, eq. (1), over all runs.
 
     The mean of each run is subtracted first.
+
+    Args:
+        recording: the recording.
+        command: name of the input.
+        position: name of the channel.
     """
     squares = np.zeros(3)
     for run in recording.runs:

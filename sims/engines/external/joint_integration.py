@@ -402,6 +402,11 @@ def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) 
 
     It is used unless the forces are those of the inputs and linear damping alone. `inertia` is in
     kg m^2 or kg. A failed integration is NaN throughout.
+
+    Args:
+        joint: the body of the engine.
+        element: batch element: initial state, steps, constants and effects.
+        inertia: inertia in kg m^2 or mass in kg.
     """
     forces = LinearisedForces(joint, element, inertia)
     x = float(element.x[0])

@@ -304,9 +304,17 @@ def _compute_applied_inputs(
 ) -> Array:
     """Compute the input that each request applies over each step, (N, S) for N batch elements.
 
-    Delays and filters act within a step. `fractions` are the times in a step, as shares of its
-    length, at which it is divided for them. With those of `STEP_SUBDIVISION` the parts are combined
-    to one value per step; with fewer fractions, the first part is returned.
+    Delays and filters act within a step.
+
+    Args:
+        step: step length in seconds.
+        requests: N requests of an input of a run.
+        steps: number S of steps.
+        has_sample: (S + 1,) whether a sample is at the beginning of the first step and at each
+            step's end.
+        fractions: times in a step, as shares of its length, at which it is divided for delays and
+            filters. With those of `STEP_SUBDIVISION` the parts are combined to one value per step;
+            with fewer fractions, the first part is returned.
     """
     acting = _concatenate_effects(requests)
     run_of_element = np.repeat(
@@ -332,7 +340,15 @@ def _compute_applied_inputs(
 def _make_subdivided_grid(
     step: float, steps: int, n: int, fractions: Array, has_uniform_steps: bool
 ) -> TimeGrid:
-    """Make the plan of steps that are subdivided at the given fractions."""
+    """Make the plan of steps that are subdivided at the given fractions.
+
+    Args:
+        step: step length in seconds.
+        steps: number of steps.
+        n: number of batch elements.
+        fractions: times in a step, as shares of its length.
+        has_uniform_steps: whether all parts are declared to have equal length.
+    """
     begins: Array = step * np.arange(float(steps))
     ends = (begins[:, None] + step * fractions).ravel()
     lengths = np.diff(ends, prepend=0.0)

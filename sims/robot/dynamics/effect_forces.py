@@ -208,7 +208,14 @@ class EffectForces:
         )
 
     def _make_snapshot(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
-        """Return the snapshot after a number of steps, with the inputs of step k."""
+        """Return the snapshot after a number of steps, with the inputs of step k.
+
+        Args:
+            steps: number of steps since the beginning; not whole within a step.
+            k: index of the step.
+            motion: positions and velocities of the joints, and the forces on both sides of the
+                transmissions, (L, D) each.
+        """
         x, v, *sides = motion
         now = np.full((len(x), 1), steps * self.step)
         inputs = {name: u[:, k, None] for name, u in self.applied_inputs.items()}

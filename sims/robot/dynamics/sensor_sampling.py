@@ -144,9 +144,15 @@ def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp],
 
 
 def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Interpolate values (L, S + 1), given at the ends of steps, at times (L, T) in seconds.
+    """Interpolate values between the ends of steps.
 
     With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
+
+    Args:
+        values: (L, S + 1) values at the ends of steps.
+        slopes: (L, S + 1) derivatives per second; None if they are unknown.
+        step: step length in seconds.
+        instants: (L, T) times in seconds since the first value.
     """
     position_in_steps = instants / step
     nearest = np.rint(position_in_steps)

@@ -123,7 +123,10 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
 def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> None:
     """Reject counts and sizes that would exhaust the memory.
 
-    `factor` is the product of all counts above the element, since nested replicates multiply.
+    Args:
+        files: reader of the model file, which makes the errors.
+        element: element to check, with all its children.
+        factor: product of all counts above the element, since nested replicates multiply.
     """
     for key, value in element.items():
         size_numbers = (
@@ -200,7 +203,14 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
 def _insert_placeholder(
     missing_files: MissingFiles, asset: Element, element: Element, file: str
 ) -> None:
-    """Replace an asset with a missing file by a placeholder that loads, if possible."""
+    """Replace an asset with a missing file by a placeholder that loads, if possible.
+
+    Args:
+        missing_files: missing files found so far; the asset is added.
+        asset: section of the model with the element.
+        element: element that names the file; changed in place.
+        file: name of the missing file.
+    """
     name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
     if element.tag == "mesh":
         missing_files.meshes[name] = file

@@ -168,8 +168,14 @@ def _make_command(
 ) -> ExcitationCommand:
     """Make a sinusoidal command of an actuator that moves its joint within all limits.
 
-    `holding` is the force (N or N m) that holds the reference pose, and `force` the amplitude
-    of a force that would move the joint. Position and velocity servos receive a motion instead.
+    Position and velocity servos receive a motion instead of a force.
+
+    Args:
+        robot: the robot.
+        actuator: the actuator.
+        joint: joint of the actuator.
+        holding: force that holds the reference pose, N or N m.
+        force: amplitude of a force that would move the joint, N or N m.
     """
     model = robot.compiled
     start = float(model.qpos0[joint.position])

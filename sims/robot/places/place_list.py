@@ -278,7 +278,10 @@ def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
 def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:
     """Return the numbers that the model file specifies at a joint, by effect.
 
-    `dof` is the address of its velocity and `joint` its number in the compiled model.
+    Args:
+        robot: the robot.
+        dof: address of the joint's velocity.
+        joint: number of the joint in the compiled model.
     """
     model = robot.compiled
     return {
