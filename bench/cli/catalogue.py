@@ -294,14 +294,14 @@ def format_documents(section: str, documents: list[JsonDocument]) -> list[str]:
     return [line for document in documents for line in format_entry(document)]
 
 
-def _format_plain_entry(each: JsonDocument) -> list[str]:
-    return [f"{each['name']:18} {_format_sentence(each)}"]
+def _format_plain_entry(entry: JsonDocument) -> list[str]:
+    return [f"{entry['name']:18} {_format_sentence(entry)}"]
 
 
-def _format_sentence(each: JsonDocument) -> str:
+def _format_sentence(entry: JsonDocument) -> str:
     """Return the description of an entry, or why it cannot be used here."""
-    skipped = each.get("skipped")
-    return f"skipped: {skipped}" if skipped else each["says"]
+    skipped = entry.get("skipped")
+    return f"skipped: {skipped}" if skipped else entry["says"]
 
 
 def _format_experiment(experiment: JsonDocument) -> list[str]:
@@ -344,12 +344,12 @@ def _format_channels(role: str, channels: list[JsonDocument]) -> list[str]:
     return [f"  {role:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
 
 
-def _format_effect(each: JsonDocument) -> list[str]:
+def _format_effect(effect: JsonDocument) -> list[str]:
     """Format an effect, with its coefficients' units and plausible ranges by kind of system."""
-    if each["skipped"]:
-        return [f"{each['name']}: {_format_sentence(each)}"]
-    result = [f"{each['name']} ({each['hook']}): {each['says']}"]
-    for c in each["coefficients"]:
+    if effect["skipped"]:
+        return [f"{effect['name']}: {_format_sentence(effect)}"]
+    result = [f"{effect['name']} ({effect['hook']}): {effect['says']}"]
+    for c in effect["coefficients"]:
         for application in c["on"]:
             spread = f"{application['low']:g} to {application['high']:g}"
             result.append(
@@ -358,9 +358,14 @@ def _format_effect(each: JsonDocument) -> list[str]:
     return result
 
 
-def _format_reference(each: JsonDocument) -> list[str]:
-    description = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
-    return [f"{each['name']:26} {description}{each['targets']} targets, budget {each['budget']}]"]
+def _format_reference(reference: JsonDocument) -> list[str]:
+    description = (
+        f"{reference['says']} [simgap {reference['simgap']}, {reference['started'][:10]}, "
+    )
+    return [
+        f"{reference['name']:26} {description}{reference['targets']} targets, "
+        f"budget {reference['budget']}]"
+    ]
 
 
 _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {

@@ -177,11 +177,11 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
         # A family with one coefficient applies it at every place.
         shared = len(effect_class.parameters) < len(members_simulator.parameters)
         theta = _make_coefficients(family, 0.3)
-        each = np.tile(theta, len(members)) if shared else theta
+        member_theta = np.tile(theta, len(members)) if shared else theta
         check(
             is_bitwise_equal(
                 effect_class.simulate(theta, make_scenario()),
-                members_simulator.simulate(each, make_scenario()),
+                members_simulator.simulate(member_theta, make_scenario()),
             ),
             "the motion of all members of the family together",
             "another",

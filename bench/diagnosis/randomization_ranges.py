@@ -157,7 +157,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
                 left_out += [reason] if is_free or fitted.value or fitted.at_bound else []
             else:
                 ranges.append(_convert_to_range(kind.robot, totals, number, entry))
-    if ranges and not any(item.fields for item in ranges):
+    if ranges and not any(number_range.fields for number_range in ranges):
         left_out.append(NO_FIELD)
     if not ranges:
         left_out.append(NOTHING_FOUND.format(verdict=answer.verdict))

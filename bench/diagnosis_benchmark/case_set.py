@@ -200,7 +200,7 @@ class CaseSpec:
             draw_case(self.kind, self.system, first + k, self.effect, self.size, self.asked)
             for k in range(MAX_DRAW_ATTEMPTS)
         )
-        return next((item for item in items if item is not None), None)
+        return next((case for case in items if case is not None), None)
 
     def _get_first_seed(self, seed: int, salt: str) -> int:
         """Return the seed of the first attempt to draw the case; attempt k uses this seed plus k.

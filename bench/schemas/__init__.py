@@ -52,8 +52,8 @@ def find_violations(document: Any, name: str) -> list[str]:
 
     # Schemas name each other by their files' names.
     known = [
-        (f"{each}{_ENDING}", Resource.from_contents(load_schema(each)))
-        for each in list_schema_names()
+        (f"{schema_name}{_ENDING}", Resource.from_contents(load_schema(schema_name)))
+        for schema_name in list_schema_names()
     ]
     validator = Draft202012Validator(load_schema(name), registry=Registry().with_resources(known))
     found = sorted(validator.iter_errors(document), key=lambda error: error.json_path)

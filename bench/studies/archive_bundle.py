@@ -325,7 +325,10 @@ def _compare_with_manifest(
         manifest: content of the manifest.
         unpacked: size in bytes and SHA-256 of each unpacked file, by path.
     """
-    listed_files = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
+    listed_files = {
+        listed_file["path"]: (listed_file["bytes"], listed_file["sha256"])
+        for listed_file in manifest["files"]
+    }
     if len(listed_files) < len(manifest["files"]):
         yield ManifestMismatch(MANIFEST_FILE, "expected each file once, found one listed twice")
     for path in sorted({*listed_files, *unpacked}):
@@ -495,7 +498,9 @@ def _format_explain_command(folder: Path) -> str:
     """Build the command that reproduces an explanation, as far as its folder states it."""
     environment = read_environment(folder)
     tables = [
-        each["file"] for each in environment.get("recordings", []) if each["file"][-5:] != ".toml"
+        recording["file"]
+        for recording in environment.get("recordings", [])
+        if recording["file"][-5:] != ".toml"
     ]
     words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
     return shlex.join(words)
@@ -519,12 +524,14 @@ class ArchiveVerification(NamedTuple):
     @property
     def is_consistent(self) -> bool:
         """True if there is no verification failure."""
-        has_no_doubts = not self.doubts and all(each.is_consistent for each in self.comparisons)
+        has_no_doubts = not self.doubts and all(
+            comparison.is_consistent for comparison in self.comparisons
+        )
         return has_no_doubts and not (self.explanation and self.explanation.doubts)
 
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
-        comparisons = [each.to_document() for each in self.comparisons]
+        comparisons = [comparison.to_document() for comparison in self.comparisons]
         explanation = self.explanation.to_document() if self.explanation else None
         archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
         parts = {"archive": archive, "comparisons": comparisons, "explanation": explanation}
@@ -586,7 +593,7 @@ def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any
         "file": archive,
         "kind": manifest["kind"],
         "files": len(manifest["files"]),
-        "bytes": sum(each["bytes"] for each in manifest["files"]),
+        "bytes": sum(listed_file["bytes"] for listed_file in manifest["files"]),
         "simgap": manifest["simgap"],
         "command": manifest["command"],
     }

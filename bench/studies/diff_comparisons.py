@@ -295,12 +295,12 @@ class ComparisonDiff:
         runs of the tuner.
         """
         runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
-        for each in self.statuses:
-            tuner = each["tuner"]
-            if each["status"] in FAILED_OR_SKIPPED_STATUSES or runs[0].get(tuner) == runs[1].get(
+        for change in self.statuses:
+            tuner = change["tuner"]
+            if change["status"] in FAILED_OR_SKIPPED_STATUSES or runs[0].get(tuner) == runs[1].get(
                 tuner
             ):
-                yield f"{tuner}: {each['status']} {each['a']} -> {each['b']}"
+                yield f"{tuner}: {change['status']} {change['a']} -> {change['b']}"
 
     @cached_property
     def notes(self) -> list[str]:
@@ -342,7 +342,7 @@ class ComparisonDiff:
             "errors": self.errors.to_dict("records"),
             "statuses": self.statuses,
             "only": self.unshared_tuners,
-            "configuration": find_changes(*(each.document() for each in experiments)),
+            "configuration": find_changes(*(experiment.document() for experiment in experiments)),
             "environment": find_changes(*map(select_relevant_environment, environments)),
             "notes": self.notes,
         }

@@ -97,8 +97,8 @@ def format_changes(changes: Iterable[Mapping[str, Any]]) -> list[str]:
         changes: the changes.
     """
     lines = [
-        f"  {each['what']}: {_shorten_text(each['a'])} -> {_shorten_text(each['b'])}"
-        for each in changes
+        f"  {change['what']}: {_shorten_text(change['a'])} -> {_shorten_text(change['b'])}"
+        for change in changes
     ]
     remaining_count = len(lines) - _MAX_CHANGES
     return [
@@ -156,7 +156,10 @@ class ExplanationSide:
     def settings(self) -> dict[str, Any]:
         """System, settings, recordings, versions and machine of the explanation."""
         environment = self.environment
-        recordings = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
+        recordings = {
+            recording["file"]: recording["sha256"]
+            for recording in environment.get("recordings", [])
+        }
         base_settings = {"system": self.verdict.system, "engine": self.verdict.engine}
         return {
             **base_settings,
@@ -202,8 +205,8 @@ class ExplanationDiff:
         """All effects that either explanation names, with their roles in both."""
         effect_names = [
             effect
-            for each in (self.a, self.b)
-            for cause in each.verdict.causes
+            for side in (self.a, self.b)
+            for cause in side.verdict.causes
             for effect in (cause.effect, *cause.alternatives)
         ]
         return [
@@ -242,7 +245,7 @@ class ExplanationDiff:
         return has_other_verdict or has_other_numbers or has_other_causes
 
     def _list_cause_places(self) -> list[tuple[str, str]]:
-        return [(each["in_a"], each["in_b"]) for each in self.causes]
+        return [(cause["in_a"], cause["in_b"]) for cause in self.causes]
 
     @property
     def is_worse(self) -> bool:
@@ -255,7 +258,7 @@ class ExplanationDiff:
 
     def _list_held_out_errors(self) -> list[dict[str, Any]]:
         """List errors on held-out runs and the closed gap of both explanations; None if missing."""
-        errors = [each.verdict.heldout for each in (self.a, self.b)]
+        errors = [side.verdict.heldout for side in (self.a, self.b)]
         return [
             {"name": name, "a": getattr(errors[0], name, None), "b": getattr(errors[1], name, None)}
             for name in _HELD_OUT
@@ -267,18 +270,18 @@ class ExplanationDiff:
         A candidate that one of the explanations does not rank has None as its score and rank there.
         """
         ranked = [
-            {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
-            for each in (self.a, self.b)
+            {c.effect: (rank, c.score) for rank, c in enumerate(side.verdict.candidates, 1)}
+            for side in (self.a, self.b)
         ]
         names = [
-            e
-            for each in ranked
-            for e, (rank, _) in each.items()
+            effect
+            for side in ranked
+            for effect, (rank, _) in side.items()
             if rank <= _MAX_COMPARED_CANDIDATES
         ]
         rows = []
         for name in dict.fromkeys(names):
-            (rank_a, score_a), (rank_b, score_b) = (each.get(name, (None, None)) for each in ranked)
+            (rank_a, score_a), (rank_b, score_b) = (side.get(name, (None, None)) for side in ranked)
             scores = {"score_a": score_a, "score_b": score_b}
             rows.append({"effect": name, **scores, "rank_a": rank_a, "rank_b": rank_b})
         return rows
@@ -289,7 +292,7 @@ class ExplanationDiff:
         notes = []
         if not (self.a.environment and self.b.environment):
             notes.append("settings and versions of the older explanation are not known")
-        units = [each.verdict.heldout.unit for each in (self.a, self.b) if each.verdict.heldout]
+        units = [side.verdict.heldout.unit for side in (self.a, self.b) if side.verdict.heldout]
         if len(set(units)) > 1:
             notes.append(f"held-out errors are in {units[0]} and in {units[1]}")
         if self.a.verdict.system != self.b.verdict.system:
@@ -300,7 +303,7 @@ class ExplanationDiff:
         """Convert to a JSON document."""
         coefficients, parameters = self.numbers
         side_documents = [
-            describe_side(each.folder, each.title, each.environment) for each in (self.a, self.b)
+            describe_side(side.folder, side.title, side.environment) for side in (self.a, self.b)
         ]
         return {
             "kind": "explanation",
@@ -362,11 +365,11 @@ class ExplanationDiff:
         return pd.DataFrame([*coefficients, *parameters, *held_out])
 
 
-def _collect_coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
+def _collect_coefficients(side: ExplanationSide) -> dict[str, FittedValue]:
     """Return the coefficients of all causes of an explanation, by effect and coefficient name."""
     return {
         f"{cause.effect} {name}": value
-        for cause in each.verdict.causes
+        for cause in side.verdict.causes
         for name, value in cause.coefficients.items()
     }
 

@@ -225,7 +225,9 @@ def _score_extended_model(
             f"held-out error: {location} in it (simgap bundle --with LOG.csv)"
         )
         return
-    hashes = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
+    hashes = {
+        recording["file"]: recording["sha256"] for recording in environment.get("recordings", [])
+    }
     for path in (tables[0], tables[0].with_suffix(".toml")):
         if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
             expected = (

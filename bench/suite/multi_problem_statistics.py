@@ -164,14 +164,14 @@ class ComparisonCollection:
     @cached_property
     def mean_ranks(self) -> pd.DataFrame:
         """Ranks among the common tuners: one row per problem, one column per tuner, 1 is best."""
-        each = pd.concat(
+        problem_errors = pd.concat(
             [
                 compute_problem_ranks(part.statistics.curves, part.statistics.floor)
                 for part in self.parts
             ]
         )
         # Ranks among all tuners have gaps if some tuners are left out.
-        return each[list(self.tuners)].rank(axis=1)
+        return problem_errors[list(self.tuners)].rank(axis=1)
 
     @property
     def has_enough_problems(self) -> bool:
@@ -283,14 +283,14 @@ class ComparisonCollection:
 
         It is the share of error thresholds reached after 0..100 % of the budget.
         """
-        each = [
+        distributions = [
             problem
             for part in self.parts
             for problem in _compute_runtime_shares(
                 part.statistics.curves, part.statistics.runtime_thresholds
             )
         ]
-        return {t: np.mean([problem[t] for problem in each], axis=0) for t in self.tuners}
+        return {t: np.mean([problem[t] for problem in distributions], axis=0) for t in self.tuners}
 
 
 def _compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:

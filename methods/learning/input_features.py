@@ -402,8 +402,10 @@ class InputFeatures:
                 self.reading.select_channels(data.flattened_observations), data.lengths
             )
             return rows.reshape(*data.parameters.shape[:2], -1)
-        each = zip(data.observations, data.scenes, strict=True)
-        return np.array([self(observations, data.lengths, scene) for observations, scene in each])
+        observed_scenarios = zip(data.observations, data.scenes, strict=True)
+        return np.array(
+            [self(observations, data.lengths, scene) for observations, scene in observed_scenarios]
+        )
 
     def to_arrays(self) -> dict[str, Array]:
         """Return everything as plain arrays by name."""

@@ -84,8 +84,10 @@ class NeuralPosteriorEstimation(Tuner):
             ValueError: the budget is smaller than two scenarios.
         """
         dim = simulator.dim
-        each = max(self.each, 2 * (dim + 1))
-        training_data = generate_training_data(simulator, rng, budget, self.scenarios, each)
+        points_per_scenario = max(self.each, 2 * (dim + 1))
+        training_data = generate_training_data(
+            simulator, rng, budget, self.scenarios, points_per_scenario
+        )
         noisy_data = training_data.with_noise(
             self.noise * training_data.flattened_observations.std(axis=(0, 1)), rng
         )

@@ -130,7 +130,7 @@ def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
     """
     model = robot.compiled
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-    return set(geoms) in [set(one) for one in pairs]
+    return set(geoms) in [set(pair) for pair in pairs]
 
 
 def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]:

@@ -339,7 +339,7 @@ class BallDetector:
         u0 = max(0, int(u) - half_size)
         v0 = max(0, int(v) - half_size)
         window = np.s_[v0 : int(v) + half_size + 1, u0 : int(u) + half_size + 1]
-        windows = np.stack([each[window] for each in differences]).astype(np.float32)
+        windows = np.stack([difference[window] for difference in differences]).astype(np.float32)
         # The edge itself, half ball and half background, must not be treated as shadow.
         shadow_mask = shade[window].astype(np.uint8)
         offset = -u0, -v0

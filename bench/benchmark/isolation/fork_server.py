@@ -165,7 +165,7 @@ def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -
     cannot reach anything of the harness through an open file.
     """
     _discard_output()
-    reading, writing = (os.dup2(each, 100 + i) for i, each in enumerate(pipes))
+    reading, writing = (os.dup2(pipe, 100 + i) for i, pipe in enumerate(pipes))
     os.closerange(3, 100)
     os.closerange(102, 4096)
     policy = isolation_layers.AccessPolicy(

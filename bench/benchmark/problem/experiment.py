@@ -481,7 +481,8 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if fields.get("experiments"):
         fields["experiments"] = tuple(
-            _resolve_experiment_path(each, path) for each in fields["experiments"]
+            _resolve_experiment_path(named_experiment, path)
+            for named_experiment in fields["experiments"]
         )
     elif not fields.get("simulator") and not fields.get("diagnosis"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')

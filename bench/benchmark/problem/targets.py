@@ -274,5 +274,5 @@ def _simulate_held_out(problem: TargetProblem, theta: Array, target: TargetStrea
     # Each scenario has its own stream, so that more scenarios do not change the first ones.
     streams = [target.get_held_out_stream(i) for i in range(held_out.scenarios)]
     scenarios = tuple(draw_scenario(experiment, rng, initial, inputs) for rng in streams)
-    observed = [problem.world.simulate(theta, each)[0] for each in scenarios]
+    observed = [problem.world.simulate(theta, scenario)[0] for scenario in scenarios]
     return ObservedRuns(scenarios, np.concatenate(observed))

@@ -111,8 +111,10 @@ def compute_tuning_costs(
     for tuner in curves.list_tuners():
         mask = (curves.keys["tuner"] == tuner).to_numpy(dtype=bool)
         effort = compute_effort(curves.select_mask(mask), threshold, budget, tuner_seconds[mask])
-        each = float(simulator_seconds[mask][:, -1].sum() / max(curves.used[mask].sum(), 1))
-        result[tuner] = TuningCost(effort, *fits.get(tuner, (0.0, 0.0)), each)
+        seconds_per_simulation = float(
+            simulator_seconds[mask][:, -1].sum() / max(curves.used[mask].sum(), 1)
+        )
+        result[tuner] = TuningCost(effort, *fits.get(tuner, (0.0, 0.0)), seconds_per_simulation)
     return result
 
 

@@ -32,7 +32,7 @@ def describe_machine() -> dict[str, Any]:
 
 def list_package_versions() -> dict[str, str]:
     """List the version of every installed package, by name."""
-    return dict(sorted(_name_and_version(each) for each in distributions()))
+    return dict(sorted(_name_and_version(distribution) for distribution in distributions()))
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
@@ -69,7 +69,7 @@ def format_explain_command(recordings: Iterable[object], settings: Mapping[str, 
             words.append(f"--{name}")
         elif isinstance(value, (list, tuple)):
             # An option that can be given several times.
-            words += [word for item in value for word in (f"--{name}", str(item))]
+            words += [word for argument in value for word in (f"--{name}", str(argument))]
         elif value not in (None, False, ""):
             words += [f"--{name}", str(value)]
     return words

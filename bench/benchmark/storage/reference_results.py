@@ -183,7 +183,7 @@ def find_reference(name: str) -> ReferenceResult:
         InputError: There is no such reference, or it is damaged.
     """
     names = list_reference_names()
-    endings = [each for each in names if each.endswith(f"/{name}")]
+    endings = [known_name for known_name in names if known_name.endswith(f"/{name}")]
     if name in names:
         return _read_reference(name, _find_reference_folder(name))
     if len(endings) == 1:

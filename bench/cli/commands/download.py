@@ -170,10 +170,10 @@ def _list_dependent_experiments(data_set: DataSet) -> list[str]:
 
     names = []
     for name in list_experiment_names():
-        each = load_experiment(name)
-        paths = [("robot", each.model)]
-        if each.recording:
-            paths.append(("recording", each.recording.path))
+        experiment = load_experiment(name)
+        paths = [("robot", experiment.model)]
+        if experiment.recording:
+            paths.append(("recording", experiment.recording.path))
         if data_set in [find_providing_data_set(*path) for path in paths]:
             names.append(name)
     return names

@@ -194,7 +194,7 @@ def _format_info(information: JsonDocument) -> Iterator[str]:
         yield _format_part(package, f"[{package['of']}] " if package["of"] else "")
 
 
-def _format_part(each: JsonDocument, prefix: str) -> str:
-    version = each["version"] or ""
-    missing = f"MISSING: {each['missing']}" if each["missing"] else ""
-    return f"{prefix + each['name']:26} {'  '.join(filter(None, [version, missing]))}"
+def _format_part(document: JsonDocument, prefix: str) -> str:
+    version = document["version"] or ""
+    missing = f"MISSING: {document['missing']}" if document["missing"] else ""
+    return f"{prefix + document['name']:26} {'  '.join(filter(None, [version, missing]))}"

@@ -140,7 +140,9 @@ class ConventionDifference:
         """Description of the difference and of its alternatives."""
         if not self.alternatives:
             return self.hypothesis.description
-        others = join_first_names([one.description for one in self.alternatives], MAX_NAMED)
+        others = join_first_names(
+            [alternative.description for alternative in self.alternatives], MAX_NAMED
+        )
         return f"{self.hypothesis.description} (or {others})"
 
 
@@ -320,15 +322,19 @@ class ConventionComparison:
         ranked = sorted(best_by_description.values(), key=lambda pair: -pair[0])
         refined = [self._refine_offset(*pair, recording) for pair in ranked[:MAX_REFINED]]
         accepted = [
-            (score, one)
-            for score, one in (*refined, *ranked[MAX_REFINED:])
-            if score > limit and self._uses_inputs(score, one, recording)
+            (score, rated_hypothesis)
+            for score, rated_hypothesis in (*refined, *ranked[MAX_REFINED:])
+            if score > limit and self._uses_inputs(score, rated_hypothesis, recording)
         ]
         if not accepted:
             return None
         best = max(score for score, _ in accepted)
-        equally_likely = [one for score, one in accepted if score > best - EQUAL_LOG_LIKELIHOOD]
-        first, *others = sorted(equally_likely, key=lambda one: one.size)
+        equally_likely = [
+            rated_hypothesis
+            for score, rated_hypothesis in accepted
+            if score > best - EQUAL_LOG_LIKELIHOOD
+        ]
+        first, *others = sorted(equally_likely, key=lambda rated_hypothesis: rated_hypothesis.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
 
@@ -562,7 +568,9 @@ def _compute_log_scale_correction(
         recording: the recording, as described.
     """
     result = 0.0
-    for name, change in (item for one in hypotheses for item in one.changes.items()):
+    for name, change in (
+        named_change for hypothesis in hypotheses for named_change in hypothesis.changes.items()
+    ):
         samples = [run.channels[name] for run in recording.training() if name in run.channels]
         count = sum(int(np.isfinite(values).sum()) for values in samples)
         result += count * math.log(abs(change.scale))

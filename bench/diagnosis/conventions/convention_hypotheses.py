@@ -470,7 +470,8 @@ def _generate_units(
         scale = first_signal.scale * gain / first_signal.gain
         if not math.isclose(scale, 1.0, rel_tol=SAME_UNIT_TOLERANCE):
             unit_words, stated_words = (
-                UNITS_IN_WORDS.get(one, one) for one in (unit, first_signal.specified_unit)
+                UNITS_IN_WORDS.get(unit_name, unit_name)
+                for unit_name in (unit, first_signal.specified_unit)
             )
             yield ConventionHypothesis(
                 f"the numbers of {text} look like {unit_words}, stated as {stated_words}",

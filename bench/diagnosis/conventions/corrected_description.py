@@ -183,8 +183,8 @@ def write_corrected(
         raise InputError(f"{path}: expected NAME.toml for the corrected description")
     unknown = [
         name
-        for one in differences
-        for name, change in one.hypothesis.changes.items()
+        for difference in differences
+        for name, change in difference.hypothesis.changes.items()
         if change.source == UNKNOWN_COLUMN
     ]
     if unknown:

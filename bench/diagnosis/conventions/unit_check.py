@@ -248,9 +248,10 @@ class Hypothesis:
             return f"The recorded numbers of {names} look converted twice: {scale}"
         sign_text = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
         unit_words, stated_words = (
-            UNITS_IN_WORDS.get(one, one) for one in (unit, first_signal.specified_unit)
+            UNITS_IN_WORDS.get(unit_name, unit_name)
+            for unit_name in (unit, first_signal.specified_unit)
         )
-        unit_keys = dict.fromkeys(f'unit = "{one}"' for one in self.units)
+        unit_keys = dict.fromkeys(f'unit = "{unit_name}"' for unit_name in self.units)
         return (
             f"The recorded numbers of {names} look like {unit_words}, stated as {stated_words} "
             f"(factor {abs(factors[first_signal.name]):.4g}): set {' and '.join(unit_keys)} "

@@ -176,8 +176,8 @@ def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
     failed = data.rows[data.rows["status"] != "done"]
     if len(failed):
         counts = failed.groupby("diagnoser").size()
-        each = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
-        yield f"Without an answer (crashed, too late or too costly): {each}."
+        counts_text = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
+        yield f"Without an answer (crashed, too late or too costly): {counts_text}."
     for name, reason, count in summarise_unsupported(data.left_out):
         yield f"{sanitise(name, 60)} does not support {count} of the cases: {reason}."
     for name, reason in data.skipped.items():

@@ -46,7 +46,10 @@ class DescriptionWriter:
 
     def write(self) -> str:
         """Return the description."""
-        servos = [self._estimate_added_servo(*item) for item in self._signals.added_servos.items()]
+        servos = [
+            self._estimate_added_servo(*named_servo)
+            for named_servo in self._signals.added_servos.items()
+        ]
         body = [*self._list_time_lines(), *self._run_lines()]
         for servo in servos:
             body += [
