@@ -120,7 +120,12 @@ def select_written_causes(
 def _leave_out_base_effects(
     causes: Mapping[str, Mapping[str, FittedValue]], base_joints: Collection[str]
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
-    """Leave out effects at the coordinates of floating bodies, and return a line for each."""
+    """Leave out effects at the coordinates of floating bodies, and return a line for each.
+
+    Args:
+        causes: fitted coefficients by effect.
+        base_joints: names of the coordinates of floating bodies.
+    """
     remaining: dict[str, Mapping[str, FittedValue]] = {}
     left_out = []
     for name, numbers in causes.items():

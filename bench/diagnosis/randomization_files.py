@@ -388,9 +388,14 @@ def _build_joint_term(
 def _build_body_term(
     prefix: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
 ) -> Term:
-    """Build an Isaac Lab event term that calls `function` with `params` for one body of the robot.
+    """Build an Isaac Lab event term that calls a function for one body of the robot.
 
-    `params` has the code of each further argument; `notes` become comments above the term.
+    Args:
+        prefix: first part of the name of the term.
+        body: name of the body.
+        function: Isaac Lab function to call.
+        params: code of each further argument.
+        notes: comments above the term.
     """
     return Term(
         f"{prefix}_{body}",

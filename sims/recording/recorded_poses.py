@@ -130,7 +130,12 @@ def convert_quaternions(
 
 
 def _multiply_by_inverse(quaternions: Array, reference: Array) -> Array:
-    """Compute the products (T, 4) of quaternions with the inverse of a unit quaternion."""
+    """Compute the products (T, 4) of quaternions with the inverse of a unit quaternion.
+
+    Args:
+        quaternions: (T, 4) quaternions w, x, y, z.
+        reference: (4,) the unit quaternion that is inverted.
+    """
     w, x, y, z = quaternions.T
     a, b, c, d = reference * np.array([1.0, -1.0, -1.0, -1.0])
     products = [

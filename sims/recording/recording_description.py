@@ -460,6 +460,11 @@ def _find_orientations(
 ) -> dict[str, Array]:
     """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
 
+    Args:
+        path: file of the description, for error messages.
+        channels: columns of the channels.
+        declared: signals that the system declares.
+
     Raises:
         InputError: A quaternion is incomplete, or the angles are recorded in addition.
     """
@@ -484,7 +489,14 @@ def _find_orientations(
 def _convert_quaternion_noise(
     noises: Mapping[str, float], orientations: Mapping[str, Array]
 ) -> dict[str, float]:
-    """Replace the noise of quaternions by that of the angles, which is twice as large."""
+    """Replace the noise of quaternions by that of the angles, which is twice as large.
+
+    A small rotation by an angle changes an entry of the quaternion by half of it.
+
+    Args:
+        noises: stated noise of each signal.
+        orientations: bodies whose orientation is recorded as a quaternion.
+    """
     result = dict(noises)
     for base in orientations:
         stated = [result.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES]

@@ -104,8 +104,13 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
     """Act as supervisor: fork the process that runs the service, and report how it ended.
 
     The supervisor is needed because a new process namespace begins with the next child. It never
-    runs the tuner's code. `descriptors` are the control socket and the two pipes; `layers` are the
-    names of the isolation layers that are active already.
+    runs the tuner's code.
+
+    Args:
+        request: request of the harness: function of the service, its folder, readable paths and
+            memory limit.
+        descriptors: control socket and the two pipes.
+        layers: names of the isolation layers that are active already.
     """
     set_parent_death_signal()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)

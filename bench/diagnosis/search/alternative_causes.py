@@ -190,7 +190,12 @@ class AlternativeFinder:
         ]
 
     def _act_in_one_loop(self, effect: str, other_effect: str) -> bool:
-        """Return whether two effects act at different joints of one kinematic loop."""
+        """Return whether two effects act at different joints of one kinematic loop.
+
+        Args:
+            effect: name of one effect.
+            other_effect: name of the other effect.
+        """
         evaluator = self.search.evaluator
         joints = {evaluator.available_effects[name].coordinate for name in (effect, other_effect)}
         return len(joints) == 2 and any(joints <= loop for loop in evaluator.simulator.system.loops)

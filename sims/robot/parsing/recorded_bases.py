@@ -92,7 +92,14 @@ def separate_floating_joints(
 
 
 def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
-    """Add a joint without any force of its own, whatever the defaults of the file are."""
+    """Add a joint without any force of its own, whatever the defaults of the file are.
+
+    Args:
+        body: body of MuJoCo's spec that gets the joint.
+        name: name of the joint.
+        kind: joint type of MuJoCo.
+        axis: axis of the joint in the body.
+    """
     joint = body.add_joint(name=name, type=kind, axis=axis)
     for field in ("damping", "armature", "frictionloss", "stiffness", "springref", "margin"):
         setattr(
