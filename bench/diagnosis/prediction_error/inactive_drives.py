@@ -474,18 +474,20 @@ def _choose_second_hypothesis(costs: Array) -> Mask:
 
     Dynamic programming finds the sequence with the lowest cost.
     """
-    count = costs.shape[1]
-    from_other = np.zeros((2, count), dtype=bool)
-    lowest_costs = costs[:, 0].copy()
-    for i in range(1, count):
-        cost_with_change = lowest_costs[::-1] + CHANGE_COST
-        from_other[:, i] = cost_with_change < lowest_costs
-        lowest_costs = np.minimum(lowest_costs, cost_with_change) + costs[:, i]
-    result = np.zeros(count, dtype=bool)
-    hypothesis = int(np.argmin(lowest_costs))
-    for i in range(count - 1, -1, -1):
+    # Python's own numbers: an operation of NumPy takes ten times as long for two of them.
+    first_costs, second_costs = costs.tolist()
+    first, second = first_costs[0], second_costs[0]
+    from_other = [(False, False)]
+    for first_cost, second_cost in zip(first_costs[1:], second_costs[1:], strict=True):
+        first_with_change, second_with_change = second + CHANGE_COST, first + CHANGE_COST
+        from_other.append((first_with_change < first, second_with_change < second))
+        first = min(first, first_with_change) + first_cost
+        second = min(second, second_with_change) + second_cost
+    result = np.zeros(len(from_other), dtype=bool)
+    hypothesis = int(second < first)
+    for i in range(len(from_other) - 1, -1, -1):
         result[i] = hypothesis == 1
-        if from_other[hypothesis, i]:
+        if from_other[i][hypothesis]:
             hypothesis = 1 - hypothesis
     return result
 

@@ -49,18 +49,20 @@ def motion_forces(
     import mujoco
 
     data = mujoco.MjData(model)
-    positions = [joint.position for joint in joints]
-    dofs = [joint.velocity for joint in joints]
+    qpos, qvel, qacc, ctrl, act = data.qpos, data.qvel, data.qacc, data.ctrl, data.act
+    inverse_forces, actuator_forces = data.qfrc_inverse, data.qfrc_actuator
+    positions = np.array([joint.position for joint in joints], dtype=np.intp)
+    dofs = np.array([joint.velocity for joint in joints], dtype=np.intp)
     needed, driven = np.zeros(motion.shape[1:]), np.zeros(motion.shape[1:])
     for k in range(motion.shape[1]):
-        data.qpos[positions], data.qvel[dofs], data.qacc[dofs] = motion[:, k]
+        qpos[positions], qvel[dofs], qacc[dofs] = motion[:, k]
         mujoco.mj_inverse(model, data)
-        needed[k] = data.qfrc_inverse[dofs]
-        data.ctrl[:] = controls[k]
+        needed[k] = inverse_forces[dofs]
+        ctrl[:] = controls[k]
         if activations is not None:
-            data.act[:] = activations[k]
+            act[:] = activations[k]
         mujoco.mj_fwdActuation(model, data)
-        driven[k] = data.qfrc_actuator[dofs]
+        driven[k] = actuator_forces[dofs]
     return MotionForces(needed, driven)
 
 
