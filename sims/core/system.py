@@ -19,7 +19,7 @@ force.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -283,6 +283,20 @@ class System(ABC):
             numbers: Parameters and constants by name.
         """
         return None
+
+    @classmethod
+    def close_loops(
+        cls,
+        states: Mapping[str, float],
+        measured: Collection[str],  # noqa: ARG003
+    ) -> dict[str, float]:
+        """Return states in which the loops of the system are closed; without loops, the same.
+
+        Args:
+            states: States by name.
+            measured: Names of the states that stay; the other coordinates of a loop are moved.
+        """
+        return dict(states)
 
     @classmethod
     def gear(cls, coordinate: int) -> float:  # noqa: ARG003

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.series_joints import find_compile_error, list_added_elements
 from sims.robot.floating_joints import FloatingJoints
+from sims.robot.loop_closure import close_loops
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places import effect_places
 from sims.robot.places.default_excitation import LazyDefaultRecording
@@ -88,6 +89,16 @@ class RobotSystem(System):
     def gear(cls, coordinate: int) -> float:
         """Return the gear of a coordinate's position servo, see `System`."""
         return cls.gears.get(coordinate, 1.0)
+
+    @classmethod
+    def close_loops(
+        cls, states: Mapping[str, float], measured: Collection[str]
+    ) -> dict[str, float]:
+        """Return states in which the loops of the robot are closed, see `System`."""
+        in_loops = sorted(set().union(*cls.loops))
+        names = [cls.coordinates[coordinate].removeprefix("q.") for coordinate in in_loops]
+        unmeasured = [name for name in names if f"q.{name}" not in measured]
+        return close_loops(cls.robot, states, unmeasured)
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:

@@ -131,7 +131,7 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
         values[system.coordinates[-1]] = _estimate_start_height(run, simulator)
     # Specified values override every guess.
     values.update(run.initial)
-    return values
+    return system.close_loops(values, {*run.channels, *run.initial})
 
 
 def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:

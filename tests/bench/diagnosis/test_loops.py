@@ -1,0 +1,82 @@
+"""Tests of recordings of a leg whose knee is driven by a rod, with unmeasured joints."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.explain import explain
+from tests.exams.robot_files import write_robot_recording
+
+LEG = """<mujoco model="leg">
+  <compiler angle="radian"/>
+  <option timestep="0.001" integrator="implicitfast"/>
+  <default><geom type="capsule" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="thigh" pos="0 0 1">
+      <joint name="hip" axis="0 1 0" damping="0.05" armature="0.02"/>
+      <geom fromto="0 0 0 0 0 -0.4" size="0.02" mass="1.5"/>
+      <body name="shin" pos="0 0 -0.4">
+        <joint name="knee" axis="0 1 0" damping="0.05" armature="0.01"/>
+        <geom fromto="0 0 0 0.1 0 -0.35" size="0.015" mass="0.7"/>
+      </body>
+      <body name="crank" pos="0.02 0 -0.05">
+        <joint name="crank" axis="0 1 0" damping="0.01" armature="0.005"/>
+        <geom fromto="0 0 0 -0.06 0 0" size="0.008" mass="0.1"/>
+        <body name="rod" pos="-0.06 0 0">
+          <joint name="rod" axis="0 1 0" damping="0.001"/>
+          <geom fromto="0 0 0 0 0 -0.35" size="0.006" mass="0.15"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><connect body1="rod" body2="shin" anchor="0 0 -0.35" solref="0.004 1"/></equality>
+  <actuator>
+    <position name="m_hip" joint="hip" kp="150" kv="6"/>
+    <position name="m_crank" joint="crank" kp="60" kv="2"/>
+  </actuator>
+</mujoco>
+"""
+NOISE = 3e-4
+"""Standard deviation of the encoders in rad."""
+
+
+def write_log(folder, planted_damping):
+    """Write three runs of 3 s by plain MuJoCo; the encoders are at hip and crank alone."""
+    rng, runs = np.random.default_rng(5), {}
+    times = np.arange(301) / 100
+    for name in ("1", "2", "3"):
+        model = mujoco.MjModel.from_xml_string(LEG)
+        model.dof_damping[model.joint("knee").dofadr[0]] += planted_damping
+        data = mujoco.MjData(model)
+        frequencies = rng.uniform((0.3, 0.7, 1.3), (0.7, 1.3, 2.5), (2, 3))
+        phases = rng.uniform(0.0, 6.0, (2, 3))
+        waves = np.sin(2 * np.pi * frequencies[..., None] * times + phases[..., None])
+        commands = 0.3 * np.einsum("k,ukt->tu", (0.5, 0.3, 0.2), waves)
+        commands = np.array([[float(f"{value:.9g}") for value in row] for row in commands])
+        data.ctrl[:] = commands[0]
+        mujoco.mj_step(model, data, nstep=2000)
+        positions = []
+        for command in commands:
+            positions.append([data.joint(joint).qpos[0] for joint in ("hip", "crank")])
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data, nstep=10)
+        readings = np.array(positions) + NOISE * rng.standard_normal((times.size, 2))
+        runs[name] = (name == "3", times, commands, readings)
+    inputs = {"u.m_hip": "rad", "u.m_crank": "rad"}
+    channels = {"q.hip": ("rad", NOISE), "q.crank": ("rad", NOISE)}
+    return write_robot_recording(folder, "log", inputs, channels, runs, ("leg.xml", LEG))
+
+
+@pytest.mark.slow
+def test_a_leg_with_a_rod_is_adequate(tmp_path):
+    assert explain(write_log(tmp_path, 0.0), jobs=1).answer.verdict == "adequate"
+
+
+@pytest.mark.slow
+def test_a_damping_in_the_loop_is_found(tmp_path):
+    answer = explain(write_log(tmp_path, 0.5), jobs=1).answer
+    (cause,) = answer.causes
+    assert "drag.linear@knee" in (cause.effect, *cause.alternatives)
+    if cause.effect == "drag.linear@knee":
+        assert cause.coefficients["coefficient"].value == pytest.approx(0.5, rel=0.02)
+    assert answer.verdict in ("named", "ambiguous")
