@@ -29,11 +29,6 @@ class BOBYQA(Tuner):
     step_tolerance: float = 1e-12
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Pass nlopt's points to the harness one by one.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: unused; the method is deterministic.
-        """
+        """Pass nlopt's points to the harness one by one."""
         tolerance = self.step_tolerance
         return from_callback(lambda loss: minimise_with_nlopt("LN_BOBYQA", loss, task, tolerance))

@@ -26,12 +26,7 @@ class DIRECT(Tuner):
     stochastic: ClassVar[bool] = False
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Pass nlopt's points to the harness one by one.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: unused; the method is deterministic.
-        """
+        """Pass nlopt's points to the harness one by one."""
         # nlopt's DIRECT stops at an infinite loss.
         return from_callback(
             lambda loss: minimise_with_nlopt("GN_DIRECT_L", loss, task, failed_loss=FAILED_LOSS)

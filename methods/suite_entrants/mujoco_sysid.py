@@ -24,12 +24,7 @@ class MuJoCoSysId(Tuner):
     stochastic: ClassVar[bool] = False
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Pass the toolbox's points to the harness, finite differences in one batch.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: unused; the method is deterministic.
-        """
+        """Pass the toolbox's points to the harness, finite differences in one batch."""
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
             """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""

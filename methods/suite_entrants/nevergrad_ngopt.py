@@ -22,10 +22,5 @@ class NevergradNGOpt(Tuner):
     requires: ClassVar[tuple[str, ...]] = ("nevergrad",)
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one point at a time; the first one is the start.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: random numbers of the run.
-        """
+        """Propose one point at a time; the first one is the start."""
         return tune_with_nevergrad("NGOpt", task, rng)

@@ -27,12 +27,7 @@ class OptunaTPE(Tuner):
     multivariate: bool | None = None
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one point at a time; the first one is the start.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: random numbers of the run.
-        """
+        """Propose one point at a time; the first one is the start."""
         return tune_with_optuna(self._make_sampler, task, rng)
 
     def _make_sampler(self, seed: int) -> Any:

@@ -28,12 +28,7 @@ class SequentialNPE(Tuner):
     rounds: int = 4
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Propose one round of points per yield; the first one is uniform, with the start.
-
-        Args:
-            task: start, observations, number of parameters and budget of the run.
-            rng: random numbers of the run.
-        """
+        """Propose one round of points per yield; the first one is uniform, with the start."""
         posterior = PosteriorRounds(task)
         points = rng.uniform(size=(max(task.budget // self.rounds, 1), task.dim))
         points[0] = task.start
