@@ -41,7 +41,7 @@ from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES
 from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomSearch
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
 from bench.diagnosis.search.start_selection import select_refit_starts
-from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.core.effect import members_of
 from sims.core.simulator import Array
 
 MAX_COMPETITOR_SIZE = 1.3
@@ -75,11 +75,6 @@ SAMPLED_WIDTH = 0.04
 """Standard deviation of coefficients in a random search, relative to the number of the model file.
 
 For effects without such a number, it is relative to the coefficient.
-"""
-STEP_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003)
-"""Half of the intervals in which coefficients that fit equally well are searched.
-
-They are relative to the standard deviation of coefficients in a random search.
 """
 MAX_TRIED_EFFECTS = 3
 """Maximum number of effects that are fitted with initial states of their own."""
@@ -155,9 +150,10 @@ def _list_single_starts(search: EffectSearch) -> list[FitStart]:
     """Return starts of the effects that explain most from the initial states of the base model.
 
     Effects at contacts are scanned over their range. Of the others, those with the best scores are
-    fitted.
+    fitted, and the members of a fitted family are tried alone. An effect with more coefficients has
+    to explain more.
     """
-    base = search.base_model
+    base, evaluator = search.base_model, search.evaluator
     states = base.fit.initial_states
     ranked = [
         (value.squares, _make_start(search, value, states))
@@ -165,13 +161,40 @@ def _list_single_starts(search: EffectSearch) -> list[FitStart]:
     ]
     exclude_laws_with_many_shapes(search)
     search.refit_extensions([base], MAX_REFITTED_CANDIDATES)
-    ranked += [
-        (model.fit.cost, model.fit.make_start())
-        for model in search.models.values()
-        if model.effects and model.fit.cost < MAX_SCAN_RATIO * base.fit.cost
-    ]
-    ranked.sort(key=lambda pair: pair[0])
-    return [start for _, start in ranked[:MAX_TRIED_EFFECTS]]
+    for model in search.models.values():
+        if model.effects:
+            count = len(evaluator.get_coefficient_indices(model.effects[0]))
+            ranked.append((count * model.fit.cost, model.fit.make_start()))
+            ranked += _list_member_starts(search, model)
+    limit = MAX_SCAN_RATIO * base.fit.cost
+    useful = sorted((pair for pair in ranked if pair[0] < limit), key=lambda pair: pair[0])
+    return [start for _, start in useful[:MAX_TRIED_EFFECTS]]
+
+
+def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[float, FitStart]]:
+    """Return starts of the members of a fitted family, with their sums of squares.
+
+    Members have one coefficient each.
+    """
+    (name,) = model.effects
+    evaluator, fit = search.evaluator, model.fit
+    members = [member.name for member in members_of(evaluator.available_effects[name])]
+    indices = list(evaluator.get_coefficient_indices(name))
+    if len(members) < 2 or len(members) != len(indices):
+        return []
+    starts = []
+    for member, index in zip(members, indices, strict=True):
+        if member not in evaluator.coefficient_slices:
+            continue
+        theta = fit.theta.copy()
+        theta[indices] = 0.0
+        theta[evaluator.coefficient_slices[member]] = fit.theta[index]
+        starts.append(FitStart((member,), theta, fit.initial_states))
+    if not starts:
+        return []
+    samples = np.array([start.theta for start in starts])
+    squares = _compute_squares(evaluator, search.noise.sigma, samples, fit.initial_states)
+    return list(zip(squares.tolist(), starts, strict=True))
 
 
 def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> FittedModel:
@@ -224,67 +247,42 @@ def _use_first_states_of(
 ) -> None:
     """Use the initial states of a model for all runs, and fit it and the base model about them.
 
-    Those of held-out runs are estimated with its coefficients.
+    Those of held-out runs are estimated with its final coefficients.
     """
     base, evaluator = search.base_model, search.evaluator
     deviations = evaluator.state_prior
     assert deviations is not None
-    start = model.fit.make_start()
     evaluator.begin_at(model.fit.initial_states, deviations)
-    held_out = [other for other in evaluators if other is not evaluator]
-    set_first_states_in_contact(held_out, start.theta, search.noise.sigma)
-    for other in held_out:
-        start = replace(start, theta=_choose_within_steps(search, other, model, start.theta))
     search.models.clear()
     search.refit_models([FitStart((), base.fit.theta, evaluator.initial_state_guesses)])
-    is_moved = start.theta is not model.fit.theta
-    search.fit_to_convergence(search.fit_one(start) if is_moved else search.add_fit(model.fit))
+    model = search.fit_to_convergence(search.add_fit(model.fit))
+    held_out = [other for other in evaluators if other is not evaluator]
+    set_first_states_in_contact(held_out, model.fit.theta, search.noise.sigma)
+    for other in held_out:
+        _search_first_states(search, other, model.fit.theta)
 
 
-def _choose_within_steps(
-    search: EffectSearch, held_out: RunEvaluator, model: FittedModel, theta: Array
-) -> Array:
-    """Return parameters (P,) that explain held-out runs, among those that fit equally well.
-
-    The sum of squares has steps where a contact begins or ends at another time. Between two steps,
-    the runs for fitting hardly depend on the coefficient, while a held-out run may have a step
-    there. Its initial states are estimated again with the chosen coefficient.
+def _search_first_states(search: EffectSearch, held_out: RunEvaluator, theta: Array) -> None:
+    """Search initial states of held-out runs at random if the smoothed ones do not explain them.
 
     Args:
-        search: search with the runs for fitting.
-        held_out: held-out runs, which begin at states that were estimated with `theta`.
-        model: fitted model with one effect.
-        theta: (P,) its parameters.
+        search: search with the noise.
+        held_out: held-out runs, which begin at smoothed states.
+        theta: (P,) parameters of the model.
     """
-    (name,) = model.effects
-    indices = list(search.evaluator.get_coefficient_indices(name))
-    sigma = search.noise.sigma
-    unexplained = _compute_squares(held_out, sigma, theta[None], held_out.initial_state_guesses)
-    count = int(np.isfinite(held_out.observed).sum())
-    if len(indices) != 1 or not float(unexplained[0]) > EXPLAINED_SQUARES * count:
-        return theta
-    widths = _compute_widths(search, name, theta[indices])
-    distances = np.concatenate([share * np.linspace(-1.0, 1.0, 13) for share in STEP_SHARES])
-    samples = np.repeat(theta[None], len(distances), axis=0)
-    samples[:, indices[0]] += widths[0] * distances
-    states = model.fit.initial_states
-    squares = _compute_squares(search.evaluator, sigma, samples, states)
-    is_as_good = squares < squares.min() + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-    values = samples[is_as_good, indices[0]]
-    smoothed = smooth_first_states(held_out, theta, sigma)
-    if smoothed is None or not np.ptp(values) > 0.0:
-        return theta
-    bounds = np.array([[values.min(), values.max()]])
-    rng = search.make_rng("held-out states", model.effects)
+    sigma, count = search.noise.sigma, int(np.isfinite(held_out.observed).sum())
+    (before,) = _compute_squares(held_out, sigma, theta[None], held_out.initial_state_guesses)
+    smoothed = None
+    if before > EXPLAINED_SQUARES * count:
+        smoothed = smooth_first_states(held_out, theta, sigma)
+    if smoothed is None:
+        return
+    rng = search.make_rng("held-out states")
     found = RandomSearch(held_out, sigma, smoothed, rng).run(
-        theta, indices, 0.5 * np.ptp(bounds, axis=1), bounds
+        theta, [], np.zeros(0), np.zeros((0, 2))
     )
-    (after,) = _compute_squares(search.evaluator, sigma, found.theta[None], states)
-    is_better = found.mean_square * count < float(unexplained[0])
-    if not is_better or after > squares.min() + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
-        return theta
-    held_out.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
-    return found.theta
+    if found.mean_square * count < before:
+        held_out.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
 
 
 def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, states: Array) -> Array:

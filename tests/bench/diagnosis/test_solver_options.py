@@ -1,5 +1,7 @@
 """Tests that options of MuJoCo's solver are causes if the recorded simulator has other ones."""
 
+from types import SimpleNamespace
+
 import mujoco
 import pytest
 
@@ -7,9 +9,10 @@ from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
 from bench.diagnosis.explain import _ExplainRun, explain
 from bench.diagnosis.explain_options import ExplainOptions
+from bench.diagnosis.numerics_cause import RatedOptions
 from bench.diagnosis.report.effect_and_unit_text import format_effect
 from sims.robot.integrator_settings import OPTION_EFFECTS, IntegratorSettings
-from tests.bench.diagnosis.block_recordings import OPTIONS, write_block_recording
+from tests.bench.diagnosis.block_recordings import BLOCK, OPTIONS, write_block_recording
 
 
 def rank(path):
@@ -59,6 +62,33 @@ def test_an_option_that_leaves_most_of_a_wrong_friction_is_no_alternative(tmp_pa
 
 def test_no_alternative_explains_a_clean_recording_better(tmp_path):
     assert rank(write_block_recording(tmp_path)) == []
+
+
+def rate(changes, gain, residual):
+    """Return the rating of a base model of the block with changed options of the solver."""
+    settings = IntegratorSettings(0.002, "implicitfast").replace_options(changes)
+    robot = SimpleNamespace(compiled=mujoco.MjModel.from_xml_string(BLOCK))
+    evaluators = SimpleNamespace(kind=SimpleNamespace(robot=robot, numerics=settings))
+    return RatedOptions(evaluators, None, gain, gain, residual, 0.0, False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "gain", "residual", "is_better"),
+    [
+        ({"impratio": 20.0}, 100.0, 9.0, False),
+        ({"impratio": 20.0}, 100.0, 5.9, True),
+        ({"integrator": 0}, 100.0, 9.0, False),
+        ({"integrator": 0}, 100.0, 5.9, True),
+        ({"integrator": 0}, 10.0, 5.9, False),
+    ],
+)
+def test_an_option_must_close_half_of_the_gap(changes, gain, residual, is_better):
+    assert rate(changes, gain, residual).is_better_than(rate({}, 0.0, 11.0)) is is_better
+
+
+def test_another_value_of_a_changed_option_needs_no_part_of_the_gap():
+    assert rate({"impratio": 20.0}, 108.0, 4.9).is_better_than(rate({"impratio": 10.0}, 100.0, 5.0))
+    assert rate({"integrator": 0}, 108.0, 4.9).is_better_than(rate({"integrator": 1}, 100.0, 5.0))
 
 
 def test_settings_replace_options_by_number():

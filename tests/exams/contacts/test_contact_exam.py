@@ -42,7 +42,7 @@ def test_a_case_shows_its_discrepancy_and_a_clean_one_has_none():
     "question",
     [
         ContactQuestion("single", "hopper", "contact.damping", 1),
-        # The runs for fitting determine the number only up to a step of the held-out run.
+        # The held-out run is explained only from states that belong to the fitted number.
         ContactQuestion("single", "arm", "contact.damping", 0),
         # The first state of the held-out run has to be found by simulation.
         ContactQuestion("clean", "hopper", "any", 2),

@@ -66,3 +66,10 @@ def test_known_initial_states_are_kept_and_bounds_are_respected():
     np.testing.assert_array_equal(found.states, STARTS)
     assert found.theta[1] == pytest.approx(0.31, abs=1e-3)
     assert found.theta[1] >= 0.31
+
+
+def test_initial_states_alone_are_searched_without_coefficients():
+    found = make_search().run(np.array([7.0, FRICTION]), [], np.zeros(0), np.zeros((0, 2)))
+    assert found.theta.tolist() == [7.0, FRICTION]
+    assert found.mean_square < 1.2
+    assert np.abs(found.states - STARTS) / np.array([NOISE, 1e-3]) == pytest.approx(0.0, abs=2.0)
