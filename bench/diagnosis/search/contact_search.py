@@ -85,6 +85,8 @@ MAX_COST_RATIO = 0.5
 MAX_REPEATED_COST_RATIO = 0.25
 """Maximum sum of squares at which initial states are estimated again, relative to the base model.
 """
+MAX_EXCESS_OF_WRONG_STATES = 2.0
+"""Maximum excess of the base model at which its initial states may be all that is wrong."""
 MAX_EXPLAINED_EXCESS = 0.05
 """Maximum excess of a model whose initial states are not estimated again."""
 MIN_COST_RATIO = 0.7
@@ -107,6 +109,10 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     base = search.base_model
     if search.is_noise_like(base):
         return
+    _search_states_of_base(search)
+    base = search.base_model
+    if search.is_noise_like(base):
+        return
     try:
         best = _fit_single_effects(search)
         if best is not None:
@@ -114,6 +120,28 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     except SearchStoppedError:
         search.models.setdefault(frozenset(), base)
         raise
+
+
+def _search_states_of_base(search: EffectSearch) -> None:
+    """Search the initial states at random with the base model, and fit it again if they are better.
+
+    The model may lack nothing where the smoothed states do not explain the recording. Far from the
+    noise, it lacks something.
+    """
+    base = search.base_model
+    if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
+        return
+    former_states, deviations = search.evaluator.initial_state_guesses, search.evaluator.state_prior
+    assert deviations is not None
+    _search_first_states(search, search.evaluator, base.fit.theta)
+    states = search.evaluator.initial_state_guesses
+    if states is former_states:
+        return
+    search.models.clear()
+    model = search.fit_one(FitStart((), base.fit.theta, states))
+    if not model.penalised_log_likelihood > base.penalised_log_likelihood:
+        search.evaluator.begin_at(former_states, deviations)
+        search.models[frozenset()] = base
 
 
 def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
@@ -262,27 +290,25 @@ def _use_first_states_of(
         _search_first_states(search, other, model.fit.theta)
 
 
-def _search_first_states(search: EffectSearch, held_out: RunEvaluator, theta: Array) -> None:
-    """Search initial states of held-out runs at random if the smoothed ones do not explain them.
+def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array) -> None:
+    """Search initial states at random if the smoothed ones do not explain the runs.
 
     Args:
         search: search with the noise.
-        held_out: held-out runs, which begin at smoothed states.
+        runs: the runs, which begin at smoothed states.
         theta: (P,) parameters of the model.
     """
-    sigma, count = search.noise.sigma, int(np.isfinite(held_out.observed).sum())
-    (before,) = _compute_squares(held_out, sigma, theta[None], held_out.initial_state_guesses)
+    sigma, count = search.noise.sigma, int(np.isfinite(runs.observed).sum())
+    (before,) = _compute_squares(runs, sigma, theta[None], runs.initial_state_guesses)
     smoothed = None
     if before > EXPLAINED_SQUARES * count:
-        smoothed = smooth_first_states(held_out, theta, sigma)
+        smoothed = smooth_first_states(runs, theta, sigma)
     if smoothed is None:
         return
-    rng = search.make_rng("held-out states")
-    found = RandomSearch(held_out, sigma, smoothed, rng).run(
-        theta, [], np.zeros(0), np.zeros((0, 2))
-    )
+    rng = search.make_rng("initial states")
+    found = RandomSearch(runs, sigma, smoothed, rng).run(theta, [], np.zeros(0), np.zeros((0, 2)))
     if found.mean_square * count < before:
-        held_out.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
+        runs.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
 
 
 def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, states: Array) -> Array:

@@ -46,6 +46,8 @@ def test_a_case_shows_its_discrepancy_and_a_clean_one_has_none():
         ContactQuestion("single", "arm", "contact.damping", 0),
         # The first state of the held-out run has to be found by simulation.
         ContactQuestion("clean", "hopper", "any", 2),
+        # The smoothed initial states leave a residual of 1.3 times the noise.
+        ContactQuestion("clean", "arm", "any", 0),
     ],
     ids=lambda question: question.name,
 )
