@@ -92,6 +92,9 @@ def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
         if joint.has_one_coordinate and joint.name in positions:
             data.qpos[joint.position] = positions[joint.name]
     mujoco.mj_forward(robot.compiled, data)
+    for joint in (j for j in robot.joints if j.name in robot.base_joints):
+        # The slides of a floating body have no bearings: they are where the body is.
+        data.xanchor[joint.id] = data.xpos[robot.compiled.jnt_bodyid[joint.id]]
     return data
 
 
@@ -110,7 +113,14 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     axes = _compute_camera_axes(azimuth, elevation)
     moving_points, static_points = compute_bounding_points(robot.compiled, data)
     points = (
-        np.concatenate([data.xanchor, moving_points, _find_end_points(robot.compiled, data)])
+        np.concatenate(
+            [
+                data.xanchor,
+                moving_points,
+                _find_end_points(robot.compiled, data),
+                _find_actuated_sites(robot.compiled, data),
+            ]
+        )
         @ axes.T
     )
     # Corners of the bounding box in m, along the camera's axes right, up and forward.
@@ -143,6 +153,20 @@ def _find_end_points(model: Any, data: Any) -> Array:
     jointed = [body for body in sorted(shapeless_bodies) if int(model.body_jntadr[body]) >= 0]
     tips: Array = 2 * data.xipos[jointed] - data.xanchor[model.body_jntadr[jointed]]
     return tips
+
+
+def _find_actuated_sites(model: Any, data: Any) -> Array:
+    """Return the positions (n, 3) of sites on which actuators act, such as rotors.
+
+    Args:
+        model: compiled model.
+        data: its state at the pose.
+    """
+    import mujoco
+
+    is_at_site = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)
+    sites: Array = data.site_xpos[model.actuator_trnid[is_at_site, 0]]
+    return sites
 
 
 def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:

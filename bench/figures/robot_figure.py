@@ -353,7 +353,8 @@ def _make_labels(
         lines += [mark.says] if mark.says and mark.says not in lines else []
     if len(robot.joints) <= MAX_NAMED_JOINTS:
         for joint in robot.joints:
-            lines_by_place.setdefault(("joint", joint.name), [])
+            if joint.name not in robot.base_joints:
+                lines_by_place.setdefault(("joint", joint.name), [])
     marked = {(mark.kind, mark.name) for mark in marks}
     labels = []
     for (kind, name), lines in lines_by_place.items():
@@ -556,13 +557,32 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
         if kind == "body":
             return np.array(data.xipos[robot.body(name).id])
         if kind == "actuator":
-            joint = robot.actuator(name).joint
-            return None if joint is None else np.array(data.xanchor[robot.joint(joint).id])
+            return _place_of_actuator(robot, data, name)
         if kind == "channel":
             return _place_of_channel(robot, data, name)
         return np.array(data.xanchor[robot.joint(name).id])
     except InputError:
         return None
+
+
+def _place_of_actuator(robot: RobotModel, data: Any, name: str) -> Array | None:
+    """Return the position (3,) in the world of the joint or the site on which an actuator acts.
+
+    It is None for an actuator on a tendon or a body.
+
+    Args:
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+        name: name of the actuator.
+    """
+    import mujoco
+
+    actuator = robot.actuator(name)
+    if actuator.joint is not None:
+        return np.array(data.xanchor[robot.joint(actuator.joint).id])
+    if int(robot.compiled.actuator_trntype[actuator.id]) != int(mujoco.mjtTrn.mjTRN_SITE):
+        return None
+    return np.array(data.site_xpos[int(robot.compiled.actuator_trnid[actuator.id, 0])])
 
 
 def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
