@@ -227,6 +227,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         "pairs": tables.pairs,
         "ert": tables.running_times,
         "profile": tables.profile,
+        "ranks_common_targets": tables.build_tables()["ranks_common_targets"],
     }
     shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
     for name, frame in shown_frames.items():
@@ -237,6 +238,7 @@ def render_suite_page(tables: SuiteTables) -> str:
     seeds = int(suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique().max())
     trained = suite.training[suite.training["fit_simulations"] > 0]
     ranked = bool(tables.complete_tuners)
+    partial_tuners = [t for t in suite.tuners if t not in tables.complete_tuners]
     return page.render(
         _TEMPLATE,
         version=suite.version,
@@ -256,6 +258,7 @@ def render_suite_page(tables: SuiteTables) -> str:
             for k in _RANK_BLOCKS
             if k in tables.checkpoints
         ],
+        partial_tuners=partial_tuners,
         skipped=[f"{row.tuner}: {row.reason}" for row in suite.skipped.itertuples()],
         rank_panel=_make_rank_panel(tables, page, styles) if ranked else None,
         columns={name: _list_columns(frame) for name, frame in shown_frames.items()},

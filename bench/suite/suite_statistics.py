@@ -403,9 +403,32 @@ class SuiteTables:
         frame = pd.DataFrame(lines, columns=["cell", "winner", "ratio"])
         return frame.sort_values("ratio", ascending=False, kind="stable", ignore_index=True)
 
+    @cached_property
+    def over_common_targets(self) -> SuiteTables:
+        """Tables over the targets that every tuner of their cell ran.
+
+        They compare slow tuners, which ran on some of the targets only, with the others. Without
+        such tuners they are these tables.
+        """
+        runs = self.suite.runs
+        tuner_counts = runs.groupby("cell")["tuner"].nunique()
+        by_target = runs.groupby(["cell", "target"])["tuner"].transform("nunique")
+        is_common = by_target == runs["cell"].map(tuner_counts)
+        return self if is_common.all() else SuiteTables(self.suite.select(is_common))
+
+    @property
+    def has_partial_tuners(self) -> bool:
+        """True if some tuners ran on some of the targets only."""
+        return self.over_common_targets is not self
+
     def build_tables(self) -> dict[str, pd.DataFrame]:
-        """Return all tables by name."""
+        """Return all tables by name.
+
+        The table ``ranks_common_targets`` is empty unless some tuners ran on some targets only.
+        """
+        common = self.over_common_targets.ranks if self.has_partial_tuners else self.ranks.iloc[:0]
         return {
+            "ranks_common_targets": common,
             "errors": self.errors,
             "ranks": self.ranks,
             "pairs": self.pairs,

@@ -1,5 +1,7 @@
 """Statistics, headline, guide and page of a suite on given error curves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -41,6 +43,27 @@ def test_headline_names_the_best_untrained_method_too():
         "If you can train on your simulator beforehand, use early up to 3 simulations, then late. "
         "Without training, use late."
     )
+
+
+def test_a_method_with_fewer_targets_is_ranked_on_the_common_ones():
+    tables = make_tables()
+    assert not tables.has_partial_tuners
+    assert tables.build_tables()["ranks_common_targets"].empty
+    # Method "never" is better than all others on the first target, and did not run on the rest.
+    suite = tables.suite
+    runs = suite.runs
+    errors = suite.errors.copy()
+    errors[((runs["tuner"] == "never") & (runs["target"] == "in-000")).to_numpy()] = 1e-5
+    is_left_out = (runs["tuner"] == "never") & (runs["target"] != "in-000")
+    partial = SuiteTables(replace(suite, errors=errors).select(~is_left_out))
+    assert "never" not in partial.complete_tuners
+    assert set(partial.ranks["tuner"]) == {"early", "late"}
+    common = partial.build_tables()["ranks_common_targets"]
+    first = common[(common["training"] == FREE) & (common["mean_rank"] == 1.0)]
+    assert set(first["tuner"]) == {"never"}
+    assert set(common["cells"]) == {len(CELLS)}
+    assert "ran on some of the targets only" in render_suite_page(partial)
+    assert "ran on some of the targets only" not in render_suite_page(tables)
 
 
 def test_the_headline_does_not_change_method_for_a_small_difference():
