@@ -3,6 +3,8 @@
 Plain MuJoCo simulates the free joint with a controller; explain sees commands and noisy poses.
 """
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from bench.cli.main import main
 from bench.diagnosis.explain import explain
+from examples.drone import make_log
 from sims.core.simulator import InputError
 from tests.exams.robot_files import write_robot_recording
+
+EXAMPLE = Path(make_log.__file__).parent
 
 QUADROTOR = """<mujoco model="quadrotor">
   <option timestep="0.002" integrator="RK4"/>
@@ -136,6 +141,25 @@ def test_an_unstable_flight_is_explained_in_short_pieces(tmp_path):
     (cause,) = answer.causes
     assert cause.effect == "mass.offset@hull"
     assert cause.coefficients["x"].value == pytest.approx(0.01, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_weak_rotor_of_the_example_is_named():
+    answer = explain(EXAMPLE / "log.csv", jobs=1).answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "input.gain@m3", ())
+    number = cause.coefficients["coefficient"]
+    assert number.value == pytest.approx(make_log.EFFICIENCY[2] - 1.0, abs=1e-3)
+
+
+def test_the_log_of_the_example_is_what_its_script_writes(tmp_path):
+    written = make_log.write_log(tmp_path).read_text().splitlines()
+    stored = (EXAMPLE / "log.csv").read_text().splitlines()
+    assert written[0] == stored[0]
+    tables = [
+        np.array([row.split(",") for row in rows[1:]], dtype=float) for rows in (written, stored)
+    ]
+    assert tables[0] == pytest.approx(tables[1], abs=2e-5)
 
 
 def test_an_incomplete_pose_is_refused(tmp_path):
