@@ -312,7 +312,10 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     table = pa.Table.from_pandas(suite.runs, preserve_index=False)
     table = table.append_column(_ERRORS_COLUMN, errors)
     with atomic_replacement(folder / CURVES_FILE) as path:
-        parquet.write_table(table, path, compression="zstd", compression_level=15)
+        # Few errors occur twice, so that a dictionary of them takes more space than it saves.
+        parquet.write_table(
+            table, path, compression="zstd", compression_level=22, use_dictionary=False
+        )
     texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
     for name, table_frame in texts.items():
         write_atomically(folder / name, table_frame.to_csv(index=False))
