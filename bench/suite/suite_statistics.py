@@ -128,7 +128,8 @@ class SuiteTables:
         """Compute logarithms of errors after k simulations: a row per target, a column per tuner.
 
         With training counted, a trained tuner has k less its share of the training simulations, and
-        no advance over the start before that.
+        no advance over the start before that. A regressor has its estimate of the parameters before
+        any simulation of the target, but not before its training.
 
         Args:
             cell: name of the cell.
@@ -141,10 +142,25 @@ class SuiteTables:
             share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
             column = tuner_curves.values[:, max(int(k - share), 0)]
             target_means = pd.Series(column).groupby(tuner_curves.keys["target"]).mean()
+            if share > k:
+                start_errors = self._start_errors[cell].reindex(target_means.index)
+                target_means = start_errors.fillna(target_means)
             means_array: Array = np.asarray(target_means, dtype=np.float64)
             logs = compute_log_errors(means_array, self.floors[cell])
             columns[tuner] = pd.Series(logs, index=target_means.index)
         return pd.DataFrame(columns)
+
+    @cached_property
+    def _start_errors(self) -> dict[str, pd.Series[float]]:
+        """Errors of the starts by target, for each cell: those of tuners without training."""
+        result = {}
+        for cell, curves in self.curves.items():
+            costs = {t: self._get_training_share(cell, t) for t in curves.list_tuners()}
+            untrained = curves.keys["tuner"].map(costs) == 0.0
+            errors = pd.Series(curves.values[untrained.to_numpy(), 0])
+            targets = curves.keys.loc[untrained, "target"].reset_index(drop=True)
+            result[cell] = errors.groupby(targets).min()
+        return result
 
     def _get_training_share(self, cell: str, tuner: str) -> float:
         """Return a target's share of the training simulations of a tuner; 0 without training.

@@ -89,6 +89,18 @@ def test_counted_training_delays_a_trained_method():
     assert np.exp(before).tolist() == pytest.approx([np.sqrt(1.01 * 1.02)] * len(CELLS))
 
 
+def test_an_estimate_without_simulations_has_to_be_trained_first():
+    """A regressor is right before it simulates; counted, it has the start's error until then."""
+    at_once = np.where(np.arange(BUDGET + 1) >= 0, 0.001, 1.0)
+    curves = {"regressor": at_once, "late": LATE}
+    suite = make_suite(dict.fromkeys(CELLS, curves), training={"regressor": 200}, targets=1)
+    tables = SuiteTables(suite)
+    for k, expected in ((10, 1.0), (30, 0.001)):
+        counted = np.exp(tables.get_medians(k, COUNTED)["regressor"])
+        assert counted.tolist() == pytest.approx([expected] * len(CELLS))
+    assert np.exp(tables.get_medians(1)["regressor"]).iloc[0] == pytest.approx(0.001)
+
+
 def test_expected_running_time():
     times = make_tables(targets=1).running_times
     late = times[(times["cell"] == CELLS[0]) & (times["tuner"] == "late")]
