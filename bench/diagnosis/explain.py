@@ -111,9 +111,17 @@ MAX_OPTION_ROUNDS = 3
 """Maximum number of options of the solver that are changed."""
 MAX_FITTED_OPTIONS = 3
 """Maximum number of alternative options that are fitted in a round."""
+RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
+"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
+MAX_ROTATION_ERROR = 0.5
+"""Maximum error in rad of the simulated orientation of a floating body.
+
+Beyond it, the effects of small changes are not linear.
+"""
 EXPLAINED_VERDICTS = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
 RecordingSource: TypeAlias = str | Path | Recording
+_Result = TypeVar("_Result")
 
 
 def explain(
@@ -139,16 +147,6 @@ def explain(
     return _run_in_segments(
         recording, replace(options or ExplainOptions(), **changes), _ExplainRun.run
     )
-
-
-RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
-"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
-_Result = TypeVar("_Result")
-
-
-MAX_ROTATION_ERROR = 0.5
-"""Largest error in rad of the simulated orientation of a floating body; beyond it, the effects of
-small changes are not linear."""
 
 
 class DivergingSimulationError(InputError):
@@ -366,7 +364,7 @@ class _ExplainRun:
 
         Args:
             kind: class of the simulator.
-            options: options of the diagnosis: number of segments, and whether runs stay whole.
+            options: options of the diagnosis: duration of segments, and whether runs stay whole.
         """
         self.recording, thinning_note = thin_recording(self.recording, kind)
         self.recording, settling_note = leave_out_settling(self.recording, kind)
@@ -1360,7 +1358,7 @@ class _ExplainRun:
     @property
     def is_divisible(self) -> bool:
         """True if runs may be cut into segments: those of a robot without unrecorded poses."""
-        return self.kind.has_model and not self.kind.system.afloat
+        return self.kind.has_model and not self.kind.system.floating_state_units
 
     def _loses_orientation(self, base: BaseFit) -> bool:
         """Return whether the simulated orientation of a recorded floating body is far from it."""

@@ -73,7 +73,7 @@ def segment_recording(
     if seconds is None and (whole or not kind.has_model):
         return SegmentedRecording(recording, "")
     robot: Any = kind
-    floats = kind.has_model and bool(robot.system.afloat)
+    floats = kind.has_model and bool(robot.system.floating_state_units)
     if floats and seconds is not None:
         raise InputError(
             f"{recording.path}: expected no --pieces: {recording.system} has a floating base, "

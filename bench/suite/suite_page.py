@@ -227,7 +227,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         "pairs": tables.pairs,
         "ert": tables.running_times,
         "profile": tables.profile,
-        "ranks_common_targets": tables.build_tables()["ranks_common_targets"],
+        "ranks_common_targets": tables.ranks_over_common_targets,
     }
     shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
     for name, frame in shown_frames.items():

@@ -437,14 +437,15 @@ class SuiteTables:
         """True if some tuners ran on some of the targets only."""
         return self.over_common_targets is not self
 
-    def build_tables(self) -> dict[str, pd.DataFrame]:
-        """Return all tables by name.
+    @property
+    def ranks_over_common_targets(self) -> pd.DataFrame:
+        """Mean ranks over the targets that all tuners ran; empty if they ran on all targets."""
+        return self.over_common_targets.ranks if self.has_partial_tuners else self.ranks.iloc[:0]
 
-        The table ``ranks_common_targets`` is empty unless some tuners ran on some targets only.
-        """
-        common = self.over_common_targets.ranks if self.has_partial_tuners else self.ranks.iloc[:0]
+    def build_tables(self) -> dict[str, pd.DataFrame]:
+        """Return all tables by name."""
         return {
-            "ranks_common_targets": common,
+            "ranks_common_targets": self.ranks_over_common_targets,
             "errors": self.errors,
             "ranks": self.ranks,
             "pairs": self.pairs,

@@ -219,9 +219,9 @@ class System(ABC):
         rates: Names of the states that are the generalised velocity, in order.
         states: Default values of both.
         bounces: Whether its last coordinate strikes the ground at `floor`.
-        afloat: Units by name of the poses and velocities of floating bodies, which are states but
-            no coordinates: they are known at the beginning of a run, but not at the beginning of a
-            part of a run.
+        floating_state_units: Units by name of the poses and velocities of floating bodies, which
+            are states but no coordinates: they are known at the beginning of a run, but not at the
+            beginning of a part of a run.
         base_orientations: Orientation (w, x, y, z) in the model file of each floating body whose
             pose is recorded, by the name of its joint.
         loops: Coordinates that constraints couple, such as those of a four-bar linkage, as sets of
@@ -257,7 +257,7 @@ class System(ABC):
     primary: ClassVar[int] = 0
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
-    afloat: ClassVar[Mapping[str, str]] = {}
+    floating_state_units: ClassVar[Mapping[str, str]] = {}
     base_orientations: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     loops: ClassVar[Sequence[frozenset[int]]] = ()
     uniform: ClassVar[bool] = False

@@ -77,7 +77,8 @@ def compute_angles(quaternions: Array, reference: Array) -> Array:
         quaternions: (T, 4) orientations (w, x, y, z); NaN where a sample is missing.
         reference: (4,) orientation in the model file, a unit quaternion.
     """
-    w, x, y, z = _multiply_by_inverse(quaternions, reference).T
+    inverse_reference = reference * np.array([1.0, -1.0, -1.0, -1.0])
+    w, x, y, z = multiply_quaternions(quaternions, inverse_reference[None]).T
     with np.errstate(invalid="ignore"):
         angles = [
             np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
@@ -129,20 +130,9 @@ def convert_quaternions(
     return converted
 
 
-def _multiply_by_inverse(quaternions: Array, reference: Array) -> Array:
-    """Compute the products (T, 4) of quaternions with the inverse of a unit quaternion.
-
-    Args:
-        quaternions: (T, 4) quaternions w, x, y, z.
-        reference: (4,) the unit quaternion that is inverted.
-    """
-    w, x, y, z = quaternions.T
-    a, b, c, d = reference * np.array([1.0, -1.0, -1.0, -1.0])
-    products = [
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    ]
-    result: Array = np.stack(products, axis=1)
-    return result
+def multiply_quaternions(first: Array, second: Array) -> Array:
+    """Compute the Hamilton products (n, 4) of `first` and `second`, quaternions (w, x, y, z)."""
+    a, u = first[:, :1], first[:, 1:]
+    b, v = second[:, :1], second[:, 1:]
+    real_part = a * b - np.sum(u * v, axis=1, keepdims=True)
+    return np.concatenate([real_part, a * v + b * u + np.cross(u, v)], axis=1)

@@ -433,7 +433,7 @@ def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
 
 def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
     """Return the units of the states of floating bodies, by name; empty if there are none."""
-    units: Mapping[str, str] = getattr(_get_system(declared), "afloat", {})
+    units: Mapping[str, str] = getattr(_get_system(declared), "floating_state_units", {})
     return units
 
 

@@ -23,14 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError
+from sims.recording.recorded_poses import (
+    POSITION_AXES,
+    QUATERNION_ENTRIES,
+    multiply_quaternions,
+)
 from sims.robot.robot_model import Joint, RobotModel
 
 IndexArray = NDArray[np.intp]
-POSITION_AXES, QUATERNION_ENTRIES, ANGULAR_VELOCITY_AXES = (
-    ("x", "y", "z"),
-    ("qw", "qx", "qy", "qz"),
-    ("wx", "wy", "wz"),
-)
+ANGULAR_VELOCITY_AXES = ("wx", "wy", "wz")
+"""Axes of angular velocity, those of the body."""
 MIN_QUATERNION_NORM = 1e-6
 """Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
 
@@ -176,7 +178,7 @@ class FloatingJoints:
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
             quaternion = np.concatenate([np.cos(0.5 * angle), half_sinc * rotation], axis=1)
-            displaced_pose[:, quaternion_columns] = _multiply_quaternions(
+            displaced_pose[:, quaternion_columns] = multiply_quaternions(
                 pose[:, quaternion_columns], quaternion
             )
         return displaced_pose
@@ -190,7 +192,7 @@ class FloatingJoints:
             inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
             columns.append(
                 _compute_rotation_vectors(
-                    _multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
+                    multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
                 )
             )
         return np.concatenate(columns, axis=1) if columns else np.zeros((len(pose), 0))
@@ -211,14 +213,6 @@ class FloatingJoints:
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
     """Return the axes of translation of a floating joint."""
     return POSITION_AXES if joint.kind == "free" else ()
-
-
-def _multiply_quaternions(first: Array, second: Array) -> Array:
-    """Compute the Hamilton products (n, 4) of `first` and `second`, quaternions (w, x, y, z)."""
-    a, u = first[:, :1], first[:, 1:]
-    b, v = second[:, :1], second[:, 1:]
-    real_part = a * b - np.sum(u * v, axis=1, keepdims=True)
-    return np.concatenate([real_part, a * v + b * u + np.cross(u, v)], axis=1)
 
 
 def _compute_rotation_vectors(quaternions: Array) -> Array:

@@ -312,7 +312,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "states": MappingProxyType(states),
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
-        "afloat": MappingProxyType(floating.units()),
+        "floating_state_units": MappingProxyType(floating.units()),
         "base_orientations": MappingProxyType(dict(robot.base_orientations)),
         "loops": tuple(map(frozenset, coupled_joints(model, [j.velocity for j in joints]))),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),

@@ -322,8 +322,18 @@ def fix_bases(spec: Any) -> list[str]:
     if not free:
         return ["fix_base: no body of the model file floats"]
     names = [joint.parent.name for joint in free]
+    for joint in free:
+        spec.delete(joint)
+    return [f"fixed in the pose of the model file: {', '.join(names)}{remove_keyframes(spec)}"]
+
+
+def remove_keyframes(spec: Any) -> str:
+    """Remove the keyframes of a model whose coordinates change, and return the end of a note.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+    """
     keyframes = list(spec.keys)
-    for element in (*free, *keyframes):
-        spec.delete(element)
-    left_out = f"; {len(keyframes)} keyframes are left out" if keyframes else ""
-    return [f"fixed in the pose of the model file: {', '.join(names)}{left_out}"]
+    for keyframe in keyframes:
+        spec.delete(keyframe)
+    return f"; {len(keyframes)} keyframes are left out" if keyframes else ""

@@ -13,9 +13,7 @@ import numpy as np
 
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.recording.recorded_poses import ANGLES, POSITION_AXES
-
-AXES = np.eye(3)
-"""Axes of the world, as rows."""
+from sims.robot.parsing.compile_repairs import remove_keyframes
 
 
 def separate_floating_joints(
@@ -48,7 +46,6 @@ def separate_floating_joints(
     if not bases:
         return (), []
     model = spec.copy().compile()
-    keyframe_count = len(spec.keys)
     for base in bases:
         if base not in floating:
             raise InputError(
@@ -74,7 +71,7 @@ def separate_floating_joints(
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, compiled.quat)
         # Columns of the transpose are the world's axes in the frame of the body.
-        axes_in_body = rotation.reshape(3, 3).T @ AXES
+        axes_in_body = rotation.reshape(3, 3).T
         spec.delete(joint)
         for k, name in enumerate(POSITION_AXES if is_free else ()):
             _add_joint(
@@ -85,10 +82,7 @@ def separate_floating_joints(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_HINGE, axes_in_body[:, k]
             )
             hinge.pos = np.zeros(3) if is_free else anchor
-    for keyframe in list(spec.keys):
-        spec.delete(keyframe)
-    left_out = f"; {keyframe_count} keyframes are left out" if keyframe_count else ""
-    return tuple(bases), [f"the pose is recorded: {', '.join(bases)}{left_out}"]
+    return tuple(bases), [f"the pose is recorded: {', '.join(bases)}{remove_keyframes(spec)}"]
 
 
 def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
@@ -102,11 +96,8 @@ def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
     """
     joint = body.add_joint(name=name, type=kind, axis=axis)
     for field in ("damping", "armature", "frictionloss", "stiffness", "springref", "margin"):
-        setattr(
-            joint,
-            field,
-            np.zeros_like(getattr(joint, field)) if np.ndim(getattr(joint, field)) else 0.0,
-        )
+        # Some fields are numbers, and some are arrays of coefficients.
+        setattr(joint, field, 0.0 * np.asarray(getattr(joint, field)))
     joint.limited = 0
     joint.actfrclimited = 0
     joint.actgravcomp = 0
