@@ -285,7 +285,7 @@ _RUN_SECONDS = 0.8
 
 @lru_cache(maxsize=1)
 def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
-    """Make the simulator of the arm, with its contact enabled for effects at contacts.
+    """Make the simulator of the arm, with its contact enabled for effects at contacts and geoms.
 
     It is made anew for each effect, because it caches the places of effects by name.
     """
@@ -295,7 +295,7 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
     from sims.robot.robot_simulator import make_robot_simulator
 
     spec = mujoco.MjSpec.from_string(ARM_MJCF)
-    contacts = (_TESTED_CONTACT,) if effect.at == "contact" else ()
+    contacts = (_TESTED_CONTACT,) if effect.at in ("contact", "geom") else ()
     if contacts:
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     robot = RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks", contacts=contacts)

@@ -18,7 +18,7 @@ import numpy as np
 from sims.core.simulator import Array
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 
-PlaceKind = Literal["joint", "actuator", "body", "channel", "contact", "world", "level"]
+PlaceKind = Literal["joint", "actuator", "body", "channel", "contact", "geom", "world", "level"]
 """Kinds of places where an effect acts; `level` exists only in user-defined simulators."""
 ALL_PLACES = "*"
 """Place of an effect that acts at all places of its kind."""

@@ -21,7 +21,9 @@ The coefficients are differences or relative errors, so that zero is the number 
   the body, exp([r]) a; a turn by pi reverses it
 * (3) link length: the distance of a body's frame from the frame of its parent times (1 + c), in the
   same direction
-* (4) payload: a point mass m on the body, at (x, y, z) from the body's stated centre of mass, along
+* (4) radius: that of a round geom (sphere, capsule, cylinder; all half axes of an ellipsoid) times
+  (1 + c); a wheel that rolls without slip moves by its radius times its angle
+* (5) payload: a point mass m on the body, at (x, y, z) from the body's stated centre of mass, along
   the axes of the body's frame
 """
 
@@ -195,6 +197,21 @@ class LinkLengthScale(ModelValueEffect):
     coefficients = (
         Coefficient(
             "coefficient", ("1", "1", "1"), ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3)), least=-0.99
+        ),
+    )
+
+
+class GeomRadiusScale(ModelValueEffect):
+    """Radius of a round geom, such as a wheel or a foot, times 1 + c."""
+
+    name = "geom.radius"
+    noun = "a wrong radius"
+    says = "the radius of the wheel or foot differs from the model file"
+    source = "R. Siegwart, I. R. Nourbakhsh, D. Scaramuzza, Autonomous Mobile Robots (2011), ch. 3"
+    at = "geom"
+    coefficients = (
+        Coefficient(
+            "coefficient", ("1", "1", "1"), ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3)), least=-0.9
         ),
     )
 

@@ -76,6 +76,19 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
     raise make_unknown_name_error(f"geom of {robot.path.name}", unknown, list(geom_ids) or ["none"])
 
 
+def find_geom(robot: RobotModel, name: str) -> int:
+    """Return the number of a geom.
+
+    Raises:
+        InputError: there is no such geom; the message lists the existing ones.
+    """
+    model = robot.compiled
+    names = [get_geom_name(model, geom) for geom in range(model.ngeom)]
+    if name not in names:
+        raise make_unknown_name_error(f"geom of {robot.path.name}", name, names or ["none"])
+    return names.index(name)
+
+
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
     """Return the parameters that MuJoCo gives to a contact of two geoms.
 

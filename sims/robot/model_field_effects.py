@@ -14,7 +14,9 @@ body:
 * (7) Loaded: a point mass m at p on a body with mass m_0, centre of mass p_0 and inertia tensor I_0
   about it gives mass m_0 + m, centre p_1 = (m_0 p_0 + m p) / (m_0 + m) and tensor
   I_0 + m_0 J(p_0 - p_1) + m J(p - p_1), with J(d) = |d|^2 1 - d d' (parallel axis theorem).
-* (8) Softened: `solref` (t, z) of a contact becomes (t (1 + c), z), or (t, z (1 + c)) for its
+* (8) Rounded: the radius of a geom times 1 + c, with the volumes that bound it: radius r and half
+  axes h become r + d and h + d, with the change d of the largest size if it is positive.
+* (9) Softened: `solref` (t, z) of a contact becomes (t (1 + c), z), or (t, z (1 + c)) for its
   damping. In the direct form (-k, -b), k is proportional to 1 / (t z)^2 and b to 1 / t.
 
 `robot.model_field_effects` writes these fields, `export.model_file_totals` reads the numbers in
@@ -30,7 +32,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.contact_pairs import find_pair
+from sims.robot.contact_pairs import find_geom, find_pair
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
@@ -415,8 +417,31 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
     sliding[:] = add_to_file_value(sliding, c[0][:, None])
 
 
+def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the radius of a geom by (8), without changing mass and inertia of its body.
+
+    Args:
+        fields: fields of L batch elements, changed in place.
+        robot: the robot.
+        place: name of the geom.
+        c: (1, L) coefficient.
+    """
+    import mujoco
+
+    geom, model = find_geom(robot, place), robot.compiled
+    is_ellipsoid = int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+    size = fields["geom_size"][:, geom, : 3 if is_ellipsoid else 1]
+    growth = np.maximum(compute_factor(c[0]) - 1.0, 0.0) * size.max(axis=1)
+    size *= compute_factor(c[0])[:, None]
+    fields["geom_rbound"][:, geom] += growth
+    fields["geom_aabb"][:, geom, 3:] += growth[:, None]
+    first = int(model.body_bvhadr[model.geom_bodyid[geom]])
+    volumes = slice(first, first + int(model.body_bvhnum[model.geom_bodyid[geom]]))
+    fields["bvh_aabb"][:, volumes, 3:] += growth[:, None, None]
+
+
 def _scale_solref(index: int) -> FieldWriter:
-    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (8)."""
+    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (9)."""
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
@@ -486,6 +511,9 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
     "contact.softness": ModelFieldEffect(("pair_solref",), _scale_solref(0)),
     "contact.damping": ModelFieldEffect(("pair_solref",), _scale_solref(1)),
+    "geom.radius": ModelFieldEffect(
+        ("geom_size", "geom_rbound", "geom_aabb", "bvh_aabb"), _scale_radius
+    ),
     "actuator.limit": ModelFieldEffect(
         ("actuator_forcelimited", "actuator_forcerange"), _limit_force
     ),

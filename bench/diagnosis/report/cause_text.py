@@ -267,6 +267,7 @@ _MODEL_FILE_ERROR_FORMATTERS: Mapping[str, Callable[[str, Sequence[FittedValue]]
     "joint.zero": _format_joint_zero,
     "joint.axis": _format_tilted_axis,
     "link.length": _format_link_length,
+    "geom.radius": _make_percentage_formatter("radius"),
     "contact.friction": _make_difference_formatter("friction coefficient"),
     "contact.softness": _make_percentage_formatter("time constant"),
     "contact.damping": _make_percentage_formatter("damping ratio"),

@@ -28,6 +28,7 @@ _AT = {
     "body": ("of", "bodies"),
     "channel": ("in", "channels"),
     "contact": ("of", "contacts"),
+    "geom": ("of", "geoms"),
     "level": ("of", "levels"),
 }
 """Preposition before a place of each kind, and the plural of the kind."""

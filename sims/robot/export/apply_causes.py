@@ -326,13 +326,14 @@ class SpecElements:
     """The elements of a spec by their numbers in the compiled model."""
 
     def __init__(self, spec: Any, robot: RobotModel) -> None:
-        """Index the joints, bodies, actuators and pairs of a spec, after a compilation."""
+        """Index the joints, bodies, actuators, geoms and pairs of a spec, after a compilation."""
         self.spec = spec
         # Elements have numbers only after compilation.
         spec.compile()
         self.joints = {joint.id: joint for joint in spec.joints}
         self.bodies = {body.id: body for body in spec.bodies}
         self.actuators = {actuator.id: actuator for actuator in spec.actuators}
+        self.geoms = {geom.id: geom for geom in spec.geoms}
         self.pairs = {pair.id: pair for pair in spec.pairs}
         self.robot = robot
 
@@ -341,6 +342,7 @@ class SpecElements:
         if element.kind == "option":
             return self.spec.option
         of_kind = {"joint": self.joints, "actuator": self.actuators, "pair": self.pairs}
+        of_kind["geom"] = self.geoms
         return of_kind.get(element.kind, self.bodies)[element.id]
 
 

@@ -27,7 +27,7 @@ from sims.robot.integrator_settings import OPTION_EFFECTS
 from sims.robot.model_field_effects import get_write_order
 from sims.robot.robot_model import RobotModel
 
-Kind = Literal["joint", "body", "frame", "actuator", "pair", "option", "compiler"]
+Kind = Literal["joint", "body", "frame", "actuator", "pair", "geom", "option", "compiler"]
 """Kinds of model elements.
 
 Kind ``frame`` is a body without its inertial: the position of its frame, and its gravity
@@ -179,6 +179,7 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
         MjcfAttribute("friction", "friction", _make_reader("pair_friction")),
         MjcfAttribute("solref", "solref", _make_reader("pair_solref")),
     ),
+    "geom": (MjcfAttribute("size", "size", _make_reader("geom_size")),),
     "option": (
         *(
             MjcfAttribute(name, name, partial(_read_option, name))
@@ -198,6 +199,7 @@ _NAMES = (
     *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
     *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
     *("pair_friction", "pair_solref"),
+    *("geom_size", "geom_rbound", "geom_aabb", "bvh_aabb"),
 )
 
 FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
@@ -236,8 +238,8 @@ def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
 def list_elements(model: Any) -> list[ModelElement]:
     """List the elements of a model whose attributes can be written.
 
-    They are joints with one coordinate, bodies, actuators with one control, pairs of geoms, and the
-    options.
+    They are joints with one coordinate, bodies, actuators with one control, pairs of geoms, round
+    geoms, and the options.
     """
     import mujoco
 
@@ -254,6 +256,12 @@ def list_elements(model: Any) -> list[ModelElement]:
     ]
     elements += [ModelElement("actuator", i) for i in scalar_actuators]
     elements += [ModelElement("pair", i) for i in range(model.npair)]
+    # The sizes of other geoms come from meshes, or have no limits.
+    round_kinds = ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER")
+    types = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in round_kinds}
+    elements += [
+        ModelElement("geom", i) for i in range(model.ngeom) if int(model.geom_type[i]) in types
+    ]
     return [*elements, ModelElement("option", 0)]
 
 

@@ -400,6 +400,12 @@ class MjcfDocument:
             frozenset(str(model.geom(geom).name) for geom in geoms): i
             for i, geoms in enumerate(pairs)
         }
+        geom_ids = {str(model.geom(geom).name): geom for geom in range(model.ngeom)}
+        tags_by_element |= {
+            ModelElement("geom", geom_ids[name]): tag
+            for tag in self.walk()
+            if tag.name == "geom" and (name := tag.attributes.get("name")) in geom_ids
+        }
         return tags_by_element | {
             ModelElement("pair", pair_ids[geoms]): tag
             for geoms, tag in self.find_pairs().items()

@@ -22,6 +22,7 @@ from sims.robot.export.mjcf_attributes import (
 )
 from sims.robot.export.mjcf_document import (
     MjcfDocument,
+    NotEditableError,
     XmlElement,
     format_element,
     format_number,
@@ -84,7 +85,9 @@ class MjcfWriter:
             if statement.values:
                 self._keep_masses()
             self._write_inertial(self.tags[element], statement, comments)
-        elif element.kind == "pair":
+        elif element.kind in ("pair", "geom"):
+            if element not in self.tags:
+                raise NotEditableError("a changed geom has no name in its text")
             _add_comments(self.tags[element], comments)
             self.tags[element].new |= format_attributes(statement.values)
         else:

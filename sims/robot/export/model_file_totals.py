@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.effect import Effect
-from sims.robot.contact_pairs import add_contact_pairs, find_pair
+from sims.robot.contact_pairs import add_contact_pairs, find_geom, find_pair
 from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS, get_write_order, model_fields
 from sims.robot.robot_model import RobotModel
@@ -87,6 +87,7 @@ _READERS: Mapping[str, Read] = {
     "contact.damping": _make_solref_reader(1),
     "contact.friction": lambda f, r, place: [f["pair_friction"][0, find_pair(r, place), 0]],
     "contact.softness": _make_solref_reader(0),
+    "geom.radius": lambda f, r, place: [f["geom_size"][0, find_geom(r, place), 0]],
     "gravity.compensation": lambda f, r, place: [f["body_gravcomp"][0, r.body(place).id]],
     "gravity.scale": _get_gravity_strength,
     "joint.zero": lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
@@ -100,6 +101,7 @@ _UNITS: Mapping[str, tuple[str, str]] = {
     "inertia.scale": ("kg*m^2", ""),
     "contact.softness": ("s", ""),
     "link.length": ("m", ""),
+    "geom.radius": ("m", ""),
     "gravity.scale": ("m/s^2", ""),
     "gravity.tilt": ("m/s^2", ""),
 }

@@ -44,6 +44,7 @@ EFFECTS_WITHOUT_FAMILY = frozenset(
         "contact.softness",
         "force.periodic",
         "force.ripple",
+        "geom.radius",
         "input.power",
         "joint.axis",
         "joint.backlash",
@@ -71,10 +72,10 @@ BASE_EFFECTS = frozenset({"drag.linear", "drag.quadratic", "force.bias"})
 """Effects at the coordinates of a floating body: it has no bearing and no drive."""
 POSITION_SENSOR_EFFECTS = frozenset({"sensor.slip"})
 """Effects of position encoders, which act on no other channel."""
-REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0, "contact": 1.0}
+REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0, "contact": 1.0, "geom": 1.0}
 """Reference force for the plausible ranges of the effect library.
 
-N m on a hinge, N on a slide; no coefficient of a contact is a force.
+N m on a hinge, N on a slide; no coefficient of a contact or geom is a force.
 """
 HIDDEN_STATE_SHAPE_COUNT = 6
 """Number of values tried for a shape parameter of a hidden-state effect.
@@ -85,7 +86,12 @@ MAX_PAYLOAD_SHARE = 0.5
 """Largest plausible payload, as a share of the mass of all moving bodies."""
 MIN_LOAD_FREQUENCY = 15.0
 """Minimum natural frequency of the load on a flexible joint, in rad/s."""
-_KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear", "contact": "point"}
+_KINDS: Mapping[str, SystemKind] = {
+    "hinge": "rotary",
+    "slide": "linear",
+    "contact": "point",
+    "geom": "point",
+}
 
 
 def make_world_effect(effect: type[Effect]) -> type[Effect]:

@@ -1,6 +1,6 @@
 """List of the places of a robot at which effects can act, coupled joints included.
 
-Places are joints, actuators, bodies, channels and contacts of two geoms.
+Places are joints, actuators, bodies, channels, contacts of two geoms, and round geoms in contact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.robot.contact_pairs import find_pair_geoms, get_geom_name, read_contact_parameters
+from sims.robot.contact_pairs import (
+    find_geom,
+    find_pair_geoms,
+    get_geom_name,
+    read_contact_parameters,
+)
 from sims.robot.coupled_drives import list_coupling_places
 from sims.robot.places.centre_of_mass_limits import (
     compute_centre_of_mass_limits,
@@ -34,6 +39,7 @@ MUJOCO_EFFECT_WORDS = {
     "mass": "mass.scale",
     "pos": "link.length",
     "ref": "joint.zero",
+    "size": "geom.radius",
     "stiffness": "spring.linear",
 }
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
@@ -49,8 +55,8 @@ class EffectPlace(NamedTuple):
     """A place at which an effect may act.
 
     Attributes:
-        name: name of the joint, actuator, body, channel or pair of geoms.
-        kind: kind of the coordinate whose units apply: hinge or slide; or contact.
+        name: name of the joint, actuator, body, channel, geom or pair of geoms.
+        kind: kind of the coordinate whose units apply: hinge or slide; or contact or geom.
         coordinate: index of the coordinate; None if there is none.
         signal: name of the input or channel; empty for a joint or body.
         unit: unit of the signal.
@@ -94,7 +100,7 @@ class EffectPlace(NamedTuple):
 def list_places(
     robot: RobotModel, channels: Sequence[tuple[str, str]]
 ) -> dict[str, list[EffectPlace]]:
-    """List the places of a robot by kind: joint, actuator, body, channel, contact.
+    """List the places of a robot by kind: joint, actuator, body, channel, contact, geom.
 
     A place is where an effect can act. Each has the units and the typical sizes that scale the
     plausible ranges of effects, and what the model file states there.
@@ -109,6 +115,12 @@ def list_places(
     kinds = ("joint", "actuator", "body", "channel")
     places: dict[str, list[EffectPlace]] = {kind: [] for kind in kinds}
     places["contact"] = [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts]
+    touching = {geom for pair in robot.contacts for geom in find_pair_geoms(robot, pair)}
+    places["geom"] = [
+        make_geom_place(robot, get_geom_name(robot.compiled, geom))
+        for geom in sorted(touching)
+        if has_radius(robot, geom)
+    ]
     joint_numbers: dict[str, int] = {}
     mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = list_coupling_places(robot)
@@ -231,6 +243,36 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
         limits={"contact.softness": {"coefficient": (min_softness_change, np.inf)}},
         pairs=pairs,
     )
+
+
+def has_radius(robot: RobotModel, geom: int) -> bool:
+    """Return whether a geom of a moving body is a sphere, capsule, ellipsoid or cylinder."""
+    import mujoco
+
+    kinds = mujoco.mjtGeom
+    model = robot.compiled
+    is_round = int(model.geom_type[geom]) in (
+        int(kinds.mjGEOM_SPHERE),
+        int(kinds.mjGEOM_CAPSULE),
+        int(kinds.mjGEOM_ELLIPSOID),
+        int(kinds.mjGEOM_CYLINDER),
+    )
+    return is_round and int(model.body_weldid[model.geom_bodyid[geom]]) != 0
+
+
+def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
+    """Make the place of a geom with a radius.
+
+    Args:
+        robot: robot with the geom.
+        name: name of the geom.
+
+    Raises:
+        InputError: there is no such geom.
+    """
+    radius = float(robot.compiled.geom_size[find_geom(robot, name), 0])
+    stated = {"geom.radius": radius}
+    return EffectPlace(name, "geom", None, "", "1", 1.0, 1.0, stated, f"geom {name}")
 
 
 def _make_actuator_place(

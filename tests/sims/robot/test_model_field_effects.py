@@ -145,9 +145,9 @@ def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path: Path) -
 def test_every_native_effect_is_compared() -> None:
     """The table above contains every model-field effect, except for those at contacts.
 
-    These are compared in `test_contact_effects`.
+    These are compared in `test_contact_effects` and `test_wheel_radius`.
     """
-    at_contacts = {"contact.damping", "contact.friction", "contact.softness"}
+    at_contacts = {"contact.damping", "contact.friction", "contact.softness", "geom.radius"}
     written = set(model_field_effects.MODEL_FIELD_EFFECTS)
     assert {effect for effect, _, _ in STATED} == written - at_contacts
 
