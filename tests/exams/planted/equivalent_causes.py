@@ -14,7 +14,14 @@ import mujoco
 import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms, fit_coefficients
-from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, Change, Run
+from tests.exams.planted.planted_motion import (
+    HELD_OUT,
+    RATE,
+    RUNS,
+    Change,
+    Run,
+    add_point_mass,
+)
 
 STEPS = 12  # Maximum number of steps of a fit.
 
@@ -55,10 +62,11 @@ class _Comparison:
     def _places(self, effect, place):
         model = self.experiment.model
         every = {
-            "joint": self.experiment.joints,
+            "joint": self.experiment.places,
             "body": [model.body(b).name for b in self.experiment.bodies],
             "actuator": [model.actuator(i).name for i in range(model.nu)],
-            "channel": [f"q.{joint}" for joint in self.experiment.joints],
+            "channel": self.experiment.channel_names,
+            "contact": [place] if place != "*" else [],
             "world": [""],
         }[_place_kind(effect)]
         return every if place == "*" else [p for p in every if p == place]
@@ -124,6 +132,8 @@ class _Form:
         if "inertia" in self.units:
             dof = experiment.model.joint(place).dofadr[0]
             sizes["inertia"] = max(0.3 * float(experiment.nominal_inertia[dof]), 1e-9)
+        if "mass" in self.units:
+            sizes["mass"] = 0.3 * float(experiment.model.body(place).mass[0])
         return np.array([sizes[unit] for unit in self.units])
 
     def simulate(self, experiment, coefficients, run):
@@ -145,7 +155,7 @@ class _Form:
         channels = experiment.channels(states).copy()
         if self.reading is not None:
             for place, c in coefficients.items():
-                column = experiment.joints.index(place.partition(".")[2])
+                column = experiment.channel_names.index(place)
                 channels[:, column] = self.reading(c, channels[:, column])
         return channels
 
@@ -200,6 +210,15 @@ def _mass_offset(model, place, c):
     model.body_ipos[model.body(place).id] += c
 
 
+def _payload(model, place, c):
+    body = model.body(place).id
+    add_point_mass(model, body, c[0], model.body_ipos[body] + c[1:])
+
+
+def _link_length(model, place, c):
+    model.body_pos[model.body(place).id] *= 1 + c[0]
+
+
 def _gravity_scale(model, _, c):
     model.opt.gravity[:] *= 1 + c[0]
 
@@ -234,6 +253,11 @@ def _ratio(model, place):
     return -0.95
 
 
+def _point_mass(model, place):
+    """Return the lower bounds of a payload's mass and position."""
+    return np.array([1e-6, -np.inf, -np.inf, -np.inf])
+
+
 def _positive(model, place):
     return 0.0
 
@@ -257,6 +281,12 @@ FORMS = {
     "inertia.armature": [_planted("armature", "inertia", _stated("dof_armature"))],
     "mass.scale": [_planted("mass", "ratio", _ratio)],
     "mass.offset": [_Form(("angle",) * 3, edit=_mass_offset, begin=(0, 0, 0))],
+    "payload": [
+        _Form(("mass", *("angle",) * 3), edit=_payload, at_least=_point_mass, begin=(1, 0, 0, 0))
+    ],
+    "joint.zero": [_planted("zero", "angle", lambda model, place: -np.inf)],
+    "link.length": [_Form(("ratio",), edit=_link_length)],
+    "contact.friction": [_planted("friction", "ratio", _ratio)],
     "inertia.scale": [_Form(("ratio",), edit=_inertia_scale, at_least=_ratio)],
     "actuator.stiffness": [_planted("kp", "ratio", _ratio)],
     "actuator.damping": [_Form(("ratio",), edit=_servo_damping, at_least=_ratio)],
@@ -281,5 +311,6 @@ FORMS = {
 def _place_kind(effect):
     """Return the kind of place at which an effect acts."""
     kinds = {"actuator": "actuator", "input": "actuator", "sensor": "channel", "gravity": "world"}
+    kinds |= {"contact": "contact", "payload": "body", "link": "body"}
     is_body = effect.startswith("mass.") or effect == "inertia.scale"
     return "body" if is_body else kinds.get(effect.partition(".")[0], "joint")

@@ -49,6 +49,7 @@ from tests.exams.robot_files import signal_unit, write_robot_recording
 
 # Masses of the links are small compared with the armature of the joints.
 INVISIBLE = {("reacher", "mass")}
+NUMBERS = ("damping", "frictionloss", "mass", "kp", "armature")  # Kinds of the changed number.
 DRAWS = 3  # Cases for each robot and kind.
 GAP = (3.0, 30.0)  # Smallest and largest discrepancy, in multiples of the noise.
 POSITION_NOISE = (1e-4, 2e-4, 3e-4)  # Standard deviations of positions to draw from, rad or m.
@@ -70,6 +71,9 @@ MAX_DECREASE = 0.7  # Relative decrease of mass, kp, damping, friction or armatu
 MAX_KP = 1.0  # Relative increase.
 MAX_ARMATURE = 3.0  # Multiples of M.
 MAX_DAMPING = 100.0  # Multiples of M per second, and multiples of kv for servos.
+MAX_PAYLOAD = 1.0  # Multiple of the mass of the body.
+# Gear (relative), centre of mass (m), zero of a joint (rad or m), friction coefficient.
+MAX_DIFFERENCES = {"gear": 0.3, "com": 0.05, "zero": 0.09, "friction": 0.5}
 MAX_FRICTION = 0.8  # Multiple of the largest torque at the joint.
 
 
@@ -78,9 +82,12 @@ class PlantedQuestion(Question):
     """Specification of a case: robot, kind of the changed number, and number of the draw."""
 
     system: str
-    number: str
+    number: str  # A key of `EFFECTS`, or "clean".
     index: int
-    kind = "single"
+
+    @property
+    def kind(self):
+        return "clean" if self.number == "clean" else "single"
 
     @property
     def name(self):
@@ -88,7 +95,7 @@ class PlantedQuestion(Question):
 
     @property
     def effect(self):
-        return EFFECTS[self.number]
+        return EFFECTS.get(self.number, "")
 
     def draw(self, seed=0):
         """Draw the case; another seed gives another exam."""
@@ -104,7 +111,7 @@ def questions(seed=0):
     return [
         PlantedQuestion(robot.name, number, draw)
         for robot in ROBOTS.values()
-        for number in EFFECTS
+        for number in NUMBERS
         for draw in range(DRAWS)
         if (robot.drive == "servo" or number != "kp") and (robot.name, number) not in INVISIBLE
     ]
@@ -118,7 +125,7 @@ class PlantedCase(Case):
         robot: name of the robot.
         kind: kind of the changed number.
         draw: number of the draw.
-        place: joint, body or actuator.
+        place: joint, body, actuator or contact; empty if nothing is wrong.
         size: see `Change`.
         gap: RMS discrepancy over all samples and channels with fitted initial states, in multiples
             of the noise.
@@ -145,7 +152,13 @@ class PlantedCase(Case):
 
     @property
     def change(self):
-        return Change(self.kind, self.place, self.size)
+        """The wrong number; None for a clean recording."""
+        return Change(self.kind, self.place, self.size) if self.place else None
+
+    @property
+    def hidden_effects(self):
+        """Coefficients by effect@place."""
+        return {self.change.effect: (self.size,)} if self.place else {}
 
     @cached_property
     def experiment(self):
@@ -176,12 +189,9 @@ class PlantedCase(Case):
             joint, name = model.joint(model.actuator_trnid[index, 0]), model.actuator(index).name
             inputs[f"u.{name}"] = signal_unit("u", position_unit(joint), robot.drive == "motor")
             actuators[name] = robot.drive_of(joint.name, self.force_limits).description
-        channels = [f"q.{joint}" for joint in experiment.joints]
-        if self.with_velocities:
-            channels += [f"qd.{joint}" for joint in experiment.joints]
         channels = {
             name: (signal_unit(name, position_unit(model.joint(name.partition(".")[2]))), sigma)
-            for name, sigma in zip(channels, experiment.sigma.tolist(), strict=True)
+            for name, sigma in zip(experiment.channel_names, experiment.sigma.tolist(), strict=True)
         }
         times, (runs, _) = np.arange(SAMPLES) / RATE, self.performance
         tables = {
@@ -201,12 +211,12 @@ class PlantedCase(Case):
             number=self.kind, limited=bool(self.force_limits), sigma=self.noise,
             velocities=self.with_velocities,
         )  # fmt: skip
-        hidden = hidden_text({self.change.effect: (self.size,)})
-        size = number(self.gap)
+        hidden, size = hidden_text(self.hidden_effects), number(self.gap) if self.place else ""
         return {"hidden": hidden, "size": size, "noise": "white", "conditions": conditions}
 
     def mark(self, outcome):
-        hidden_cause = HiddenCause("single", {self.change.effect: (self.size,)})
+        kind = "single" if self.place else "clean"
+        hidden_cause = HiddenCause(kind, self.hidden_effects)
         return mark_answer(hidden_cause, outcome.verdict, STANDARD, self._held_out_ratios)
 
     def _held_out_ratios(self, sets):
@@ -247,9 +257,12 @@ class Experiment:
         self.bodies = [b for b in range(self.model.nbody) if self._is_carried(b)]
         joints = [j for j in range(self.model.njnt) if self.model.jnt_bodyid[j] in self.bodies]
         self.joints = [self.model.joint(j).name for j in joints]
+        self.places = self.joints
         self.columns = list(self.model.jnt_qposadr[joints])
+        self.channel_names = [f"q.{joint}" for joint in self.joints]
         self.sigma = np.full(len(joints), noise)
         if with_velocities:
+            self.channel_names += [f"qd.{joint}" for joint in self.joints]
             self.columns += [self.model.nq + d for d in self.model.jnt_dofadr[joints]]
             self.sigma = np.append(self.sigma, np.full(len(joints), VELOCITY_NOISE))
         self.with_velocities = with_velocities
@@ -354,12 +367,12 @@ class Experiment:
 
     @cached_property
     def nominal_peaks(self):
-        """Largest joint torque of the unchanged model by run, (runs, nu)."""
+        """Largest torque at each of `Operator.dofs` of the unchanged model by run, (runs, D)."""
         runs, _ = self.performed(None)
         simulator, rows = self.simulator(), []
         for run in runs.values():
             simulator.start(run.positions, run.velocities)
-            row = np.zeros(self.model.nu)
+            row = np.zeros(len(self.operator.dofs))
             for command in run.commands[:-1]:
                 simulator.advance(command)
                 row = np.maximum(row, np.abs(simulator.data.qfrc_actuator[self.operator.dofs]))
@@ -397,11 +410,18 @@ def draw_planted_case(question, name):
             experiment = limited
         else:  # The limited servos chatter or the robot falls.
             limits = {}
+    if question.kind == "clean":
+        return PlantedCase(
+            question.system, question.number, question.index, "", 0.0, 0.0, 0.0, noise,
+            with_velocities, limits, swing, seed,
+        )  # fmt: skip
     for place in rng.permutation(_places(experiment, question.number)):
         signs = rng.permutation([1.0, -1.0])
         for sign in signs:
-            largest = _largest(experiment, question.number, str(place), sign, peaks.max(0))
-            sized = _sized(experiment, question.number, str(place), sign * largest, wanted)
+            largest = find_largest_change(
+                experiment, question.number, str(place), sign, peaks.max(0)
+            )
+            sized = find_size(experiment, question.number, str(place), sign * largest, wanted)
             if sized is not None:
                 size, gap, plain = sized
                 if not _is_simple(experiment, Change(question.number, str(place), size)):
@@ -457,13 +477,25 @@ def _places(experiment, kind):
     return experiment.joints
 
 
-def _largest(experiment, kind, place, sign, torques):
-    """Return the size of the largest plausible change of this sign; 0 if there is none."""
+def find_largest_change(experiment, kind, place, sign, torques):
+    """Return the size of the largest plausible change of this sign; 0 if there is none.
+
+    Args:
+        experiment: `Experiment`.
+        kind: kind of the number.
+        place: joint, body, actuator or contact.
+        sign: 1 or -1.
+        torques: largest force at each degree of freedom of `Operator.dofs`, N m or N.
+    """
     model, operator = experiment.model, experiment.operator
     if kind == "mass":
         return MAX_MASS if sign > 0 else MAX_DECREASE
     if kind == "kp":
         return MAX_KP if sign > 0 else MAX_DECREASE
+    if kind == "payload":  # A payload has no negative mass.
+        return MAX_PAYLOAD * model.body(place).mass[0] if sign > 0 else 0.0
+    if kind in MAX_DIFFERENCES:
+        return MAX_DIFFERENCES[kind]
     dof = model.joint(place).dofadr[0]
     stated = {
         "damping": model.dof_damping,
@@ -483,8 +515,17 @@ def _largest(experiment, kind, place, sign, torques):
     return MAX_FRICTION * torque
 
 
-def _sized(experiment, kind, place, largest, wanted):
-    """Return (size, gap, plain gap) near the wanted gap; None if the place cannot show one."""
+def find_size(experiment, kind, place, largest, wanted, min_gap=GAP[0]):
+    """Return (size, gap, plain gap) near the wanted gap; None if the place cannot show one.
+
+    Args:
+        experiment: `Experiment`.
+        kind: kind of the number.
+        place: joint, body, actuator or contact.
+        largest: largest size, with its sign.
+        wanted: discrepancy in multiples of the noise.
+        min_gap: smallest discrepancy.
+    """
 
     def gaps(share):
         size = float(f"{share * largest:.3g}")
@@ -494,7 +535,7 @@ def _sized(experiment, kind, place, largest, wanted):
             return size, np.inf, np.inf
 
     # If the largest change shows less than wanted, the smallest visible size is tried.
-    for target in (wanted, 1.2 * GAP[0]) if largest else ():
+    for target in (wanted, 1.2 * min_gap) if largest else ():
         found = find_strength_for_size(
             lambda share: gaps(share)[1], target, 1.0, 0.1, np.inf, GAP_TOLERANCE
         )

@@ -23,9 +23,10 @@ class Change:
     """One number of a model that differs from its file.
 
     Attributes:
-        kind: "damping", "frictionloss", "mass", "kp" or "armature".
-        place: joint, body or actuator.
-        size: added to damping, frictionloss and armature; for mass and kp a relative change.
+        kind: a key of `EFFECTS`.
+        place: joint, body, actuator or contact (GEOM/GEOM).
+        size: for mass, kp and gear a relative change; the mass of a payload, kg; otherwise the
+            difference of the number.
     """
 
     kind: str
@@ -46,11 +47,45 @@ class Change:
             body = model.body(self.place).id
             model.body_mass[body] *= 1 + self.size
             model.body_inertia[body] *= 1 + self.size
+        elif self.kind == "payload":
+            body = model.body(self.place).id  # As far behind the centre as that from the frame.
+            add_point_mass(model, body, self.size, 2 * model.body_ipos[body])
+        elif self.kind == "com":
+            model.body_ipos[model.body(self.place).id, 0] += self.size
+        elif self.kind == "zero":
+            model.qpos0[model.joint(self.place).qposadr[0]] += self.size
+        elif self.kind == "friction":
+            model.geom(self.place.partition("/")[2]).friction[0] += self.size
         else:
             actuator = model.actuator(self.place).id
             model.actuator_gainprm[actuator, 0] *= 1 + self.size
-            model.actuator_biasprm[actuator, 1] *= 1 + self.size
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+            if self.kind == "kp":
+                model.actuator_biasprm[actuator, 1] *= 1 + self.size
+        if self.kind != "zero":  # Otherwise the bodies' places would follow qpos0.
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def add_point_mass(model, body, mass, place):
+    """Add a point mass to a body of a compiled model.
+
+    Args:
+        model: compiled model.
+        body: number of the body.
+        mass: mass, kg.
+        place: position (3,) in the frame of the body, m.
+    """
+    offset, total = place - model.body_ipos[body], model.body_mass[body] + mass
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+    turn = turn.reshape(3, 3)
+    tensor = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    reduced = model.body_mass[body] * mass / total
+    tensor += reduced * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    values, axes = np.linalg.eigh(tensor)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    model.body_mass[body], model.body_inertia[body] = total, values
+    model.body_ipos[body] += offset * mass / total
+    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
 
 
 EFFECTS = {
@@ -59,6 +94,11 @@ EFFECTS = {
     "mass": "mass.scale",
     "kp": "actuator.stiffness",
     "armature": "inertia.armature",
+    "gear": "input.gain",
+    "com": "mass.offset",
+    "zero": "joint.zero",
+    "payload": "payload",
+    "friction": "contact.friction",
 }
 DOF_FIELDS = {
     "damping": "dof_damping",
@@ -141,6 +181,11 @@ class Simulator:
         self.data.qpos[:], self.data.qvel[:] = positions, velocities
         self.touches = False
 
+    def settle_filters(self, command):
+        """Give each filtered actuator the activation of a command (nu,) that was held for long."""
+        filtered = self.model.actuator_actadr >= 0
+        self.data.act[self.model.actuator_actadr[filtered]] = np.asarray(command)[filtered]
+
     def advance(self, command):
         """Advance by one sample with the controls held."""
         self.data.ctrl[:] = command
@@ -158,6 +203,7 @@ class Simulator:
     def simulate(self, run):
         """Return positions and velocities (SAMPLES, nq + nv) of a run."""
         self.start(run.positions, run.velocities)
+        self.settle_filters(run.commands[0])
         states = []
         for command in run.commands:
             states.append(np.concatenate([self.data.qpos, self.data.qvel]))
@@ -215,6 +261,7 @@ class Operator:
             simulator.advance(self.command(simulator.data, references[0]))
         positions, velocities = simulator.data.qpos.copy(), simulator.data.qvel.copy()
         simulator.start(positions, velocities)
+        simulator.settle_filters(self.command(simulator.data, references[0]))
         commands = []
         for wanted in references:
             commands.append(self.command(simulator.data, wanted))
