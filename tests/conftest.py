@@ -38,7 +38,7 @@ def pytest_configure(config):
     if not hasattr(config, "workerinput"):
         from sims.engines.compiled import kernel
 
-        kernel.get_kernel()
+        kernel.COMPILED.load()
 
 
 def pytest_collection_finish():

@@ -53,6 +53,6 @@ def _warm_up_search(system: str) -> None:
         compute_directions(evaluator, fit_base_model(evaluator, noise).fit, evaluator.library)
 
 
-kernel.get_kernel()
+kernel.COMPILED.load()
 for _system in SYSTEMS:
     _warm_up_search(_system)

@@ -5,17 +5,13 @@ A step in Python takes some microseconds, and a recording has up to a hundred th
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.engines.compiled.array_functions import ArrayFunctions
 from sims.engines.compiled.interpreter import nan_maximum, nan_minimum
-from sims.engines.compiled.intrinsics import carray, to_real_pointer
-from sims.engines.compiled.kernel import get_address, load_compiled_module
 
 LINEAR, CLAMP, RATE_LIMIT = range(3)
 """Recursions: y' = a y + b; y' = min(max(y, a), b); y' = y + min(max(a - y, -b), b)."""
@@ -37,40 +33,8 @@ def run_recursion(kind: int, a: Array, b: Array, start: Array) -> Array:
         np.ascontiguousarray(values, dtype=np.float64) for values in np.broadcast_arrays(a, b)
     )
     begin = np.ascontiguousarray(start, dtype=np.float64).reshape(len(first), 1)
-    result = np.empty(first.shape)
-    compiled = _load_compiled_recursion()
-    if compiled is None:
-        step_elements(kind, first, second, begin, result)
-    else:
-        addresses = [get_address(values) for values in (first, second, begin, result)]
-        numbers = np.array([kind, *result.shape, *addresses], dtype=np.int64)
-        compiled(get_address(numbers))
+    (result,) = COMPILED.call(step_elements, kind, first, second, begin)
     return result
-
-
-@cache
-def _load_compiled_recursion() -> Callable[[int], None] | None:
-    """Return the compiled `recursion_entry`; None if numba does not support this Python version."""
-    if importlib.util.find_spec("llvmlite") is None:
-        return None
-    return load_compiled_module(__name__, "recursion_entry", "the effects with memory")
-
-
-def recursion_entry(arguments_at: Any) -> None:
-    """Run a recursion (compiled code only).
-
-    The argument is the address of seven integers: the recursion, L, S, and the addresses of the
-    other arguments of `step_elements`.
-    """
-    numbers = carray(arguments_at, (7,))
-    size, steps = numbers[1], numbers[2]
-    step_elements(
-        numbers[0],
-        carray(to_real_pointer(numbers[3]), (size, steps)),
-        carray(to_real_pointer(numbers[4]), (size, steps)),
-        carray(to_real_pointer(numbers[5]), (size, 1)),
-        carray(to_real_pointer(numbers[6]), (size, steps)),
-    )
 
 
 def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
@@ -85,3 +49,11 @@ def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
             else:
                 y = y + nan_maximum(nan_minimum(a[i, k] - y, b[i, k]), -b[i, k])
             result[i, k] = y
+
+
+COMPILED = ArrayFunctions(
+    __name__,
+    "the effects with memory",
+    {step_elements: ("#", "ls", "ls", "l1", "ls")},
+    can_run_uncompiled=True,
+)

@@ -36,7 +36,7 @@ def describe_stepping() -> str:
         return "none"
     from sims.engines.compiled import kernel
 
-    kernel.get_kernel()
+    kernel.COMPILED.load()
     return "machine code"
 
 

@@ -12,7 +12,7 @@ from sims.core.simulator import InputError, Scenario
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
 from sims.engines.compiled import force_program
-from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.kernel import make_instruction_runner
 from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
     PER_ELEMENT,
@@ -264,7 +264,7 @@ def run_operation(name, values):
     r = np.zeros((2, len(values)))
     r[0] = values
     code = np.array([[OPERATION_CODES[name], 1, 0, 0, 0]], dtype=np.int64)
-    get_kernel().make_instruction_runner(code, 0, 1, r)()
+    make_instruction_runner(code, 0, 1, r)()
     return r[1]
 
 

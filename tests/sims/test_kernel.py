@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.diagnosis.kalman.compiled_recursions import recursion_entry
+from bench.diagnosis.kalman import compiled_recursions
 from sims.core.simulator import InputError
 from sims.engines.compiled import (
+    array_functions,
     data_layout,
     interpreter,
     kernel,
     kernel_build,
-    kernel_entry,
     machine_code,
     mujoco_callback,
     traced_array,
@@ -30,22 +30,28 @@ def fail_if_called():
 
 
 @pytest.mark.parametrize(
-    "entry", [kernel_entry.kernel_entry, mujoco_callback.add_effect_forces, recursion_entry]
+    ("module", "entry"),
+    [
+        (kernel, kernel.COMPILED.make_entry()),
+        (mujoco_callback, mujoco_callback.add_effect_forces),
+        (compiled_recursions, compiled_recursions.COMPILED.make_entry()),
+    ],
 )
-def test_the_cache_name_depends_on_every_compiled_source_file(entry):
-    sources = {str(path) for path in kernel.list_source_files(entry.__module__)}
+def test_the_cache_name_depends_on_every_compiled_source_file(module, entry):
+    sources = {str(path) for path in array_functions.list_source_files(module.__name__)}
+    assert module.__file__ in sources
     assert all(Path(path).is_file() for path in sources)
     called = kernel_build.list_called_functions(entry)
     assert called
-    for function in (entry, *called):
+    for function in called:
         for thing in (function, *function.__globals__.values()):
-            module = inspect.getmodule(thing)
+            module_of_thing = inspect.getmodule(thing)
             if (
-                function.__module__ != recursion_entry.__module__
-                and module is not None
-                and module.__name__.startswith("sims.engines")
+                module is not compiled_recursions
+                and module_of_thing is not None
+                and module_of_thing.__name__.startswith("sims.engines")
             ):
-                assert module.__file__ in sources, (function, module)
+                assert module_of_thing.__file__ in sources, (function, module_of_thing)
         assert inspect.getsourcefile(function) in sources
 
 
@@ -100,7 +106,8 @@ def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp
     assert second.communicate(timeout=20)[0].split()[-1] == str(first.pid)
 
 
-load_kernel = kernel._load_kernel.__wrapped__
+def load_kernel():
+    return array_functions.load_stored(kernel.__name__, "COMPILED", "the batch engine", 1, {})
 
 
 def test_compiled_code_is_loaded_without_numba(monkeypatch, tmp_path):
@@ -117,7 +124,7 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
-    path = machine_code.get_cache_folder() / kernel.make_cache_name(kernel_entry.__name__, {})
+    path = machine_code.get_cache_folder() / array_functions.make_cache_name(kernel.__name__, {})
     code = machine_code.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
@@ -127,7 +134,7 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
-    path = machine_code.get_cache_folder() / kernel.make_cache_name(kernel_entry.__name__, {})
+    path = machine_code.get_cache_folder() / array_functions.make_cache_name(kernel.__name__, {})
     code = machine_code.MachineCode.unpack(machine_code.read_cached(path))
     assert machine_code.MachineCode.unpack(code.pack()) == code
     with pytest.raises(machine_code.CodeNotLoadableError, match="frobnicate"):
@@ -136,7 +143,7 @@ def test_code_with_a_missing_symbol_is_not_loaded():
 
 def test_loading_the_kernel_does_not_import_numba():
     code = (
-        "import sys; from sims.engines.compiled import kernel; assert kernel.get_kernel();"
+        "import sys; from sims.engines.compiled import kernel; assert kernel.COMPILED.load();"
         "sys.exit('numba' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
@@ -181,37 +188,43 @@ def make_small_arrays():
 )
 def test_arrays_of_wrong_shape_are_refused(name, value):
     program, work, block, w = make_small_arrays()
-    data_layout.check_array_layout(program, work, block, w)
-    with pytest.raises(ValueError, match=r"expected \(|does not match the arrays"):
-        data_layout.check_array_layout(program, work._replace(**{name: value}), block, w)
+    check_arrays(program, work, block, w)
+    with pytest.raises(ValueError, match=r"expected a contiguous|does not match the arrays"):
+        check_arrays(program, work._replace(**{name: value}), block, w)
     with pytest.raises(ValueError, match="does not match the arrays"):
-        data_layout.check_array_layout(program, work, block, 0)
+        check_arrays(program, work, block, 0)
     far = program._replace(code=np.array([[interpreter.ADD, 7, 0, 0, 0]]))
     with pytest.raises(ValueError, match="does not match the arrays"):
-        data_layout.check_array_layout(far, work, block, w)
+        check_arrays(far, work, block, w)
+
+
+def check_arrays(program, arrays, buffers, w):
+    block = data_layout.Block(*program, *arrays[:-1], *buffers, arrays.steps_per_record, w)
+    data_layout.check_block(block)
 
 
 def test_instructions_are_checked_and_run_on_any_number_of_slots():
-    run_by = kernel.get_kernel()
     ops = {name: code for code, name in enumerate(traced_array.OPERATIONS)}
     code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
     for size in (1, 5, 64, 130):
         r = np.zeros((4, size))
-        run = run_by.make_instruction_runner(code, 0, 2, r)
+        run = kernel.make_instruction_runner(code, 0, 2, r)
         for seed in range(2):
             r[:2] = np.random.default_rng(seed).normal(size=(2, size))
             run()
             np.testing.assert_allclose(r[3], np.tanh(r[0] + r[1]), rtol=1e-14)
     held = np.zeros((4, 8))
-    run_by.make_instruction_runner(code, 1, 1, held)()
+    kernel.make_instruction_runner(code, 1, 1, held)()
     assert not held.any(), "an empty program wrote to registers"
     wrong = code.copy()
     wrong[1, 1] = 4
     for bad in (
-        lambda: run_by.make_instruction_runner(wrong, 0, 2, held),
-        lambda: run_by.make_instruction_runner(code, 0, 3, held),
-        lambda: run_by.make_instruction_runner(code, 0, 2, held[:, ::2]),
-        lambda: run_by.make_instruction_runner(code.astype(np.int32), 0, 2, held),
+        lambda: kernel.make_instruction_runner(wrong, 0, 2, held),
+        lambda: kernel.make_instruction_runner(code, 0, 3, held),
+        lambda: kernel.make_instruction_runner(code, 0, 2, held[:, ::2]),
+        lambda: kernel.make_instruction_runner(code.astype(np.int32), 0, 2, held),
     ):
-        with pytest.raises(ValueError, match="not for these registers"):
+        with pytest.raises(
+            ValueError, match=r"not for these registers|expected a contiguous array"
+        ):
             bad()

@@ -1,182 +1,16 @@
 """Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `filter_and_smoother`.
 
 Matrices of a few joints are too small for one library call each: a step in Python takes fifty
-microseconds whatever their size. numba translates the functions once; the machine code is stored in
-the user's cache and loaded with llvmlite alone (`sims.engines.compiled.kernel`), because loading
-numba would take longer than filtering a short log. The functions allocate no memory.
+microseconds whatever their size. The functions are compiled once (`array_functions`) and allocate
+no memory.
 """
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Callable
-from functools import cache
-from typing import Any
-
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.compiled.intrinsics import carray, to_real_pointer
-from sims.engines.compiled.kernel import get_address, load_compiled_module
-
-FILTER, SMOOTHER = range(2)
-"""Recursions, by the first argument of `recursion_entry`."""
-SIZE_COUNT = 6
-"""Number of integers before the addresses in the argument of `recursion_entry`."""
-MAX_ARRAYS = 26
-"""Maximum number of addresses in the argument of `recursion_entry`."""
-FILTER_SHAPES = (
-    *("bizz", "biz", "bize", "btcz", "btc", "biz", "btc", "z", "be", "1"),
-    *("btz", "btzz", "btc", "btzc", "btcc", "b"),
-    *("z", "z", "zz", "zz", "zz", "cc", "cc", "zc", "zc", "c"),
-)
-"""Shapes of the arguments of `run_filter`.
-
-A letter is a size: b runs, t samples, i = t - 1 intervals, c channels, z states, e forces.
-"""
-SMOOTHER_SHAPES = (
-    *("bizz", "bize", "btcz", "be", "btz", "btzz", "btc", "btzc", "btcc"),
-    *("btz", "bie", "e", "e"),
-    *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "zz", "cz"),
-)
-"""Shapes of the arguments of `run_smoother`, as in `FILTER_SHAPES`."""
-BUFFER_COUNT = 10
-"""Number of buffers, which are the last arguments of both recursions."""
-
-
-def filter_recursion(*arrays: Array) -> None:
-    """Run the filter: the arguments of `run_filter` without the buffers.
-
-    Raises:
-        ValueError: an array has another shape or layout.
-    """
-    _run(FILTER, FILTER_SHAPES, run_filter, arrays, arrays[3].shape, arrays[2].shape[3])
-
-
-def smoother_recursion(*arrays: Array) -> None:
-    """Run the smoother: the arguments of `run_smoother` without the buffers.
-
-    Raises:
-        ValueError: an array has another shape or layout.
-    """
-    _run(SMOOTHER, SMOOTHER_SHAPES, run_smoother, arrays, arrays[2].shape, arrays[1].shape[3])
-
-
-def _run(
-    function: int,
-    shapes: tuple[str, ...],
-    python_function: Callable[..., None],
-    arrays: tuple[Array, ...],
-    readings_shape: tuple[int, ...],
-    force_count: int,
-) -> None:
-    """Allocate the buffers and run a recursion, compiled if numba supports this Python version.
-
-    Args:
-        function: `FILTER` or `SMOOTHER`.
-        shapes: shapes of all arguments of the recursion.
-        python_function: the same recursion in Python.
-        arrays: arguments of the recursion without the buffers.
-        readings_shape: (B, T, C, Z).
-        force_count: E.
-    """
-    b, t, c, z = readings_shape
-    sizes = {"b": b, "t": t, "i": t - 1, "c": c, "z": z, "e": force_count, "1": 1}
-    expected_shapes = [tuple(sizes[letter] for letter in shape) for shape in shapes]
-    buffers = tuple(np.zeros(shape) for shape in expected_shapes[-BUFFER_COUNT:])
-    arguments = (*arrays, *buffers)
-    # The compiled code does not check array bounds.
-    for array, shape in zip(arguments, expected_shapes, strict=True):
-        if array.shape != shape or array.dtype != np.float64 or not array.flags.c_contiguous:
-            raise ValueError(f"expected a contiguous array of shape {shape}, got {array.shape}")
-    if t < 1:
-        return
-    compiled = _load_compiled_recursions()
-    if compiled is None:
-        python_function(*arguments)
-        return
-    numbers = np.zeros(SIZE_COUNT + MAX_ARRAYS, dtype=np.int64)
-    numbers[:SIZE_COUNT] = function, b, t, c, z, force_count
-    numbers[SIZE_COUNT : SIZE_COUNT + len(arguments)] = [get_address(a) for a in arguments]
-    compiled(get_address(numbers))
-
-
-@cache
-def _load_compiled_recursions() -> Callable[[int], None] | None:
-    """Return the compiled `recursion_entry`; None if numba does not support this Python version.
-
-    The recursions then run uncompiled, a hundred times slower.
-    """
-    if importlib.util.find_spec("llvmlite") is None:
-        return None
-    return load_compiled_module(__name__, "recursion_entry", "the Kalman filter")
-
-
-def recursion_entry(arguments_at: Any) -> None:
-    """Run a recursion (compiled code only).
-
-    The argument is the address of `SIZE_COUNT` + `MAX_ARRAYS` integers: the recursion, the sizes
-    B, T, C, Z and E, and the addresses of its arguments.
-    """
-    numbers = carray(arguments_at, (SIZE_COUNT + MAX_ARRAYS,))
-    b, t, c, z, e = numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
-    i = t - 1
-    at = numbers[SIZE_COUNT:]
-    if numbers[0] == FILTER:
-        run_filter(
-            carray(to_real_pointer(at[0]), (b, i, z, z)),
-            carray(to_real_pointer(at[1]), (b, i, z)),
-            carray(to_real_pointer(at[2]), (b, i, z, e)),
-            carray(to_real_pointer(at[3]), (b, t, c, z)),
-            carray(to_real_pointer(at[4]), (b, t, c)),
-            carray(to_real_pointer(at[5]), (b, i, z)),
-            carray(to_real_pointer(at[6]), (b, t, c)),
-            carray(to_real_pointer(at[7]), (z,)),
-            carray(to_real_pointer(at[8]), (b, e)),
-            carray(to_real_pointer(at[9]), (1,)),
-            carray(to_real_pointer(at[10]), (b, t, z)),
-            carray(to_real_pointer(at[11]), (b, t, z, z)),
-            carray(to_real_pointer(at[12]), (b, t, c)),
-            carray(to_real_pointer(at[13]), (b, t, z, c)),
-            carray(to_real_pointer(at[14]), (b, t, c, c)),
-            carray(to_real_pointer(at[15]), (b,)),
-            carray(to_real_pointer(at[16]), (z,)),
-            carray(to_real_pointer(at[17]), (z,)),
-            carray(to_real_pointer(at[18]), (z, z)),
-            carray(to_real_pointer(at[19]), (z, z)),
-            carray(to_real_pointer(at[20]), (z, z)),
-            carray(to_real_pointer(at[21]), (c, c)),
-            carray(to_real_pointer(at[22]), (c, c)),
-            carray(to_real_pointer(at[23]), (z, c)),
-            carray(to_real_pointer(at[24]), (z, c)),
-            carray(to_real_pointer(at[25]), (c,)),
-        )
-    else:
-        run_smoother(
-            carray(to_real_pointer(at[0]), (b, i, z, z)),
-            carray(to_real_pointer(at[1]), (b, i, z, e)),
-            carray(to_real_pointer(at[2]), (b, t, c, z)),
-            carray(to_real_pointer(at[3]), (b, e)),
-            carray(to_real_pointer(at[4]), (b, t, z)),
-            carray(to_real_pointer(at[5]), (b, t, z, z)),
-            carray(to_real_pointer(at[6]), (b, t, c)),
-            carray(to_real_pointer(at[7]), (b, t, z, c)),
-            carray(to_real_pointer(at[8]), (b, t, c, c)),
-            carray(to_real_pointer(at[9]), (b, t, z)),
-            carray(to_real_pointer(at[10]), (b, i, e)),
-            carray(to_real_pointer(at[11]), (e,)),
-            carray(to_real_pointer(at[12]), (e,)),
-            carray(to_real_pointer(at[13]), (z,)),
-            carray(to_real_pointer(at[14]), (z,)),
-            carray(to_real_pointer(at[15]), (c,)),
-            carray(to_real_pointer(at[16]), (z, z)),
-            carray(to_real_pointer(at[17]), (z, z)),
-            carray(to_real_pointer(at[18]), (z, z)),
-            carray(to_real_pointer(at[19]), (z, z)),
-            carray(to_real_pointer(at[20]), (z, z)),
-            carray(to_real_pointer(at[21]), (z, z)),
-            carray(to_real_pointer(at[22]), (c, z)),
-        )
+from sims.engines.compiled.array_functions import ArrayFunctions
 
 
 def multiply_sparse(a: Array, b: Array, out: Array) -> None:
@@ -490,3 +324,23 @@ def run_smoother(
                 missing[run, i - 1, e] = -q * q * pushed
                 measured[e] += pushed * pushed
                 expected[e] += known
+
+
+COMPILED = ArrayFunctions(
+    __name__,
+    "the Kalman filter",
+    {
+        run_filter: (
+            *("bizz", "biz", "bize", "btcz", "btc", "biz", "btc", "z", "be", "1"),
+            *("btz", "btzz", "btc", "btzc", "btcc", "b"),
+            *("z", "z", "zz", "zz", "zz", "cc", "cc", "zc", "zc", "c"),
+        ),
+        run_smoother: (
+            *("bizz", "bize", "btcz", "be", "btz", "btzz", "btc", "btzc", "btcc"),
+            *("btz", "bie", "e", "e"),
+            *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "zz", "cz"),
+        ),
+    },
+    can_run_uncompiled=True,
+)
+"""Recursions for b runs, t samples, i = t - 1 intervals, c channels, z states and e forces."""

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.kalman.compiled_recursions import filter_recursion, smoother_recursion
+from bench.diagnosis.kalman.compiled_recursions import COMPILED, run_filter, run_smoother
 from sims.core.simulator import Array
 from sims.robot.dynamics.linearisation_about_recording import IntervalMaps
 
@@ -265,21 +265,15 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
             columns of G, those of coloured noise, have 1.
         white: R (C,) variances of white noise.
     """
-    run_count, samples, channels = runs.residuals.shape
-    size = runs.prior.size
+    if runs.states.shape[1] != runs.residuals.shape[1] - 1:
+        raise ValueError(f"expected a step between two samples, got {runs.states.shape[1]} steps")
     # A missing sample is replaced by a reading of zero with variance one.
     variances = np.where(runs.recorded, white, 1.0)
-    predicted = np.zeros((run_count, samples, size))
-    covariances = np.zeros((run_count, samples, size, size))
-    innovations = np.zeros((run_count, samples, channels))
-    gains = np.zeros((run_count, samples, size, channels))
-    whiteners = np.zeros((run_count, samples, channels, channels))
-    likelihood = np.zeros(run_count)
-    filter_recursion(
+    predicted, covariances, innovations, gains, whiteners, likelihood, *_ = COMPILED.call(
+        run_filter,
         *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
         *(np.square(runs.jumps), variances, runs.prior),
         *(_complete_deviations(force, runs), np.array([LARGEST_COVARIANCE])),
-        *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
     # The likelihood of a model that diverges is set to zero.
     likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
@@ -294,16 +288,12 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
         filtered: results of the filter.
         force: standard deviations of the missing forces, as for `filter_runs`.
     """
-    run_count, samples, _ = runs.residuals.shape
-    count = runs.forces.shape[3]
-    states = np.zeros((run_count, samples, runs.prior.size))
-    forces = np.zeros((run_count, samples - 1, count))
-    measured, expected = np.zeros(count), np.zeros(count)
-    smoother_recursion(
+    states, forces, measured, expected, *_ = COMPILED.call(
+        run_smoother,
         *_make_contiguous(runs.states, runs.forces, runs.readings),
         _complete_deviations(force, runs),
         *(filtered.predicted, filtered.covariances, filtered.innovations),
-        *(filtered.gains, filtered.whiteners, states, forces, measured, expected),
+        *(filtered.gains, filtered.whiteners),
     )
     states, forces = np.nan_to_num(states), np.nan_to_num(forces)
     with np.errstate(all="ignore"):

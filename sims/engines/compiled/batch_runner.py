@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
-from sims.engines.compiled.data_layout import BatchArrays
+from sims.engines.compiled.ballistic_motion import fly_elements
+from sims.engines.compiled.data_layout import BatchArrays, Block
+from sims.engines.compiled.element_stepping import step_elements
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
-from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_ELEMENTS
+from sims.engines.compiled.kernel import COMPILED, integrate_elements
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
 
@@ -39,7 +41,7 @@ def integrate_batch(
     Returns:
         The trajectories.
     """
-    get_kernel()  # an error of the compiler is not an error of the system
+    COMPILED.load()  # an error of the compiler is not an error of the system
     whole = _make_arrays(batch, max_phase, patience)
     for elements, effects in _group_by_effects(batch):
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
@@ -50,7 +52,7 @@ def integrate_batch(
         is_uniform = batch.system.uniform and not any(
             isinstance(e, (Force, Friction)) for e, _ in effects
         )
-        _integrate_group(FLY_ELEMENTS if is_uniform else STEP_ELEMENTS, program, arrays, jobs)
+        _integrate_group(fly_elements if is_uniform else step_elements, program, arrays, jobs)
     return Trajectories(*np.split(whole.records, 3, axis=2))
 
 
@@ -91,12 +93,15 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
 
 
 def _integrate_group(
-    function: int, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, jobs: int
+    function: Callable[[Block], None],
+    program: ForceProgram | NumpyForceProgram,
+    arrays: BatchArrays,
+    jobs: int,
 ) -> None:
     """Integrate elements with equal effects, on several threads if there are enough of them.
 
     Args:
-        function: address of the function of the kernel.
+        function: `step_elements` or `fly_elements`.
         program: force program of the effects.
         arrays: arrays of the batch, with the selected elements.
         jobs: maximum number of threads.
@@ -108,10 +113,10 @@ def _integrate_group(
         """Run one thread's part of the elements, in separate program buffers."""
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
         # Elements in closed form are integrated one after the other.
-        width = 1 if function == FLY_ELEMENTS else min(program.block_width, padded_count)
+        width = 1 if function == fly_elements else min(program.block_width, padded_count)
         prepared = program.prepare(width)
         part = part._replace(queue=np.zeros_like(part.order))
-        get_kernel().run(function, prepared.arrays, part, prepared.block, width)
+        integrate_elements(function, prepared.arrays, part, prepared.block, width)
         prepared.raise_error()
 
     # Every thread has its own buffers. No two threads write the same element, and the result of an

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.effect import Effect, Force, Friction
 from sims.core.system import System
+from sims.engines.compiled.array_functions import measure_arrays
 from sims.engines.compiled.traced_array import EXTERNAL
 
-Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
 Row = NDArray[np.float64]
 """Array with one number per batch element."""
@@ -135,6 +135,14 @@ class Block(NamedTuple):
     w: int
 
 
+BLOCK_SHAPES = (
+    *("#i5", "#4", "#q", "#d", "#6", "#s", "#s", "sp", "l", "ld", "ld", "kt", "ujt"),
+    *("l", "l", "l", "4l", "2", "lyz", "rw", "aw", "#nw", "#", "#"),
+)
+"""Shapes of the arrays of `Block` for `ArrayFunctions`.
+
+d coordinates, s of l elements, t steps, u inputs, p parameters, w slots; k and j are 1 or l.
+"""
 CONSTANTS, FORCES, IMPACTS = range(3)
 """Parts of a force program; part k begins at entry k of `ProgramArrays.ends`."""
 # Entries of `ProgramArrays.rows`.
@@ -246,67 +254,24 @@ def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
     )
 
 
-def check_array_layout(
-    program: ProgramArrays,
-    arrays: BatchArrays,
-    block: BlockBuffers,
-    w: int,
-) -> None:
-    """Check that all arrays have the specified shapes, because machine code does not check them.
-
-    Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
-            one batch element.
-        w: number of slots in use.
+def check_block(block: Block) -> None:
+    """Check that the arrays of a block belong together, because machine code does not check them.
 
     Raises:
         ValueError: an array is not as specified.
     """
-    element_count, d = arrays.x.shape
-    selected_count, columns = arrays.parameters.shape
-    steps = arrays.steps.shape[1]
-    width = block.r.shape[1]
-    rows = program.rows
-    step_rows = 1 if len(arrays.steps) == 1 else element_count
-    input_rows = 1 if arrays.inputs.shape[1] == 1 else element_count
-    int_arrays = [
-        (program.code, (len(program.code), 5)),
-        (program.ends, (4,)),
-        (rows, (11,)),
-        (program.out, (d,)),
-        (program.flags, (6,)),
-        (arrays.order, (selected_count,)),
-        (arrays.queue, (selected_count,)),
-        (block.n, (STATE_ROW_COUNT, width)),
-    ]
-    real_arrays = [
-        (arrays.parameters, (selected_count, columns)),
-        (arrays.x, (element_count, d)),
-        (arrays.v, (element_count, d)),
-        (arrays.mass, (element_count,)),
-        (arrays.max_steps, (element_count,)),
-        (arrays.planned_counts, (element_count,)),
-        (arrays.divisions, (element_count,)),
-        (arrays.limits, (2,)),
-        (arrays.ground, (4, element_count)),
-        (arrays.steps, (step_rows, steps)),
-        (arrays.inputs, (len(arrays.inputs), input_rows, steps)),
-        (arrays.records, (element_count, steps // arrays.steps_per_record + 1, 3 * d)),
-        (block.r, (len(block.r), width)),
-        (block.a, (NUMBER_ROW_COUNT, width)),
-    ]
-    for group, kind in ((int_arrays, np.int64), (real_arrays, np.float64)):
-        for array, shape in group:
-            if array.shape != shape or array.dtype != kind or not array.flags.c_contiguous:
-                raise ValueError(f"expected {shape} {kind.__name__}, found {array.shape}")
+    sizes = measure_arrays(BLOCK_SHAPES, block)
+    d, elements, steps, rows = sizes["d"], sizes["l"], sizes["t"], block.rows
     groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
+    record_sizes = steps // block.steps_per_record + 1, 3 * d
     if (
-        groups != (d, len(arrays.inputs), columns)
-        or not (1 <= w <= width and 1 <= d <= MAX_COORDINATES and selected_count and steps)
-        or not 0 <= arrays.order.min() <= arrays.order.max() < element_count
-        or not uses_registers(program.code, len(block.r))
+        groups != (d, sizes["u"], sizes["p"])
+        or (sizes["y"], sizes["z"]) != record_sizes
+        or (sizes["q"], sizes["a"], sizes["n"]) != (11, NUMBER_ROW_COUNT, STATE_ROW_COUNT)
+        or not {sizes["j"], sizes["k"]} <= {1, elements}
+        or not (1 <= block.w <= sizes["w"] and 1 <= d <= MAX_COORDINATES and sizes["s"] and steps)
+        or not 0 <= block.order.min() <= block.order.max() < elements
+        or not uses_registers(block.code, sizes["r"])
     ):
         raise ValueError("the force program does not match the arrays of the batch")
 

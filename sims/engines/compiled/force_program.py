@@ -37,7 +37,7 @@ from sims.engines.compiled.data_layout import (
     allocate_block,
     make_flags,
 )
-from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.kernel import make_instruction_runner
 from sims.engines.compiled.numpy_forces import NUMPY_BLOCK_WIDTH, NumpyForces, lay_out_registers
 from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
@@ -86,9 +86,9 @@ class PreparedProgram(NamedTuple):
 
         The parts are the values of each element, the forces, and the contact parameters.
         """
-        kernel, part_ends, r = get_kernel(), self.arrays.ends.tolist(), self.block.r
+        part_ends, r = self.arrays.ends.tolist(), self.block.r
         runners = [
-            kernel.make_instruction_runner(self.arrays.code, first, last, r)
+            make_instruction_runner(self.arrays.code, first, last, r)
             for first, last in pairwise(part_ends)
         ]
         if self.numpy_forces is None:

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from sims.engines.compiled import intrinsics, machine_code
-from sims.engines.compiled.data_layout import Block
+from sims.engines.compiled.array_functions import INTEGERS, ArrayFunctions
+from sims.engines.compiled.data_layout import BLOCK_SHAPES, Block
 
 _INLINED_FUNCTIONS = frozenset(
     {
@@ -43,7 +44,7 @@ def build_module(module: str, entry: str, pointers: int, constants: Mapping[str,
 
     Args:
         module: name of the module.
-        entry: name of the function, which receives pointers to integers.
+        entry: name of the function, which receives pointers to integers, or of `ArrayFunctions`.
         pointers: number of these pointers.
         constants: values that replace constants of the module, by name.
 
@@ -75,7 +76,7 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
 
     Args:
         module: name of the module.
-        entry: name of the function.
+        entry: name of the function, or of `ArrayFunctions`.
         pointers: number of its arguments, which are pointers.
         constants: further global names and their numbers.
     """
@@ -84,6 +85,8 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
     # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
     entry_function = getattr(import_module(module), entry)
+    if isinstance(entry_function, ArrayFunctions):
+        entry_function = entry_function.make_entry()
     space = _compile_functions(numba, entry_function, constants)
     types = numba.types
     arguments = [types.CPointer(types.int64)] * pointers
@@ -201,19 +204,20 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
 
 def _get_argument_types(numba: Any) -> dict[str, Any]:
     """Return numba's types by the names of annotations, derived from example values."""
-    ints, int_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
-    row, table, box = (np.zeros((1,) * k) for k in (1, 2, 3))
     examples = {
         "bool": True,
         "int": 1,
         "float": 1.0,
-        "FloatArray": table,
-        "IntTable": int_table,
-        "Block": Block(
-            code=int_table, ends=ints, rows=ints, out=ints, flags=ints, order=ints, queue=ints,
-            parameters=table, mass=row, x=table, v=table, steps=table, inputs=box, max_steps=row,
-            planned_counts=row, divisions=row, ground=table, limits=row, records=box, r=table,
-            a=table, n=int_table, steps_per_record=1, w=1,
-        ),
-    }  # fmt: skip
+        "FloatArray": _make_example("ij"),
+        "IntTable": _make_example("#ij"),
+        "Block": Block(*map(_make_example, BLOCK_SHAPES)),
+    }
     return {name: numba.typeof(value) for name, value in examples.items()}
+
+
+def _make_example(shape: str) -> Any:
+    """Return an example of an argument with a shape of `ArrayFunctions`."""
+    if shape == INTEGERS:
+        return 1
+    kind = np.int64 if shape.startswith(INTEGERS) else np.float64
+    return np.zeros((1,) * len(shape.removeprefix(INTEGERS)), dtype=kind)

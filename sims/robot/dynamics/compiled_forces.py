@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sims.core.effect import Effect, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
 from sims.engines.compiled.force_program import InstructionList, emit_instructions
-from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.kernel import make_instruction_runner
 from sims.engines.compiled.traced_array import (
     PER_ELEMENT,
     PER_EVALUATION,
@@ -263,9 +263,8 @@ class CompiledForces:
         coefficients = [own[:, :, 0] for _, own in _list_effects(forces)]
         r[c:states] = np.concatenate(coefficients)
         first, moment, end, _ = instructions.ends.tolist()
-        kernel = get_kernel()
-        kernel.make_instruction_runner(instructions.code, first, moment, r)()
-        self._run = kernel.make_instruction_runner(instructions.code, moment, end, r)
+        make_instruction_runner(instructions.code, first, moment, r)()
+        self._run = make_instruction_runner(instructions.code, moment, end, r)
 
     @cached_property
     def _stacked_inputs(self) -> Array:

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from bench.diagnosis.kalman import compiled_recursions
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from sims.engines.compiled import array_functions
 
 
 @pytest.mark.slow
@@ -63,7 +63,7 @@ def run_both(runs):
 def test_compiled_and_interpreted_recursions_agree(monkeypatch):
     pytest.importorskip("llvmlite")
     compiled = run_both(make_runs())
-    monkeypatch.setattr(compiled_recursions, "_load_compiled_recursions", lambda: None)
+    monkeypatch.setattr(array_functions, "HAS_LLVMLITE", False)
     for fast, slow in zip(compiled, run_both(make_runs()), strict=True):
         np.testing.assert_allclose(fast, slow, rtol=1e-9, atol=1e-12)
 
@@ -74,3 +74,7 @@ def test_arrays_of_another_shape_are_rejected():
         filter_runs(
             LinearRuns(**{**vars(runs), "defects": np.zeros((2, 28, 4))}), np.ones(3), np.ones(2)
         )
+    longer = np.zeros((2, 30, 4))
+    runs = {**vars(runs), "states": np.zeros((2, 30, 4, 4)), "defects": longer, "jumps": longer}
+    with pytest.raises(ValueError, match="expected a step between two samples, got 30 steps"):
+        filter_runs(LinearRuns(**runs), np.ones(3), np.ones(2))

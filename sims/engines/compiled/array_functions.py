@@ -1,0 +1,318 @@
+"""Functions on arrays in machine code: loaded from the user's cache, or compiled once.
+
+numba translates the functions (`kernel_build`), which takes up to 20 s. The machine code is stored
+and loaded with llvmlite alone (`machine_code`), in a few hundredths of a second and without numba.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from threading import Lock
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import InputError
+from sims.engines.compiled import intrinsics, machine_code
+
+Array = NDArray[Any]
+INTEGERS = "#"
+"""Prefix of the shapes of integer arrays, and the shape of an integer argument."""
+HAS_LLVMLITE = importlib.util.find_spec("llvmlite") is not None
+"""True if machine code can be loaded; numba may not support this Python version yet."""
+_MAX_COMPILE_SECONDS = 20
+"""Approximate compilation time of the batch engine in seconds, the longest one."""
+_PYTHON_MODULES = ("batch_runner.py", "force_program.py", "numpy_forces.py")
+"""Source files of this package on which no compiled code depends."""
+_lock = Lock()
+
+
+class ArrayFunctions:
+    """Functions on arrays of a module, compiled on first use into one piece of machine code.
+
+    A shape has one letter per dimension: equal letters are equal sizes in a call, and a digit is a
+    fixed size. Numbers are of double precision; the prefix `INTEGERS` declares 64-bit integers.
+
+    Args:
+        module: name of the module, which holds this object under the name ``COMPILED``.
+        description: what is compiled, for messages to the user.
+        shapes: shapes of the arguments of each function. A function with one parameter receives
+            them as one tuple, whose class is its annotation.
+        can_run_uncompiled: whether the functions run as Python where llvmlite is not installed, a
+            hundred times slower.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        description: str,
+        shapes: Mapping[Callable[..., None], Sequence[str]],
+        can_run_uncompiled: bool = False,
+    ) -> None:
+        self._module, self._description = module, description
+        self._shapes = dict(shapes)
+        self._can_run_uncompiled = can_run_uncompiled
+        self._compiled: Callable[..., None] | None = None
+
+    def call(self, function: Callable[..., None], *arguments: Any) -> list[Array]:
+        """Run a function, and return its last arguments: those that are not given.
+
+        They begin as zeros; the compiled functions themselves allocate no memory.
+
+        Args:
+            function: one of the functions.
+            arguments: first arguments: contiguous arrays and integers. Arrays may be changed.
+
+        Raises:
+            ValueError: an array has another shape, type or memory layout than declared.
+        """
+        shapes = self._shapes[function]
+        sizes = measure_arrays(shapes[: len(arguments)], arguments)
+        allocated = [
+            np.zeros([int(a) if a.isdigit() else sizes[a] for a in shape])
+            for shape in shapes[len(arguments) :]
+        ]
+        self._bind(function, sizes, (*arguments, *allocated))()
+        return allocated
+
+    def bind(self, function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
+        """Return a function without arguments that runs a function on the memory of these arrays.
+
+        Args:
+            function: one of the functions.
+            arguments: all of its arguments, see `call`.
+
+        Raises:
+            ValueError: an array has another shape, type or memory layout than declared.
+        """
+        # The compiled code does not check array bounds.
+        return self._bind(function, measure_arrays(self._shapes[function], arguments), arguments)
+
+    def _bind(
+        self, function: Callable[..., None], sizes: Mapping[str, int], arguments: tuple[Any, ...]
+    ) -> Callable[[], None]:
+        """Return a function that runs a function on measured arguments, see `bind`."""
+        if self._can_run_uncompiled and not HAS_LLVMLITE:
+            return partial(function, *arguments)
+        words = np.array(
+            [
+                list(self._shapes).index(function),
+                *sizes.values(),
+                *(get_address(a) if isinstance(a, np.ndarray) else a for a in arguments),
+            ],
+            dtype=np.int64,
+        )
+        run: Any = partial(self.load(), ctypes.c_void_p(get_address(words)))
+        run.owners = words, arguments  # keeps the memory at the addresses
+        return run  # type: ignore[no-any-return]
+
+    def load(self) -> Callable[..., None]:
+        """Return the machine code of `make_entry`, compiled on first use.
+
+        Raises:
+            InputError: the compiler or its machine code cannot be used.
+        """
+        if self._compiled is None:
+            self._compiled = load_stored(self._module, "COMPILED", self._description, 1, {})
+        return self._compiled
+
+    def make_entry(self) -> FunctionType:
+        """Make the function to be compiled: it reads the integers of `bind`, and calls a function.
+
+        The integers are the function, its sizes in the order of their letters, and the address of
+        each array.
+        """
+        count = max(map(_count_words, self._shapes.values()))
+        lines = ["def entry(address):", f"    words = carray(address, ({count},))"]
+        space: dict[str, Any] = {**vars(intrinsics), "__name__": self._module}
+        for index, (function, shapes) in enumerate(self._shapes.items()):
+            letters = _list_letters(shapes)
+            lines.append(f"    if words[0] == {index}:")
+            lines += [f"        {letter} = words[{k}]" for k, letter in enumerate(letters, 1)]
+            arguments = ", ".join(
+                _format_argument(shape, f"words[{k}]")
+                for k, shape in enumerate(shapes, 1 + len(letters))
+            )
+            parameters = list(inspect.signature(function).parameters.values())
+            if len(parameters) < len(shapes):
+                kind = parameters[0].annotation
+                space[kind] = getattr(sys.modules[function.__module__], kind)
+                arguments = f"{kind}({arguments})"
+            lines.append(f"        {function.__name__}({arguments})")
+            space[function.__name__] = function
+        exec("\n".join(lines), space)
+        entry: FunctionType = space["entry"]
+        return entry
+
+
+def _list_letters(shapes: Sequence[str]) -> list[str]:
+    """Return the letters of shapes in the order in which they first occur."""
+    return [letter for letter in dict.fromkeys("".join(shapes)) if letter.isalpha()]
+
+
+def _count_words(shapes: Sequence[str]) -> int:
+    """Return the number of integers that a call with arguments of these shapes needs."""
+    return 1 + len(_list_letters(shapes)) + len(shapes)
+
+
+def _format_argument(shape: str, word: str) -> str:
+    """Return the expression of an argument in the entry.
+
+    Args:
+        shape: its shape.
+        word: expression of its integer: the address of an array.
+    """
+    if shape == INTEGERS:
+        return word
+    kind = "int" if shape.startswith(INTEGERS) else "real"
+    sizes = "".join(f"{size}, " for size in shape.removeprefix(INTEGERS))
+    return f"carray(to_{kind}_pointer({word}), ({sizes}))"
+
+
+def measure_arrays(shapes: Sequence[str], arguments: Sequence[Any]) -> dict[str, int]:
+    """Return the sizes of arrays by the letters of their shapes.
+
+    Args:
+        shapes: shapes as for `ArrayFunctions`.
+        arguments: arrays, and integers where the shape is `INTEGERS`.
+
+    Raises:
+        ValueError: an array has another shape, type or memory layout than declared.
+    """
+    sizes: dict[str, int] = {}
+    for shape, array in zip(shapes, arguments, strict=True):
+        if shape == INTEGERS:
+            continue
+        letters = shape.removeprefix(INTEGERS)
+        kind = np.int64 if shape.startswith(INTEGERS) else np.float64
+        expected = tuple(
+            int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
+            for letter, size in zip(letters, array.shape, strict=False)
+        )
+        if (
+            array.shape != expected
+            or array.ndim != len(letters)
+            or array.dtype != kind
+            or not array.flags.c_contiguous
+        ):
+            raise ValueError(
+                f"expected a contiguous array of shape {expected} of {kind.__name__}, got"
+                f" {array.dtype} of shape {array.shape}"
+            )
+    return sizes
+
+
+_NullArray = ctypes.c_char * 0
+
+
+def get_address(array: Array) -> int:
+    """Return the address of an array; NumPy's own way takes four times as long."""
+    if array.flags.writeable:
+        return ctypes.addressof(_NullArray.from_buffer(array.data))
+    return int(array.ctypes.data)
+
+
+def load_stored(
+    module: str, entry: str, description: str, pointers: int, constants: Mapping[str, int]
+) -> Callable[..., None]:
+    """Return a function whose machine code is in a file of the cache, compiled if necessary.
+
+    Args:
+        module: name of the function's module.
+        entry: name of the function, or of `ArrayFunctions`.
+        description: what is compiled, for the message to the user.
+        pointers: number of pointer arguments of the function.
+        constants: values that replace constants of the module, by name.
+
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
+    """
+
+    def compile_code() -> bytes:
+        """Compile the module with numba, and tell the user why this takes time."""
+        _print_line(
+            f"compiling {description}, once after an install: up to {_MAX_COMPILE_SECONDS} s"
+        )
+        from sims.engines.compiled.kernel_build import build_module
+
+        return build_module(module, entry, pointers, constants)
+
+    try:
+        with _lock:
+            data = _get_machine_code(make_cache_name(module, constants), compile_code)
+            return machine_code.load_machine_code(machine_code.MachineCode.unpack(data), pointers)
+    # A compiler that does not match this Python or its NumPy may raise any error.
+    except Exception as error:
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"{description} cannot be compiled: {text}; expected working versions of numba and"
+            " llvmlite: install simgap again with the versions of requirements.lock"
+        ) from error
+
+
+def _get_machine_code(name: str, compile_code: Callable[[], bytes]) -> bytes:
+    """Return the machine code: from the file `name` of the cache, or compiled.
+
+    Compilation takes up to 20 s, so the code is stored in the user's cache. If the cache cannot
+    be written, each process compiles again.
+    """
+    folder = machine_code.get_cache_folder()
+    path = folder / name
+    data = machine_code.read_cached(path)
+    if data is not None:
+        return data
+    try:
+        return machine_code.make_cached(path, compile_code, _report_wait)
+    except OSError as error:
+        _print_line(
+            f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
+            " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
+        )
+        return compile_code()
+
+
+def _report_wait() -> None:
+    """Tell the user that another process is compiling, so that this one waits for its result."""
+    _print_line(
+        "another process compiles this code, once after an install:"
+        f" {_MAX_COMPILE_SECONDS} s at most"
+    )
+
+
+def _print_line(text: str) -> None:
+    """Write one line to the standard error output."""
+    sys.stderr.write(f"simgap: {text}\n")
+    sys.stderr.flush()
+
+
+def make_cache_name(module: str, constants: Mapping[str, int]) -> str:
+    """Return the name of a file of the cache.
+
+    It has a hash of everything on which the code depends: sources, constants, compiler, processor.
+
+    Args:
+        module: name of the module.
+        constants: values that replace constants of the module, by name.
+    """
+    digest = hashlib.sha256()
+    for source in list_source_files(module):
+        digest.update(source.read_bytes())
+    digest.update(repr((machine_code.describe_processor(), sorted(constants.items()))).encode())
+    return f"{module.rpartition('.')[2]}-{digest.hexdigest()[:24]}.bin"
+
+
+def list_source_files(module: str) -> list[Path]:
+    """Return the source files from which the code of a module is compiled, and those around it."""
+    folder = Path(__file__).parent
+    files = [path for path in folder.glob("*.py") if path.name not in _PYTHON_MODULES]
+    files += [folder.parent / "ground_contact.py", Path(str(sys.modules[module].__file__))]
+    return sorted(set(files))
