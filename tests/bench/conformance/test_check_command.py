@@ -8,24 +8,10 @@ from jsonschema import validate
 from bench.cli.main import main
 from bench.schemas import load_schema
 from tests.conftest import PLUGINS
+from tests.docs.documentation_pages import blocks, text_of
 
 CHAOS = ["--plugin", str(PLUGINS / "chaos.py")]
 SPRING = ["--plugin", str(PLUGINS / "spring.py")]
-VALID_TUNER = """import numpy as np
-
-from methods.tuner import Tuner
-
-
-class Shrinking(Tuner):
-    def tune(self, task, rng):
-        best, best_loss, width = task.start, np.inf, 0.3
-        while True:
-            seen = yield np.clip(best + width * rng.normal(size=(1, task.dim)), 0, 1)
-            if seen.losses[0] < best_loss:
-                best, best_loss = seen.proposals[0], seen.losses[0]
-            else:
-                width *= 0.9
-"""
 
 
 def checked(capsys, *arguments):
@@ -34,10 +20,10 @@ def checked(capsys, *arguments):
 
 
 @pytest.mark.slow
-def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
-    plugin = tmp_path / "shrinking.py"
-    plugin.write_text(VALID_TUNER)
-    code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
+def test_the_tuner_of_the_page_passes_every_check(tmp_path, capsys):
+    plugin = tmp_path / "my_tuner.py"
+    plugin.write_text(dict(blocks(text_of("add-a-tuner.md")))["my_tuner.py"], encoding="utf-8")
+    code, said = checked(capsys, "narrowing", "--plugin", str(plugin))
     assert code == 0, said
     assert said.count("ok    ") == 14
     assert (
@@ -48,7 +34,7 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
         "-       what was learned can be stored\n        not applicable: it does not learn" in said
     )
     assert said.endswith(
-        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 14 checks passed, "
+        "tuner narrowing (simgap_plugin_my_tuner.Narrowing): all 14 checks passed, "
         "2 not applicable\n"
     )
 
