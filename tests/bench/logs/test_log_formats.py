@@ -13,8 +13,6 @@ from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motio
 from tests.malformed_input.input_strategies import log_folders, run_cases
 from tests.malformed_input.malformed_case import tried
 
-QUICK = ("csv", "npz")
-"""Formats of the fast tests of whole commands."""
 DAMAGES = 12
 """Number of damaged folders of each format; `make malformed KINDS=logs` makes thousands."""
 
@@ -43,11 +41,9 @@ def test_the_numbers_of_a_folder_are_those_that_were_logged(kind, tmp_path):
         np.testing.assert_allclose(run.times[own] - run.times[own][0], times, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in WRITERS]
-)
+@pytest.mark.parametrize("kind", ["csv", "npz"])
 def test_two_commands_give_a_verdict(kind, tmp_path, capsys):
-    skip_without(kind)
+    """The test above shows that the other formats give the same recording."""
     logs, model = write_folder(tmp_path, kind)
     out, answer = tmp_path / "log.toml", tmp_path / "answer"
     assert main(["import", str(logs), "--model", str(model), "--out", str(out),

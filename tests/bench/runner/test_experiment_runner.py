@@ -2,15 +2,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import (
     ExperimentRun,
     prepare_experiment,
     run_experiment,
 )
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.study_creation import prepare_study
-from bench.benchmark.storage.result_folder import read_comparison
 from bench.core.plugin_registries import load_plugins
 from tests.conftest import PLUGINS
 from tests.plugins.awkward import hashed
@@ -37,13 +34,6 @@ def frame(results):
     return pd.concat([pd.DataFrame(columns[i]) for i in sorted(columns)], ignore_index=True)
 
 
-def tables(experiment, folder, jobs):
-    load_plugins_for_experiment(PLUGIN_FILES, experiment)
-    comparison = Comparison.begin(prepare_study(experiment, PLUGIN_FILES, folder, jobs))
-    assert comparison.run(jobs).is_complete
-    return read_comparison(folder)
-
-
 EVERYTHING = {
     "random": {},
     "nelder_mead": {},
@@ -61,19 +51,6 @@ EVERYTHING = {
 @pytest.fixture(scope="module")
 def two_workers():
     return compared(spring_experiment(tuners=EVERYTHING), jobs=2)
-
-
-@pytest.mark.slow
-def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
-    experiment = spring_experiment(tuners=EVERYTHING)
-    first, second = (tables(experiment, tmp_path / str(jobs), jobs) for jobs in (1, 2))
-    pd.testing.assert_frame_equal(
-        first.runs.drop(columns=MEASURED), second.runs.drop(columns=MEASURED)
-    )
-    unlike = ["seconds"]
-    pd.testing.assert_frame_equal(
-        first.statuses.drop(columns=unlike), second.statuses.drop(columns=unlike)
-    )
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ EVERYONE = {
     "regressor": {"seeds": 1},
     "crashing": {},
     "nan_proposing": {},
+    "over_asking": {},
     "stopping": {"seeds": 1},
 }
 CELL = """
