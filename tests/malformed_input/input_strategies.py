@@ -254,6 +254,6 @@ def run_cases(strategy, count, act):
 
 
 def share(kind: str, of: int | None = None) -> int:
-    """Return the number of cases of a kind, for a total of `of`, $MALFORMED or 1500 (as in CI)."""
-    total = of or int(os.environ.get("MALFORMED", "1500"))
+    """Return the number of cases of a kind, for a total of `of`, $MALFORMED or 600 (as in CI)."""
+    total = of or int(os.environ.get("MALFORMED", "600"))
     return max(SHARES[kind] * total // sum(SHARES.values()), 1)

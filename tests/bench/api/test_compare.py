@@ -94,6 +94,7 @@ def test_a_class_is_compared_its_figures_and_summary_are_at_hand(experiment, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_fault_in_a_class_shows_its_own_line_and_the_others_go_on(experiment, tmp_path, capfd):
     run = simgap.compare(experiment, tuners=["random", Careless], jobs=0, out=tmp_path / "out")
     reasons = run.statuses.set_index("tuner").loc["careless", "reason"]

@@ -1,5 +1,6 @@
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -35,8 +36,7 @@ def cache(tmp_path, monkeypatch, spring):
     return tmp_path / "cache"
 
 
-@pytest.fixture
-def experiment(tmp_path):
+def write_experiment(folder):
     document = {
         **SPRING,
         "training_budget": 56,
@@ -44,9 +44,25 @@ def experiment(tmp_path):
         "seeds": 2,
         "tuners": {"small": TUNER},
     }
-    path = tmp_path / "ahead.toml"
+    path = folder / "ahead.toml"
     path.write_text(tomli_w.dumps(document))
     return path
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    return write_experiment(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def trained_cache(tmp_path_factory, spring):
+    """Return a cache with the trained weights of both seeds."""
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SIMGAP_CACHE", str(folder / "cache"))
+        patch.chdir(folder)
+        assert train_spring(write_experiment(folder)) == 0
+    return folder / "cache"
 
 
 def train_spring(experiment, *more):
@@ -198,8 +214,8 @@ BREAKS = [truncated, emptied, flipped, pickled, foreign, another, reshaped, not_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spoil", BREAKS, ids=lambda spoil: spoil.__name__)
-def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spoil):
-    assert train_spring(experiment) == 0
+def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cache, capsys, spoil):
+    shutil.copytree(trained_cache, cache)
     entry = TunerEntry("small", "tunenet", TUNER["options"])
     path = cache / f"{compute_training_key(load_experiment(str(experiment)), entry, 0)}.npz"
     spoil(path)

@@ -23,17 +23,18 @@ BLOCK = """<mujoco model="block">
 """
 OPTIONS = 'integrator="implicitfast"'
 JOINTS = ("x", "y", "lift")
-RATE, SAMPLES, RUNS, NOISE = 100, 200, 3, 1e-4
+RATE, RUNS, NOISE = 100, 3, 1e-4
 SETTLE_STEPS = 500
 
 
-def write_block_recording(folder, options="", change=("", "")):
+def write_block_recording(folder, options="", change=("", ""), samples=200):
     """Write the model file and a recording of the block with other options of the solver.
 
     Args:
         folder: folder to write to.
         options: options that the recorded simulator has in addition, such as ``cone="elliptic"``.
         change: text of the model file and of that of the recorded simulator.
+        samples: number of samples of each run.
 
     Returns:
         Path of the recording. The initial states are stated; the last run is held out.
@@ -57,7 +58,7 @@ def write_block_recording(folder, options="", change=("", "")):
         ]
         phases, frequencies = rng.uniform(0, 2 * np.pi, (2, 3)), rng.uniform(0.3, 1.2, (2, 3))
         amplitudes = rng.uniform(0.03, 0.08, (2, 3))
-        for sample in range(SAMPLES):
+        for sample in range(samples):
             time = sample / RATE
             push = (amplitudes * np.sin(2 * np.pi * frequencies * time + phases)).sum(axis=1)
             command = [*push, -8.0 + 5.0 * np.sin(4.4 * time + phases[0, 0])]

@@ -121,7 +121,7 @@ def test_the_weak_rotor_of_the_example_is_named_and_written_into_the_file(tmp_pa
     model = mujoco.MjModel.from_xml_path(str(out / "extended.xml"))
     assert model.jnt_type.tolist() == [mujoco.mjtJoint.mjJNT_FREE]
     thrusts = model.actuator_gear[:, 2] * model.actuator_gainprm[:, 0]
-    assert thrusts == pytest.approx([1.0, 1.0, 1.0 + number, 1.0], abs=1e-9)
+    assert thrusts == pytest.approx([1.0, 1.0, 1.0 + number, 1.0], abs=1e-4)
     # Both files predict the held-out flight down to the noise.
     for name in ("extended.toml", "extended.xml"):
         assert main(["score", str(out / name), str(log), "--held-out"]) == 0

@@ -107,7 +107,7 @@ def test_every_option_has_a_name_in_texts():
 
 @pytest.mark.slow
 def test_a_planted_cone_is_the_only_cause_and_is_written_into_the_model_file(tmp_path):
-    explanation = explain(write_block_recording(tmp_path, 'cone="elliptic"'))
+    explanation = explain(write_block_recording(tmp_path, 'cone="elliptic"', samples=100))
     (cause,) = explanation.answer.causes
     assert explanation.answer.verdict == "named"
     assert cause.effect == "numerics.cone"
@@ -122,7 +122,7 @@ def test_a_planted_cone_is_the_only_cause_and_is_written_into_the_model_file(tmp
 @pytest.mark.slow
 def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
     changed = ('friction="0.6"', 'friction="0.7"')
-    answer = explain(write_block_recording(tmp_path, change=changed)).answer
+    answer = explain(write_block_recording(tmp_path, change=changed, samples=100)).answer
     assert [cause.effect for cause in answer.causes] == ["contact.friction@ground/foot"]
     assert answer.causes[0].coefficients["coefficient"].value == pytest.approx(0.1, rel=0.05)
 
@@ -131,7 +131,7 @@ def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "effect", "number"),
     [
-        ({"options": 'noslip_iterations="5"'}, "numerics.noslip", 5),
+        ({"options": 'noslip_iterations="5"', "samples": 100}, "numerics.noslip", 5),
         # The residual is 1.2 times the noise, and the coarser integrator made the recording.
         ({"change": (OPTIONS, 'integrator="Euler"')}, "numerics.integrator", 0),
     ],
@@ -145,7 +145,8 @@ def test_an_option_that_hardly_shows_is_the_only_cause(tmp_path, arguments, effe
 
 @pytest.mark.slow
 def test_a_solver_that_does_not_converge_is_named_with_its_iterations(tmp_path):
-    answer = explain(write_block_recording(tmp_path, 'solver="PGS" iterations="3"')).answer
+    path = write_block_recording(tmp_path, 'solver="PGS" iterations="3"', samples=100)
+    answer = explain(path).answer
     # Rounding errors grow in such a solver, so that the recording cannot be reproduced exactly.
     assert answer.verdict in ("named", "partial")
     numbers = {cause.effect: cause.coefficients["coefficient"].value for cause in answer.causes}

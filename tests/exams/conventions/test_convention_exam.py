@@ -85,7 +85,6 @@ def test_a_cause_is_no_broken_convention(cause, tmp_path):
 
 def test_an_identity_transform_is_no_difference(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log", SEEDS["sign of both"][0], "sign of both")
-    assert check(log.path).differences() != []
     monkeypatch.setattr(SignalChange, "applied", lambda change, signals: signals[change.source])
     assert check(log.path).differences() == []
 

@@ -177,6 +177,10 @@ def test_a_wrong_unit_is_reported_although_a_friction_is_missing_too(factors, li
     assert found is not None
     assert found.signals == tuple(sorted(factors, reverse=True))
     assert found.lines[0] == line
+
+
+def test_a_missing_friction_is_no_wrong_unit():
+    recording, kind = load_joined([ARM], None, None, ())
     assert find_unit_error(recording=recording, kind=kind) is None
 
 
