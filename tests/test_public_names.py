@@ -6,7 +6,6 @@ import ast
 import subprocess
 import sys
 from pathlib import Path
-from zipfile import ZipFile
 
 import pytest
 
@@ -101,25 +100,6 @@ def test_what_is_installed_exposes_neither_tests_nor_examples(tmp_path):
     said = python(code, tmp_path, PYTHONPATH="")
     assert said.returncode == 0, said.stderr
     assert str(ROOT) not in said.stdout
-
-
-@pytest.mark.slow
-def test_the_wheel_is_typed_for_who_installs_it(tmp_path):
-    """The wheel contains stubs and `py.typed` files for users who run a strict type checker."""
-    built = subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert built.returncode == 0, built.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    names = ZipFile(wheel).namelist()
-    typed = {f"{package}/py.typed" for package in ("bench", "methods", "sims")}
-    assert {"simgap.py", "simgap-stubs/__init__.pyi", *typed} <= set(names)
-    tops = {name.split("/")[0] for name in names if ".dist-info" not in name}
-    assert tops == {"bench", "methods", "sims", "simgap.py", "simgap-stubs"}
 
 
 def test_main_is_the_command_line(capsys):

@@ -11,7 +11,7 @@ import zipfile
 
 import pytest
 
-from tests.packaging.wheel_in_environment import build, environment, find_wheel_errors
+from tests.packaging.wheel_in_environment import PACKAGES, build, environment, find_wheel_errors
 
 EXTRA_TUNERS = {
     *("npe", "turbo", "snpe", "mujoco_sysid"),
@@ -35,6 +35,7 @@ def test_the_wheel_contains_exactly_the_package_files(wheel):
         "bench/experiments/arm2.xml",
         "bench/diagnosis/report/report.css",
         "bench/reference/ball-drop/table.csv",
+        *(f"{package}/py.typed" for package in PACKAGES),
     } <= names
     assert not [name for name in names if name.startswith(("tests/", "examples/", "results/"))]
 

@@ -180,9 +180,8 @@ def robot_log(folder, text, driven, resting, channels, noise):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [5e-4, 0.0])
-def test_a_closed_loop_without_a_cause_is_adequate(tmp_path, noise):
-    path = robot_log(tmp_path, FOUR_BAR, "servo", (), ("crank", "rocker"), noise)
+def test_a_closed_loop_without_a_cause_is_adequate(tmp_path):
+    path = robot_log(tmp_path, FOUR_BAR, "servo", (), ("crank", "rocker"), 0.0)
     assert explain(path).answer.verdict == "adequate"
 
 

@@ -17,7 +17,7 @@ from tests.bench.diagnosis.explained_samples import recording
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
-def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
+def test_the_answer_is_the_same_to_the_last_bit_with_one_and_eight(monkeypatch):
     # Use small chunks and force workers for all of them, so that the pool is tested.
     monkeypatch.setattr(forked_workers, "can_fork", lambda: True)
     monkeypatch.setattr(RunEvaluator, "is_cheap_to_split", True)
@@ -38,14 +38,14 @@ def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypat
         runs=3, seconds=1.0, rate=60.0,
     )  # fmt: skip
     documents = []
-    for jobs in (1, 2, 8):
+    for jobs in (1, 8):
         shared.clear()
         document = explain(swing, jobs=jobs).answer.to_document()
         document.pop("seconds")
         documents.append(json.dumps(document))
         assert set(shared) == ({jobs} if jobs > 1 else set())
         assert jobs == 1 or len(shared) > 10
-    assert documents[0] == documents[1] == documents[2]
+    assert documents[0] == documents[1]
 
 
 @pytest.mark.parametrize("jobs", [0, -2])

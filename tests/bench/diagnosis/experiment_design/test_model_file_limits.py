@@ -1,12 +1,11 @@
 """Tests that proposed runs stay within the limits of the model file."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench.cli.main import main
+import simgap
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import (
@@ -107,47 +106,39 @@ def log(folder, kind, effect, coefficient, size, noise):
     return path
 
 
-def check_proposals(path, out, limits, capsys):
-    """Check that the runs proposed by explain and design keep the limits."""
-    assert main(["explain", str(path), "--out", str(out), "--jobs", "1"]) == 0
-    proposed = json.loads((out / "verdict.json").read_text())["next_experiment"]
-    change = {} if proposed is None else proposed.get("change") or {}
+def check_proposals(path, limits):
+    """Check that the change that explain proposes and the designed run keep the limits."""
+    proposed = simgap.design(path, jobs=1)
+    experiment, design = proposed.explanation.answer.next_experiment, proposed.design
+    change = {} if experiment is None else experiment.to_document().get("change") or {}
     for name, value in change.items():
         if name in limits.states:
             low, high = limits.states[name]
-            assert low <= value <= high, proposed
-    capsys.readouterr()
-    table = out / "next.csv"
-    assert main(["design", str(path), "--out", str(table), "--jobs", "1", "--json"]) == 0
-    design = json.loads(capsys.readouterr().out)["design"]
-    for name, value in design["initial"].items():
+            assert low <= value <= high, experiment
+    for name, value in design.initial.items():
         low, high = limits.states.get(name, UNLIMITED)
-        assert low <= value <= high, design["says"]
-    head = table.read_text().splitlines()[0].split(",")
-    columns = dict(zip(head, np.loadtxt(table, delimiter=",", skiprows=1).T, strict=True))
-    for name, (low, high) in limits.commands.items():
-        if name in columns:
-            assert low - 1e-9 <= columns[name].min(), design["says"]
-            assert columns[name].max() <= high + 1e-9, design["says"]
-    return change, columns
+        assert low <= value <= high, design.says
+    assert limits.commands.keys() & design.inputs.keys()
+    for name in limits.commands.keys() & design.inputs.keys():
+        low, high = limits.commands[name]
+        assert low - 1e-9 <= design.inputs[name].min(), design.says
+        assert design.inputs[name].max() <= high + 1e-9, design.says
 
 
 @pytest.mark.slow
-def test_torques_and_starts_keep_to_the_limits_of_a_urdf(tmp_path, capsys):
+def test_torques_and_starts_keep_to_the_limits_of_a_urdf(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators=MOTOR)
     path = log(tmp_path, kind, "drag.quadratic@hip", 0.06, 0.7, 0.02)
-    limits = SimpleNamespace(
-        commands={"u.m": (-1.0, 1.0)}, states={"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
-    )
-    check_proposals(path, tmp_path / "out", limits, capsys)
+    states = {"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
+    check_proposals(path, SimpleNamespace(commands={"u.m": (-1.0, 1.0)}, states=states))
 
 
 @pytest.mark.slow
-def test_set_points_keep_to_the_limits_of_an_mjcf(tmp_path, capsys):
+def test_set_points_keep_to_the_limits_of_an_mjcf(tmp_path):
     kind = kind_of(tmp_path, MJCF, "arm.xml")
     path = log(tmp_path, kind, "input.lag@s", 0.02, 0.3, 0.006)
     limits = SimpleNamespace(commands={"u.s": (-0.35, 0.4)}, states={"q.hip": (-0.5, 0.4)})
-    check_proposals(path, tmp_path / "out", limits, capsys)
+    check_proposals(path, limits)
 
 
 def test_all_limits_of_a_urdf_are_read(tmp_path):
