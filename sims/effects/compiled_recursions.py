@@ -13,26 +13,31 @@ from sims.core.simulator import Array
 from sims.engines.compiled.array_functions import ArrayFunctions
 from sims.engines.compiled.interpreter import nan_maximum, nan_minimum
 
-LINEAR, CLAMP, RATE_LIMIT = range(3)
-"""Recursions: y' = a y + b; y' = min(max(y, a), b); y' = y + min(max(a - y, -b), b)."""
+LINEAR, CLAMP, RATE_LIMIT, ACCELERATION_LIMIT = range(4)
+"""Recursions: y' = a y + b; y' = min(max(y, a), b); y' = y + min(max(a - y, -b), b).
+
+The fourth one is `move_with_limited_acceleration`.
+"""
 
 
 def run_recursion(kind: int, a: Array, b: Array, start: Array) -> Array:
     """Run a recursion over S steps of L batch elements.
 
     Args:
-        kind: `LINEAR`, `CLAMP` or `RATE_LIMIT`.
-        a: (L, S) first operand of each step.
-        b: (L, S) second operand of each step.
-        start: (L, 1) value before the first step.
+        kind: `LINEAR`, `CLAMP`, `RATE_LIMIT` or `ACCELERATION_LIMIT`.
+        a: (L, S) first operand of each step; for a limited acceleration the set point.
+        b: (L, S) second operand of each step; for a limited acceleration the step length.
+        start: (L, 1) value before the first step; for a limited acceleration (L, 2), the value and
+            the limit.
 
     Returns:
-        Values (L, S) after each step.
+        Values (L, S) after each step; for a limited acceleration means over each step.
     """
     first, second = (
         np.ascontiguousarray(values, dtype=np.float64) for values in np.broadcast_arrays(a, b)
     )
-    begin = np.ascontiguousarray(start, dtype=np.float64).reshape(len(first), 1)
+    begin = np.zeros((len(first), 2))
+    begin[:, : start.shape[1]] = start
     (result,) = COMPILED.call(step_elements, kind, first, second, begin)
     return result
 
@@ -40,6 +45,9 @@ def run_recursion(kind: int, a: Array, b: Array, start: Array) -> Array:
 def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
     """Write the values after each step into `result`; arguments as in `run_recursion`."""
     for i in range(result.shape[0]):
+        if kind == ACCELERATION_LIMIT:
+            move_with_limited_acceleration(a[i], b[i], start[i], result[i])
+            continue
         y = start[i, 0]
         for k in range(result.shape[1]):
             if kind == LINEAR:
@@ -51,9 +59,39 @@ def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
             result[i, k] = y
 
 
+def move_with_limited_acceleration(commands: Any, steps: Any, start: Any, means: Any) -> None:
+    """Write the means over each step of a set point that is limited in acceleration.
+
+    The speed w at the end of a step is chosen such that the remaining distance is sufficient for
+    stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
+
+    Args:
+        commands: (S,) set point before the limit.
+        steps: (S,) lengths h in seconds.
+        start: position before the first step, and the limit c of the acceleration.
+        means: (S,) result.
+    """
+    position, limit, speed = start[0], start[1], 0.0
+    for k in range(commands.shape[0]):
+        h = steps[k]
+        gain = limit * h
+        deviation = commands[k] - position
+        direction = np.copysign(1.0, deviation)
+        remaining, directed_speed = abs(deviation), direction * speed
+        braking_distance = h * directed_speed
+        one_step_speed = (remaining - 0.5 * braking_distance) / h if h > 0.0 else 0.0
+        square = 0.25 * gain * gain + limit * (2.0 * remaining - braking_distance)
+        braking_speed = nan_maximum(np.sqrt(nan_maximum(square, 0.0)) - 0.5 * gain, gain)
+        next_speed = nan_maximum(nan_minimum(one_step_speed, braking_speed), directed_speed - gain)
+        next_speed = direction * nan_minimum(next_speed, directed_speed + gain)
+        travel = 0.5 * h * (speed + next_speed)
+        means[k] = position + (travel + 0.5 * h * speed) / 3.0
+        position, speed = position + travel, next_speed
+
+
 COMPILED = ArrayFunctions(
     __name__,
     "the effects with memory",
-    {step_elements: ("#", "ls", "ls", "l1", "ls")},
+    {step_elements: ("#", "ls", "ls", "l2", "ls")},
     can_run_uncompiled=True,
 )

@@ -43,6 +43,7 @@ import numpy as np
 from sims.core.effect import Coefficient, Force, Input, Signal
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
+from sims.effects.compiled_recursions import ACCELERATION_LIMIT, run_recursion
 
 _SET_POINT_UNITS = ("m/s^2", "m", "rad")
 """Units of a set point; point systems have no servo."""
@@ -121,43 +122,9 @@ class ServoMotionProfile(Input):
             signal: signal (L, S) over the steps.
         """
         limit = np.maximum(c[0], 0.0)
-        return np.where(limit > 0, _apply_acceleration_limit(signal, limit[:, 0]), signal.values)
-
-
-def _apply_acceleration_limit(signal: Signal, max_acceleration: Array) -> Array:
-    """Return the set point limited in acceleration (3), as means (L, S) over each step.
-
-    The speed w at the end of a step is chosen such that the remaining distance is sufficient for
-    stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
-
-    Args:
-        signal: the set point before the effect.
-        max_acceleration: (L,) limit c of the acceleration, in units of the set point per s².
-    """
-    commands, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
-    means = np.empty_like(commands)
-    gains = max_acceleration * steps
-    inverses = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)
-    rows = zip(commands, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
-    position, speed = signal.start[:, 0].copy(), np.zeros(commands.shape[1])
-    # The loop has thousands of steps of a few elements: everything possible is computed before it.
-    for row, h, gain, half_gain, squared_gain, inverse, mean in rows:
-        deviation = row - position
-        direction = np.copysign(1.0, deviation)
-        remaining, directed_speed = np.abs(deviation), direction * speed
-        braking_distance = h * directed_speed
-        one_step_speed = inverse * (remaining - 0.5 * braking_distance)
-        root = np.maximum(
-            squared_gain + max_acceleration * (2.0 * remaining - braking_distance), 0.0
-        )
-        braking_speed = np.maximum(np.sqrt(root) - half_gain, gain)
-        limited_speed = np.maximum(np.minimum(one_step_speed, braking_speed), directed_speed - gain)
-        next_speed = direction * np.minimum(limited_speed, directed_speed + gain)
-        travel = 0.5 * h * (speed + next_speed)
-        np.add(position, (travel + 0.5 * h * speed) / 3.0, out=mean)
-        position = position + travel
-        speed = next_speed
-    return means.T
+        start = np.column_stack([signal.start[:, 0], limit[:, 0]])
+        means = run_recursion(ACCELERATION_LIMIT, signal.values, signal.steps, start)  # (3)
+        return np.where(limit > 0, means, signal.values)
 
 
 def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
