@@ -96,6 +96,8 @@ MAX_CHANNEL_SIZE_FACTOR = 1e9
 """Recorded values of at least this multiple of a channel's typical size are refused."""
 MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
 """Maximum excess over the noise, as a share of that of the base model, with right units."""
+MAX_EXCESS_SHARE_OF_INCOMPLETE = 0.5
+"""Maximum excess, likewise, of a model that stays incomplete with right units, too."""
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
 MAX_LINEAR_RESIDUAL = 3.0
@@ -113,6 +115,10 @@ MAX_FITTED_OPTIONS = 3
 """Maximum number of alternative options that are fitted in a round."""
 RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
 """Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
+MAX_SUBSET_EFFECTS = 3
+"""Maximum number of effects of which all subsets are fitted with another time step."""
+REFIT_ITERATIONS = 3
+"""Maximum number of steps of the fit of more effects with another time step."""
 MAX_ROTATION_ERROR = 0.5
 """Maximum error in rad of the simulated orientation of a floating body.
 
@@ -692,7 +698,14 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
 
-        return answer(Confirmation(search, self.validation))
+        declared_bounds = {p.name: p.bounds for p in self.fitting.parameters}
+        result = answer(Confirmation(search, self.validation))
+        bounds = {p.name: p.bounds for p in self.fitting.parameters}
+        self._widen_ranges(
+            {name: bounds[name] for name in bounds if bounds[name] != declared_bounds[name]},
+            declared_bounds | {name: declared for name, (declared, _) in self.wider.items()},
+        )
+        return result
 
     def _check_units_of_unexplained(
         self, search: EffectSearch, finding: DiagnosisResult
@@ -711,7 +724,12 @@ class _ExplainRun:
         remaining_excess = search.compute_excess_residual(finding.model)
         base_excess = search.compute_excess_residual(search.base_model)
         # With a wrong unit or sign, effects would leave more of the discrepancy.
-        if remaining_excess < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * base_excess:
+        max_share = (
+            MAX_EXCESS_SHARE_OF_INCOMPLETE
+            if finding.is_incomplete
+            else MAX_EXCESS_SHARE_WITH_RIGHT_UNITS
+        )
+        if remaining_excess < max_share * base_excess:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.fixed_parameters))
         fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
@@ -1286,7 +1304,10 @@ class _ExplainRun:
     def _rate_best_subset(
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[float, float]:
-        """Fit all subsets of a finding's effects with the present step, and rate the best model.
+        """Fit subsets of a finding's effects with the present step, and rate the best model.
+
+        All subsets are fitted if there are only few effects; otherwise all effects together, with
+        few iterations, and none.
 
         Args:
             search: search with another step, whose fixed parameters stay fixed.
@@ -1297,8 +1318,8 @@ class _ExplainRun:
         """
         names, fit = finding.model.effects, finding.model.fit
         coefficient_slices = self.fitting.coefficient_slices
-        starts = []
-        for count in range(len(names) + 1):
+        starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
+        for count in range(len(names) + 1) if has_few_effects else (0, len(names)):
             for subset in combinations(names, count):
                 theta = fit.theta.copy()
                 for omitted in set(names) - set(subset):
@@ -1307,7 +1328,7 @@ class _ExplainRun:
                     ]
                 starts.append(FitStart(subset, theta, fit.initial_states))
         fits = TrajectoryFitter(self.fitting, self.noise, search.fixed_parameters).fit_models(
-            starts, MAX_ITERATIONS
+            starts, MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS
         )
         models = self._create_search(
             BaseFit(search.base_model.fit, search.fixed_parameters), self._make_rng()

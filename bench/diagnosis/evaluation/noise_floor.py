@@ -145,7 +145,7 @@ def add_minimal_noise(recording: Recording, channels: Sequence[str]) -> tuple[Re
 
 
 def _compute_added_noise(recording: Recording, name: str) -> float:
-    """Return the standard deviation of the noise to add; 0 for noisy or constant channels.
+    """Return the standard deviation of noise to add; 0 for noisy, quantised or constant channels.
 
     Args:
         recording: the recording.
@@ -155,6 +155,9 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
     min_sigma = INTEGRATION_ERROR_SHARE * compute_value_range(values)
     if min_sigma < MIN_SIGMA:
+        return 0.0
+    # A quantised channel has the noise of its steps, also while the robot rests.
+    if estimate_noise(signals).step > min_sigma:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.
     sigma = estimate_differences_sigma(signals, DIFFERENCE_ORDER)

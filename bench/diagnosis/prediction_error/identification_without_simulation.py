@@ -91,11 +91,14 @@ class IdentifiedSet:
 
     Attributes:
         model: the set, simulated with these parameters.
-        gains: loss in twice the log-likelihood of the innovations without each effect, by name.
+        gains: loss in twice the log-likelihood without each effect, by name: of the innovations, or
+            of the positions of a servo's joint.
+        is_residual_tested: whether the innovations can show which force the set lacks.
     """
 
     model: FittedModel
     gains: dict[str, float]
+    is_residual_tested: bool = True
 
 
 def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
@@ -132,7 +135,9 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
             break
     if not current.names or not current.followed.has_missing_force:
         return None
-    return IdentifiedSet(_simulate_set(context, current), gains)
+    states = context.filters.estimate_first_states(current.followed)
+    start = FitStart(current.names, current.followed.theta, states)
+    return IdentifiedSet(simulate_identified(context, start), gains)
 
 
 def is_long(evaluator: RunEvaluator) -> bool:
@@ -315,16 +320,14 @@ def _list_single_effects(context: SearchContext) -> Columns:
     return library.subset(chosen)
 
 
-def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
-    """Simulate the runs with the parameters of a filter, from fitted initial states.
+def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
+    """Simulate the runs with identified parameters, from fitted initial states.
 
     Args:
-        context: search, filters and regressions of the recording.
-        current: the set, with its filter.
+        context: context of the search.
+        start: the parameters, and estimates of the initial states.
     """
     evaluator, search = context.evaluator, context.search
-    theta, states = current.followed.theta, context.filters.estimate_first_states(current.followed)
-    start = FitStart(current.names, theta, states)
     (fitted_states,) = TrajectoryFitter(
         evaluator, search.noise, search.fixed_parameters, fits_parameters=False
     ).fit_models([start], MAX_STATE_ITERATIONS)

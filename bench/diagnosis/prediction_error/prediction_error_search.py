@@ -4,9 +4,10 @@
 fitted to whole simulated runs (output errors), which decide. The search ends as soon as the
 residual of a set is only noise. The order is:
 
-    1. Select effects with few shapes by regression. Fit the dry friction among them first, because
-       it is not linear where a joint sticks (`dry_friction_fits`), and then the set
-       (`simulated_fits`).
+    1. Select effects with few shapes by regression. If the selection leaves a large residual of a
+       robot with servos, identify the servos (`servo_identification`), and do nothing of the
+       following. Otherwise fit the dry friction among them first, because it is not linear where a
+       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
        is missing (`simulated_fits`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
@@ -47,16 +48,26 @@ from bench.diagnosis.prediction_error.dry_friction_fits import (
     fit_dry_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, has_series
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    FilteredSet,
+    acts_at_joint,
+    has_series,
+)
 from bench.diagnosis.prediction_error.identification_without_simulation import (
     IdentifiedSet,
     identify_incomplete,
+    simulate_identified,
 )
 from bench.diagnosis.prediction_error.regression_columns import build_regression_about
 from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
     compute_p_value_of_gain,
     score_by_regression,
+)
+from bench.diagnosis.prediction_error.servo_identification import (
+    MIN_EXCESS,
+    has_servos_alone,
+    identify_servos,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
@@ -79,6 +90,8 @@ from bench.diagnosis.search.start_selection import add_effect_to_start
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
 
+MIN_INCOMPLETE_SHARE = 0.6
+"""Minimum share of the joints of a real arm whose servo or friction the model lacks."""
 TRIED_SHARES = (1.0, 0.5)
 """Shares of the regression coefficients with which a filter must follow the runs better."""
 
@@ -133,6 +146,9 @@ class PredictionErrorSearch(EffectSearch):
         selected = context.columns.select()
         if not self.is_form_given:
             check_selection(context, selected)
+        self.identified = self._identify_servos(selected)
+        if self.identified is not None:
+            return self.identified.model
         friction = fit_dry_friction(context, selected)
         best = friction
         if not is_explained(context, best):
@@ -150,6 +166,41 @@ class PredictionErrorSearch(EffectSearch):
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
         return best
+
+    def _identify_servos(self, selected: Selected) -> IdentifiedSet | None:
+        """Identify the servos of a real arm, whose model is incomplete at most joints.
+
+        Args:
+            selected: the selection by regression.
+
+        Returns:
+            The identified set; None if the robot has other drives, if the base model or the
+            selection leaves a small residual, or if other effects than those of the servos may be
+            missing.
+        """
+        context = self._search_context
+        if not self.compute_excess_residual(self.base_model) > MIN_EXCESS or not has_servos_alone(
+            context
+        ):
+            return None
+        best = fit_quick_selection(context, selected)
+        excess = self.compute_excess_residual(best)
+        if is_nearly_explained(context, best) or not excess > MIN_EXCESS:
+            return None
+        start, gains = identify_servos(context)
+        joints = range(len(self.evaluator.channels))
+        incomplete_joints = [
+            joint
+            for joint in joints
+            if any(acts_at_joint(self.evaluator, name, {joint}) for name in start.effects)
+        ]
+        model = simulate_identified(context, start)
+        if (
+            len(incomplete_joints) < MIN_INCOMPLETE_SHARE * len(joints)
+            or not self.compute_excess_residual(model) < excess
+        ):
+            return None
+        return IdentifiedSet(model, gains, is_residual_tested=False)
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

@@ -6,12 +6,13 @@
 4. Collect other effects that explain the data as well.
 5. Determine the verdict by the rules of `bench.diagnosis.search.verdict_rules`.
 
-A set that filters identified in a long recording is simulated as it is, without step 1, 2 and 4.
+A set that filters identified in a long recording, or that was identified servo by servo, is
+simulated as it is, without step 1, 2 and 4.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.prediction_error.identification_without_simulation import IdentifiedSet
@@ -21,7 +22,7 @@ from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEv
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
-from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, assess_residual_size
 from bench.diagnosis.search.verdict_rules import DiagnosisState, decide_verdict, is_unexplained
 from bench.diagnosis.validation.held_out_runs import Validation
 
@@ -118,7 +119,11 @@ class Confirmation(Inquiry):
             trial = self._trial = HeldOutValidation(self._held_out)
             trial.evaluate_models([search.base_model, model])
         search_control.begin_question("structure")
-        lack_of_fit = assess_lack_of_fit(search, model)
+        if identified.is_residual_tested:
+            lack_of_fit = assess_lack_of_fit(search, model)
+        else:
+            # It is far above the noise, and counts as structure.
+            lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(model.effects),
@@ -131,7 +136,8 @@ class Confirmation(Inquiry):
             key=lambda cause: -cause.gain,
         )
         verdict = decide_verdict(state)
-        return self._make_result(verdict, search.base_model, model, tuple(causes), lack_of_fit)
+        result = self._make_result(verdict, search.base_model, model, tuple(causes), lack_of_fit)
+        return replace(result, is_incomplete=True)
 
     def _cause(self, name: str, gain: float) -> CauseEvidence:
         """Return the evidence for an effect whose gain is that of filters.

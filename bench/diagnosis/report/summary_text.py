@@ -147,7 +147,9 @@ def format_headline(report: DiagnosisReportData) -> str:
             f"These data do not identify {parameters}: it is not known what the simulation lacks."
         )
     if verdict == "unknown" or not causes:
-        conclusion = f"none of the {len(rank_candidates(report))} known causes explains it"
+        count = len(rank_candidates(report))
+        known = f"none of the {count} known causes" if count else "no set of known causes"
+        conclusion = f"{known} explains it"
         conclusion += " at any place" if has_placed_causes(report) else ""
         return f"Something is missing from the simulation, and {conclusion}."
     if verdict == "ambiguous":

@@ -58,6 +58,8 @@ class DiagnosisResult:
         unidentified_parameters: names of base parameters that the data do not determine.
         held_out_fits: models on held-out runs, by their effects; None if there are none.
         early_stop: early end of the search with its open questions; None if it was completed.
+        is_incomplete: whether the model stays incomplete, so that its effects were identified
+            without a search for the set that explains the recording.
     """
 
     verdict: VerdictName
@@ -68,6 +70,7 @@ class DiagnosisResult:
     unidentified_parameters: tuple[str, ...] = ()
     held_out_fits: Mapping[EffectNames, HeldOutFit] | None = None
     early_stop: EarlyStop | None = None
+    is_incomplete: bool = False
 
 
 def diagnose(search: EffectSearch, held_out: Validation | None) -> DiagnosisResult:

@@ -63,6 +63,21 @@ def test_rounding_of_a_file_is_not_noise(digits):
     assert add_minimal_noise(replace(made, runs=tuple(rounded)), ["q"])[1] == ["q"]
 
 
+def test_a_quantised_channel_at_rest_gets_no_noise():
+    """More than half of the samples are equal, so that their differences show no noise."""
+    made = recording(runs=2, seconds=2)
+    step = 0.002
+
+    def hold_and_round(v):
+        return np.round(np.where(np.arange(v.size) < 0.7 * v.size, v[0], v) / step) * step
+
+    rounded = [changed(run, q=hold_and_round) for run in made.runs]
+    made = replace(made, runs=tuple(rounded), noise={})
+    assert add_minimal_noise(made, ["q"])[1] == []
+    floor = compute_noise_floor(evaluator(made, candidates=[]), made)
+    assert floor.sigma[0] == pytest.approx(step / 12**0.5)
+
+
 def test_a_channel_that_never_changes_has_the_noise_of_what_no_sample_tells_of():
     made = recording(runs=2, seconds=1, noise=["0.001"])
     still = [changed(run, qd=lambda v: np.zeros_like(v)) for run in made.runs]

@@ -1,0 +1,690 @@
+"""Identify the servos of a robot by simulation, those of all joints at once.
+
+The model of a real robot with position servos is incomplete at every joint, and its encoders are
+usually sampled too slowly for a filter to see the servos' own dynamics. A servo holds its joint
+near the command, so that the motion of a joint hardly depends on the parameters of other joints.
+The Jacobian of the simulated positions is then nearly block-diagonal, and one simulation in which
+one parameter of every joint is displaced gives a column of every block (A. R. Curtis, M. J. D.
+Powell, J. K. Reid, J. Inst. Maths Applics 13, 117, 1974, doi:10.1093/imamat/13.1.117).
+
+    1. Fit stiffness and damping of every servo, and then the dry friction of every joint.
+    2. Simulate every other law at all joints with several coefficients, and estimate its gain at
+       each joint by least squares.
+    3. Fit the laws that gain most. At each joint, add the best one if it reduces the squared
+       residual enough, also without the run that gains most.
+    4. Try the laws of the joint that improved most at the other joints.
+    5. Repeat from 2 until no law reduces a residual enough.
+
+Only parameters of a joint's own servo, transmission and sensor are fitted to its position. What
+couples the joints, such as masses and gravity, stays as the model file states it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    compute_coefficient_bounds,
+    is_unusual,
+)
+from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
+from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_step import RIDGE_SHARE
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    SERVO_MODEL,
+    get_joint_name,
+    get_servo_input,
+)
+from sims.core.simulator import Array
+
+DRY_FRICTION = "friction.coulomb"
+"""Effect that is tried first, at every joint."""
+MIN_EXCESS = 30.0
+"""Minimum excess of the best model so far, in units of the noise, that real servos may leave."""
+MIN_JOINTS = 4
+"""Minimum number of joints; fewer are identified by filters, or by a search over all effects."""
+MAX_COEFFICIENTS = 1
+"""Maximum number of coefficients of a law that is added."""
+TRIED_SHARES = (0.1, 0.4)
+"""Coefficients at which a law is simulated, as shares of its usual range."""
+SCALE_LIMITS = (0.1, 2.0)
+"""Limits of the factor by which least squares may scale a simulated law."""
+MAX_FITTED_LAWS = 3
+"""Number of laws per joint that are fitted in each round."""
+COMPETING_SHARE = 0.5
+"""Minimum estimated gain of a further law that is fitted, as a share of that of the best one."""
+MIN_ESTIMATED_GAIN = 0.03
+"""Minimum estimated decrease of a joint's squared residual, as a share, of a law that is fitted."""
+MIN_GAIN = 0.15
+"""Minimum decrease of a joint's squared residual, as a share, by a law that is added."""
+MIN_OTHER_GAIN = 0.05
+"""Minimum decrease by such a law in the runs without the one that gains most."""
+MAX_ROUNDS = 2
+"""Maximum number of laws that are added to a joint."""
+FIRST_ITERATIONS = 20
+"""Maximum number of steps of the first fit."""
+TRIAL_ITERATIONS = 8
+"""Maximum number of steps of a fit with one more law."""
+SHARED_ITERATIONS = 10
+"""Maximum number of steps of a fit of several laws at once."""
+SHARED_FACTORS = (0.3, 1.0, 3.0)
+"""Factors of the coefficients of another joint from which a joint is fitted."""
+FINAL_ITERATIONS = 6
+"""Maximum number of steps of the fit to all runs."""
+CONVERGED_SHARE = 3e-3
+"""Decrease of a joint's squared residual by a step, as a share, at which its fit ends."""
+STEP_SHARE = 1e-3
+"""Difference step of a parameter, as a share of its total or of its usual range."""
+INITIAL_DAMPING, MAX_DAMPING = 1e-3, 1e3
+"""Levenberg-Marquardt damping at the first step, and that at which the fit of a joint ends."""
+DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 10.0
+"""Factors of the damping after an accepted and after a rejected step."""
+MAX_REJECTIONS = 3
+"""Maximum number of steps in a row that no joint accepts."""
+SEARCHED_RUNS = 9
+"""Maximum number of runs, spread over the recording, by which laws are chosen."""
+FAILED_RESIDUAL = 1e4
+"""Residual, in units of the noise, of a sample that was not simulated."""
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """Laws and parameters of the servos of n joints.
+
+    Attributes:
+        theta: (P,) parameters of the robot.
+        laws: names of the effects at each joint.
+        simulated: (R, T, n) positions.
+        costs: (n,) sum of squared residuals of each position, in units of its noise.
+    """
+
+    theta: Array
+    laws: tuple[tuple[str, ...], ...]
+    simulated: Array
+    costs: Array
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of all effects."""
+        return tuple(name for laws in self.laws for name in laws)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A law with simulated coefficients.
+
+    Attributes:
+        gain: estimated decrease of the joint's squared residual, as a share.
+        name: the effect.
+        coefficients: (k,) its coefficients.
+        parameters: values of the joint's other parameters that belong to them to first order.
+    """
+
+    gain: float
+    name: str
+    coefficients: Array
+    parameters: Array
+
+
+def has_servos_alone(context: SearchContext) -> bool:
+    """Return whether a robot has several joints, all of them with position servos and encoders.
+
+    Args:
+        context: context of the search.
+    """
+    evaluator = context.evaluator
+    coordinates = evaluator.simulator.system.coordinates
+    return (
+        len(coordinates) >= MIN_JOINTS
+        and set(coordinates) == set(evaluator.channels)
+        and all(get_servo_input(evaluator, joint) for joint in range(len(coordinates)))
+    )
+
+
+def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]:
+    """Identify the servos of a robot that `has_servos_alone`.
+
+    Args:
+        context: context of the search.
+
+    Returns:
+        The effects with all parameters, and the gain of each effect: the loss in twice the
+        log-likelihood without it, if the residual is white. The ranges of the base parameters are
+        widened to contain their values.
+    """
+    evaluator = context.evaluator
+    evaluator.search_control.begin_stage("identifying the servos")
+    all_runs = np.arange(len(evaluator.prepared_runs))
+    spread = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
+    fitter = _ServoFitter(context, spread.round().astype(np.intp))
+    joint_model = model = fitter.fit_joint_model()
+    growing = set(range(len(evaluator.channels)))
+    for number in range(MAX_ROUNDS):
+        if not growing or evaluator.search_control.is_over():
+            break
+        evaluator.search_control.begin_stage(f"identifying the servos, round {number + 1}")
+        larger = fitter.add_laws(model, growing)
+        growing = {joint for joint in growing if larger.laws[joint] != model.laws[joint]}
+        model = fitter.share_laws(larger, joint_model)
+    final_fitter = _ServoFitter(context, all_runs)
+    model = final_fitter.fit(final_fitter.simulate(model.theta, model.laws), FINAL_ITERATIONS)
+    gains = final_fitter.compute_gains(model)
+    theta = model.theta.copy()
+    for name in set(model.effects) - set(gains):
+        theta[evaluator.coefficient_slices[name]] = 0.0
+    use_bounds(
+        evaluator,
+        {
+            evaluator.parameters[i].name: compute_range_around(evaluator, i, theta[i])
+            for i in evaluator.base_indices.tolist()
+            if is_unusual(float(theta[i]), *evaluator.parameters[i].bounds)
+        },
+    )
+    states = context.search.base_model.fit.initial_states
+    return FitStart(tuple(gains), theta, states), gains
+
+
+@dataclass(frozen=True)
+class _ServoFitter:
+    """Fits the parameters of each joint to its own position.
+
+    Attributes:
+        context: context of the search.
+        runs: (R,) indices of the runs.
+    """
+
+    context: SearchContext
+    runs: Indices
+
+    @property
+    def _evaluator(self) -> RunEvaluator:
+        return self.context.evaluator
+
+    @cached_property
+    def _mask(self) -> Array:
+        """Mask (R, T, n) of the recorded positions, in the order of the joints."""
+        return np.isfinite(self._observed)
+
+    @cached_property
+    def _channels(self) -> list[int]:
+        """Index of each joint's position among the channels."""
+        coordinates = self._evaluator.simulator.system.coordinates
+        return [self._evaluator.channels.index(name) for name in coordinates]
+
+    @cached_property
+    def _observed(self) -> Array:
+        observed: Array = self._evaluator.observed[self.runs][:, :, self._channels]
+        return observed
+
+    @cached_property
+    def _sigma(self) -> Array:
+        sigma: Array = np.asarray(self.context.search.noise.sigma)[self._channels]
+        return sigma
+
+    @cached_property
+    def _joints(self) -> range:
+        return range(len(self._channels))
+
+    @cached_property
+    def _places(self) -> list[tuple[str, str, str]]:
+        """Joint, actuator and position channel of each joint."""
+        evaluator = self._evaluator
+        return [
+            (
+                name := get_joint_name(evaluator, joint),
+                get_servo_input(evaluator, joint).partition(".")[2],
+                f"q.{name}",
+            )
+            for joint in self._joints
+        ]
+
+    @cached_property
+    def _laws_at_joint(self) -> list[dict[str, str]]:
+        """Effects of each joint's servo, transmission and sensor with few coefficients, by law."""
+        evaluator = self._evaluator
+        result: list[dict[str, str]] = []
+        for places in self._places:
+            names = [name for name in evaluator.library if name.partition("@")[2] in places]
+            result.append(
+                {
+                    name.partition("@")[0]: name
+                    for name in names
+                    if len(evaluator.get_coefficient_indices(name)) <= MAX_COEFFICIENTS
+                    and evaluator.available_effects[name].hook != "hidden"
+                }
+            )
+        return result
+
+    @cached_property
+    def _base_parameters(self) -> list[list[int]]:
+        """Indices of the free base parameters of each joint's servo."""
+        by_name = {self._evaluator.parameters[i].name: i for i in self._evaluator.base_indices}
+        return [
+            [by_name[name] for law in SERVO_MODEL if (name := f"{law}@{actuator}") in by_name]
+            for _, actuator, _ in self._places
+        ]
+
+    def _list_parameters(self, joint: int, laws: Sequence[str]) -> list[int]:
+        """Return the indices of the parameters that are fitted to the position of a joint."""
+        indices = list(self._base_parameters[joint])
+        for name in laws:
+            indices += self._evaluator.get_coefficient_indices(name)
+        return indices
+
+    def _get_bounds(self, joint: int, laws: Sequence[str]) -> list[Bounds]:
+        """Return the bounds of the parameters of a joint."""
+        evaluator = self._evaluator
+        bounds: list[Bounds] = [
+            compute_range_around(evaluator, i) for i in self._base_parameters[joint]
+        ]
+        for name in laws:
+            bounds += compute_coefficient_bounds(evaluator, name)
+        return bounds
+
+    def fit_joint_model(self) -> ServoModel:
+        """Fit the servos, and then dry friction at the joints whose residual it reduces."""
+        servo_laws = [
+            tuple(laws[law] for law in SERVO_MODEL if law in laws) for laws in self._laws_at_joint
+        ]
+        start = self.simulate(self.context.search.base_model.fit.theta, servo_laws)
+        model = self.fit(start, FIRST_ITERATIONS)
+        theta, laws = model.theta.copy(), list(model.laws)
+        for joint, available in enumerate(self._laws_at_joint):
+            if DRY_FRICTION in available:
+                laws[joint] = (*laws[joint], available[DRY_FRICTION])
+                slot = self._evaluator.coefficient_slices[available[DRY_FRICTION]]
+                theta[slot] = TRIED_SHARES[0] * self._evaluator.parameters[slot.start].bounds[1]
+        larger = self.fit(self.simulate(theta, laws), FIRST_ITERATIONS)
+        helped = {joint: larger for joint in self._joints if self._helps(model, larger, joint)}
+        return self._join(model, helped)
+
+    def simulate(self, theta: Array, laws: Sequence[tuple[str, ...]]) -> ServoModel:
+        """Simulate the runs from the initial states of the base model."""
+        states = self.context.search.base_model.fit.initial_states[self.runs]
+        thetas = np.tile(theta, (self.runs.size, 1))
+        simulated = self._evaluator.simulate(thetas, self.runs, states)[:, :, self._channels]
+        residual = self._compute_residual(simulated)
+        costs: Array = np.square(residual).sum(axis=(0, 1))
+        return ServoModel(theta, tuple(laws), simulated, costs)
+
+    def _compute_residual(self, simulated: Array) -> Array:
+        """Return the residual (R, T, n) in units of the noise; zero where nothing was recorded."""
+        residual = np.nan_to_num((self._observed - simulated) / self._sigma, nan=FAILED_RESIDUAL)
+        masked: Array = np.where(self._mask, residual, 0.0)
+        return masked
+
+    def _compute_change(self, other: ServoModel, model: ServoModel, joint: int) -> Array:
+        """Return by how much the position (R T,) of a joint differs, in units of the noise."""
+        change = (other.simulated - model.simulated)[:, :, joint] / self._sigma[joint]
+        masked: Array = np.where(self._mask[:, :, joint], np.nan_to_num(change), 0.0).ravel()
+        return masked
+
+    def _compute_jacobians(self, model: ServoModel, joints: Sequence[int]) -> dict[int, Array]:
+        """Compute the block of the Jacobian of each joint by forward differences.
+
+        Args:
+            model: the model about which parameters are displaced.
+            joints: the joints whose blocks are computed.
+
+        Returns:
+            The block (R T, k) of each joint with its k parameters.
+        """
+        places = {joint: self._list_parameters(joint, model.laws[joint]) for joint in joints}
+        size = self._mask[:, :, 0].size
+        blocks = {joint: np.empty((size, len(places[joint]))) for joint in joints}
+        for number in range(max(map(len, places.values()))):
+            theta, steps = model.theta.copy(), dict[int, float]()
+            for joint, indices in places.items():
+                if number < len(indices):
+                    steps[joint] = self._compute_difference(model.theta, joint, indices[number])
+                    theta[indices[number]] += steps[joint]
+            displaced = self.simulate(theta, model.laws)
+            for joint, step in steps.items():
+                change = self._compute_change(displaced, model, joint)
+                blocks[joint][:, number] = change / step
+        return blocks
+
+    def _compute_difference(self, theta: Array, joint: int, index: int) -> float:
+        """Return the difference step of a parameter, away from its upper bound."""
+        low, high = self._evaluator.parameters[index].bounds
+        is_share = index in self._base_parameters[joint]
+        size = abs(1.0 + theta[index]) if is_share else max(abs(theta[index]), high - low)
+        step = STEP_SHARE * float(size)
+        return step if theta[index] + step <= high else -step
+
+    def fit(
+        self, model: ServoModel, iterations: int, joints: Sequence[int] | None = None
+    ) -> ServoModel:
+        """Fit the parameters of joints by Levenberg-Marquardt steps, all joints at once.
+
+        A joint accepts a step if it reduces the joint's own squared residual.
+
+        Args:
+            model: the start.
+            iterations: maximum number of steps.
+            joints: the joints to fit; None for all.
+        """
+        damping = dict.fromkeys(self._joints if joints is None else joints, INITIAL_DAMPING)
+        for _ in range(iterations):
+            if not damping or self._evaluator.search_control.is_over():
+                break
+            stepped = self._step(model, damping)
+            if stepped is None:
+                break
+            decrease = model.costs - stepped.costs
+            accepted = [joint for joint in damping if decrease[joint] > 0.0]
+            converged = [j for j in accepted if decrease[j] < CONVERGED_SHARE * model.costs[j]]
+            model = stepped
+            for joint in list(damping):
+                if joint in converged or damping[joint] > MAX_DAMPING:
+                    del damping[joint]
+        return model
+
+    def _step(self, model: ServoModel, damping: dict[int, float]) -> ServoModel | None:
+        """Return the model after a step of the joints that accept it; None if none does.
+
+        Args:
+            model: the present model.
+            damping: damping of each joint that is fitted; it is changed.
+        """
+        blocks = self._compute_jacobians(model, list(damping))
+        residual = self._compute_residual(model.simulated)
+        for _ in range(MAX_REJECTIONS):
+            theta = model.theta.copy()
+            for joint, block in blocks.items():
+                indices = self._list_parameters(joint, model.laws[joint])
+                theta[indices] = self._step_parameters(
+                    model, joint, block, residual[:, :, joint].ravel(), damping[joint]
+                )
+            trial = self.simulate(theta, model.laws)
+            accepted = {joint for joint in blocks if trial.costs[joint] < model.costs[joint]}
+            for joint in blocks:
+                factor = DAMPING_DECREASE if joint in accepted else DAMPING_INCREASE
+                damping[joint] *= factor
+            if accepted:
+                return self._join(model, dict.fromkeys(accepted, trial))
+        return None
+
+    def _step_parameters(
+        self, model: ServoModel, joint: int, block: Array, residual: Array, damping: float = 0.0
+    ) -> Array:
+        """Return the parameters of a joint after a step of damped least squares, within bounds.
+
+        Args:
+            model: the present model.
+            joint: the joint.
+            block: (R T, k) its block of the Jacobian.
+            residual: (R T,) its residual.
+            damping: damping λ.
+        """
+        laws = model.laws[joint]
+        present = model.theta[self._list_parameters(joint, laws)]
+        stepped = present + _solve_damped(block, residual, damping)
+        clipped: Array = np.clip(stepped, *np.array(self._get_bounds(joint, laws)).T)
+        return clipped
+
+    def _join(self, model: ServoModel, chosen: Mapping[int, ServoModel]) -> ServoModel:
+        """Return the model in which some joints have the parameters and laws of other models."""
+        theta, laws = model.theta.copy(), list(model.laws)
+        for joint, other in chosen.items():
+            for name in laws[joint]:
+                theta[self._evaluator.coefficient_slices[name]] = 0.0
+            laws[joint] = other.laws[joint]
+            indices = self._list_parameters(joint, laws[joint])
+            theta[indices] = other.theta[indices]
+        for other in chosen.values():
+            if np.array_equal(other.theta, theta):
+                return replace(other, laws=tuple(laws))
+        return self.simulate(theta, laws)
+
+    def add_laws(self, model: ServoModel, joints: Collection[int]) -> ServoModel:
+        """Add to each joint the law that reduces its squared residual most, and fit all joints.
+
+        Args:
+            model: the fitted model.
+            joints: the joints to which laws are added.
+
+        Returns:
+            The fitted larger model; the given one if no law reduces a residual enough.
+        """
+        trials = self._estimate_gains(model, joints)
+        best = dict[int, ServoModel]()
+        for number in range(MAX_FITTED_LAWS):
+            chosen = {
+                joint: at_joint[number]
+                for joint, at_joint in trials.items()
+                if number < len(at_joint)
+            }
+            if not chosen or self._evaluator.search_control.is_over():
+                break
+            theta, laws = model.theta.copy(), list(model.laws)
+            for joint, trial in chosen.items():
+                laws[joint] = (*laws[joint], trial.name)
+                theta[self._evaluator.coefficient_slices[trial.name]] = trial.coefficients
+            start = self.simulate(theta, laws)
+            for joint, trial in chosen.items():
+                theta[self._list_parameters(joint, model.laws[joint])] = trial.parameters
+            adapted = self.simulate(theta, laws)
+            nearer = [joint for joint in chosen if adapted.costs[joint] < start.costs[joint]]
+            start = self._join(start, dict.fromkeys(nearer, adapted))
+            fitted = self.fit(start, TRIAL_ITERATIONS, list(chosen))
+            for joint in chosen:
+                present = best.get(joint, model)
+                if fitted.costs[joint] < present.costs[joint] and self._helps(model, fitted, joint):
+                    best[joint] = fitted
+        if not best:
+            return model
+        return self.fit(self._join(model, best), TRIAL_ITERATIONS)
+
+    def share_laws(self, model: ServoModel, joint_model: ServoModel) -> ServoModel:
+        """Try the laws of the joint that improved most at all other joints.
+
+        Robots often have the same servo at several joints, and another law at one of them may be a
+        local optimum.
+
+        Args:
+            model: the fitted model.
+            joint_model: the model before laws were added, from which the other joints are fitted.
+
+        Returns:
+            The model in which those joints have these laws that are simulated better with them.
+        """
+        donor = int(np.argmin(model.costs / joint_model.costs))
+        theta, laws, joints = joint_model.theta.copy(), list(joint_model.laws), list[int]()
+        for joint, available in enumerate(self._laws_at_joint):
+            for name in model.laws[donor]:
+                law = name.partition("@")[0]
+                slot = self._evaluator.coefficient_slices.get(available.get(law, ""))
+                if slot is not None and available[law] not in laws[joint]:
+                    laws[joint] = (*laws[joint], available[law])
+                    theta[slot] = model.theta[self._evaluator.coefficient_slices[name]]
+            if joint != donor and set(laws[joint]) != set(model.laws[joint]):
+                joints.append(joint)
+        if not joints:
+            return model
+        others = dict.fromkeys(set(self._joints) - set(joints), model)
+        # The same servo needs the same correction of its stiffness and damping.
+        corrected = theta.copy()
+        for joint in joints:
+            donor_indices = self._list_parameters(donor, ())
+            corrected[self._list_parameters(joint, ())] = model.theta[donor_indices]
+        coefficients = [
+            i
+            for joint in joints
+            for i in self._list_parameters(joint, laws[joint])
+            if i not in self._base_parameters[joint]
+        ]
+        starts = []
+        for start in (theta, corrected):
+            for factor in SHARED_FACTORS:
+                scaled = start.copy()
+                scaled[coefficients] *= factor
+                starts.append(self.simulate(scaled, laws))
+        nearest = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
+        shared = self.fit(self._join(starts[0], nearest | others), SHARED_ITERATIONS, joints)
+        better = [joint for joint in joints if self._is_better(shared, model, joint)]
+        if not better:
+            return model
+        return self.fit(self._join(model, dict.fromkeys(better, shared)), TRIAL_ITERATIONS)
+
+    def _is_better(self, model: ServoModel, other: ServoModel, joint: int) -> bool:
+        """Return whether a model is better at a joint, each further law with enough gain."""
+        added = max(len(model.laws[joint]) - len(other.laws[joint]), 0)
+        return bool(model.costs[joint] < (1.0 - MIN_GAIN) ** added * other.costs[joint])
+
+    def _helps(self, model: ServoModel, larger: ServoModel, joint: int) -> bool:
+        """Return whether a larger model reduces a joint's residual enough.
+
+        It must do so even without the run that gains most.
+        """
+        before, after = (
+            np.square(self._compute_residual(one.simulated)[:, :, joint]).sum(axis=1)
+            for one in (model, larger)
+        )
+        others = np.arange(len(before)) != np.argmax(before - after)
+        return bool(
+            after.sum() < (1.0 - MIN_GAIN) * before.sum()
+            and after[others].sum() < (1.0 - MIN_OTHER_GAIN) * before[others].sum()
+        )
+
+    def _estimate_gains(
+        self, model: ServoModel, joints: Collection[int]
+    ) -> dict[int, list[_Trial]]:
+        """Simulate every law at joints, and return the best trials of each joint, best first.
+
+        Args:
+            model: the fitted model.
+            joints: the joints.
+        """
+        blocks = self._compute_jacobians(model, sorted(joints))
+        residual = self._compute_residual(model.simulated)
+        trials: dict[int, dict[str, _Trial]] = {joint: {} for joint in joints}
+        for law in sorted(set().union(*self._laws_at_joint)):
+            names = {
+                joint: at_joint[law]
+                for joint, at_joint in enumerate(self._laws_at_joint)
+                if joint in joints and law in at_joint and at_joint[law] not in model.laws[joint]
+            }
+            for share in TRIED_SHARES:
+                for sign in (1.0, -1.0):
+                    for trial, joint in self._simulate_law(
+                        model, names, sign * share, blocks, residual
+                    ):
+                        known = trials[joint].get(trial.name)
+                        if known is None or trial.gain > known.gain:
+                            trials[joint][trial.name] = trial
+            if self._evaluator.search_control.is_over():
+                break
+        ranked = dict[int, list[_Trial]]()
+        for joint, at_joint in trials.items():
+            best = sorted(at_joint.values(), key=lambda trial: -trial.gain)[:MAX_FITTED_LAWS]
+            ranked[joint] = [t for t in best if t.gain >= COMPETING_SHARE * best[0].gain]
+        return ranked
+
+    def _simulate_law(
+        self,
+        model: ServoModel,
+        names: Mapping[int, str],
+        share: float,
+        blocks: Mapping[int, Array],
+        residual: Array,
+    ) -> Iterator[tuple[_Trial, int]]:
+        """Simulate a law at several joints at once, and yield its estimated gain at each.
+
+        Args:
+            model: the fitted model.
+            names: the law's effect at each joint.
+            share: coefficients as a share of their usual range; negative for the lower end.
+            blocks: block of the Jacobian of each joint.
+            residual: (R, T, n) residual of the model.
+        """
+        evaluator = self._evaluator
+        theta, coefficients = model.theta.copy(), dict[int, Array]()
+        for joint, name in names.items():
+            slot = evaluator.coefficient_slices[name]
+            low, high = np.array([p.bounds for p in evaluator.parameters[slot]]).T
+            # A coefficient that is nonnegative has no other sign to try.
+            if share < 0.0 and not (low < 0.0).any():
+                continue
+            theta[slot] = np.where((share < 0.0) & (low < 0.0), -share * low, abs(share) * high)
+            coefficients[joint] = theta[slot].copy()
+        if not coefficients:
+            return
+        displaced = self.simulate(theta, model.laws)
+        for joint, c in coefficients.items():
+            change = self._compute_change(displaced, model, joint)
+            block, left = blocks[joint], residual[:, :, joint].ravel()
+            gain = _estimate_gain(block, change, left)
+            if gain > MIN_ESTIMATED_GAIN:
+                parameters = self._step_parameters(model, joint, block, left - change)
+                yield _Trial(gain, names[joint], c, parameters), joint
+
+    def compute_gains(self, model: ServoModel) -> dict[str, float]:
+        """Return the loss in twice the log-likelihood without each effect, by the Wald statistic.
+
+        The residual of each joint is taken as white noise. Effects without a gain are left out.
+
+        Args:
+            model: the fitted model.
+        """
+        gains = {}
+        blocks = self._compute_jacobians(model, self._joints)
+        for joint, block in blocks.items():
+            indices = self._list_parameters(joint, model.laws[joint])
+            count = int(self._mask[:, :, joint].sum())
+            information = block.T @ block * count / model.costs[joint]
+            covariance = np.linalg.pinv(information, hermitian=True)
+            for name in model.laws[joint]:
+                rows = [indices.index(i) for i in self._evaluator.get_coefficient_indices(name)]
+                c = model.theta[self._evaluator.coefficient_slices[name]]
+                inverse = np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True)
+                gain = float(c @ inverse @ c)
+                if gain > self.context.filters.penalty(name):
+                    gains[name] = gain
+        return gains
+
+
+def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
+    """Return the step (k,) of damped least squares.
+
+    Args:
+        block: (m, k) derivatives of the samples.
+        residual: (m,) residual.
+        damping: damping λ as a share of the diagonal of the normal equations.
+    """
+    normal = block.T @ block
+    diagonal = np.diag(normal)
+    ridge = damping * diagonal + RIDGE_SHARE * diagonal.max(initial=0.0)
+    step, *_ = np.linalg.lstsq(normal + np.diag(ridge), block.T @ residual, rcond=None)
+    return np.asarray(step)
+
+
+def _estimate_gain(block: Array, change: Array, residual: Array) -> float:
+    """Estimate the gain of a law together with the parameters that are already in the model.
+
+    Args:
+        block: (m, k) derivatives of the samples by these parameters.
+        change: (m,) change of the samples by the law.
+        residual: (m,) residual.
+
+    Returns:
+        The decrease of the squared residual, as a share, if the change is scaled within
+        `SCALE_LIMITS`; zero if it would have to be smaller.
+    """
+    low, high = SCALE_LIMITS
+    norms = np.linalg.norm(block, axis=0)
+    basis, _ = np.linalg.qr(block[:, norms > 0.0] / norms[norms > 0.0])
+    rest, left = change - basis @ (basis.T @ change), residual - basis @ (basis.T @ residual)
+    square = float(rest @ rest)
+    scale = float(rest @ left) / square if square > 0.0 else 0.0
+    if not scale > low:
+        return 0.0
+    scale = min(scale, high)
+    remaining = left - scale * rest
+    return float(left @ left - remaining @ remaining) / float(residual @ residual)

@@ -1,0 +1,149 @@
+"""Tests of the identification of all servos of an arm at once."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.diagnosis.explain import explain
+from bench.diagnosis.prediction_error.servo_identification import (
+    _estimate_gain,
+    _solve_damped,
+    has_servos_alone,
+)
+from tests.exams.robots.robot_signals import profiled
+
+ACCELERATIONS = (15.0, 20.0, 12.0, 25.0)
+"""Limits of the set points' accelerations, in rad/s²."""
+FRICTION = 0.12
+"""Dry friction of every joint, in N·m."""
+ENCODER_STEP = 0.00153
+"""Step of the encoders, in rad."""
+RUNS, SECONDS, RATE = 6, 6.0, 50
+"""Number of runs, and duration in seconds and samples per second of each."""
+
+
+def arm(stiffness, damping, friction):
+    """Return the MJCF of an arm with four servos."""
+    links = "".join(
+        f'<body pos="{0.1 if i else 0.0} 0 {0.0 if i else 0.1}">'
+        f'<joint name="j{i}" axis="{"0 1 0" if i else "0 0 1"}" armature="0.01" damping="0.05"'
+        f' {friction}/><geom type="capsule" size="0.015" fromto="0 0 0 0.1 0 0" mass="0.1"/>'
+        for i in range(4)
+    )
+    servos = "".join(
+        f'<position name="m{i}" joint="j{i}" kp="{stiffness}" kv="{damping}"/>' for i in range(4)
+    )
+    return (
+        '<mujoco><option timestep="0.002" integrator="implicitfast"/><default><geom contype="0"'
+        f' conaffinity="0"/></default><worldbody>{links}{"</body>" * 4}</worldbody>'
+        f"<actuator>{servos}</actuator></mujoco>"
+    )
+
+
+def steps_of(rng, times):
+    """Return commands that step to another angle about once a second."""
+    changes = np.cumsum(rng.uniform(0.6, 1.2, 20))
+    angles = rng.uniform(-0.6, 0.6, 21)
+    return angles[np.searchsorted(changes, times, side="right")]
+
+
+def write_log(folder):
+    """Write the log of an arm whose servos have motion profiles, and its model file without them.
+
+    The servos of the model file also have a lower stiffness, and its joints no dry friction.
+    """
+    mujoco = pytest.importorskip("mujoco")
+    (folder / "arm.xml").write_text(arm(8, 0.3, ""))
+    stiff = f'frictionloss="{FRICTION}" solreffriction="0.004 1"'
+    model = mujoco.MjModel.from_xml_string(arm(12, 0.5, stiff))
+    model.opt.timestep = 0.001
+    rng, times = np.random.default_rng(3), np.arange(0.0, SECONDS, 1.0 / RATE)
+    rows = []
+    for run in range(RUNS):
+        commands = np.stack([steps_of(rng, times) for _ in range(4)], axis=1)
+        limits = zip(commands.T, ACCELERATIONS, strict=True)
+        followed = np.stack([profiled(column, times, limit)[0] for column, limit in limits], axis=1)
+        data = mujoco.MjData(model)
+        data.qpos[:] = data.ctrl[:] = commands[0]
+        for _ in range(3000):
+            mujoco.mj_step(model, data)
+        for k, t in enumerate(times):
+            measured = np.round(data.qpos / ENCODER_STEP) * ENCODER_STEP
+            rows.append([run, t, *measured, *commands[k]])
+            for set_points in followed[1000 // RATE * k :][: 1000 // RATE]:
+                data.ctrl[:] = set_points
+                mujoco.mj_step(model, data)
+    columns = ["run", "t", *(f"q.j{i}" for i in range(4)), *(f"u.m{i}" for i in range(4))]
+    pd.DataFrame(rows, columns=columns).to_csv(folder / "log.csv", index=False, float_format="%.6g")
+    tables = [f'{name}{i}"' for name in ('channels."q.j', 'inputs."u.m') for i in range(4)]
+    channels = "".join(f'[{table}]\nunit = "rad"\n' for table in tables)
+    free = 'model = "arm.xml"\nfree = ["actuator.stiffness@*", "actuator.damping@*"]\n'
+    held_out = "[runs.4]\nheld_out = true\n[runs.5]\nheld_out = true\n"
+    (folder / "log.toml").write_text(free + channels + held_out)
+    return folder / "log.csv"
+
+
+@pytest.mark.slow(seconds=60)
+def test_profiles_friction_and_stiffness_of_all_servos_are_found(tmp_path):
+    """The model lacks two laws at each of four joints, and its stiffness is wrong."""
+    answer = explain(write_log(tmp_path)).answer
+    found = {cause.effect: cause.coefficients["coefficient"].value for cause in answer.causes}
+    assert found.keys() == {
+        *(f"servo.profile@m{i}" for i in range(4)),
+        *(f"friction.coulomb@j{i}" for i in range(4)),
+    }
+    for i, limit in enumerate(ACCELERATIONS):
+        assert found[f"servo.profile@m{i}"] == pytest.approx(limit, rel=0.05)
+        assert found[f"friction.coulomb@j{i}"] == pytest.approx(FRICTION, abs=0.03)
+        stiffness = 8.0 * (1.0 + answer.parameters[f"actuator.stiffness@m{i}"].value)
+        assert stiffness == pytest.approx(12.0, rel=0.05)
+    assert answer.heldout.rmse_extended < 2.0 * ENCODER_STEP
+    assert answer.heldout.rmse_extended < 0.1 * answer.heldout.rmse_base
+
+
+def test_the_estimated_gain_is_that_of_least_squares():
+    rng = np.random.default_rng(1)
+    block, change = rng.normal(size=(200, 3)), rng.normal(size=200)
+    residual = block @ [1.0, -2.0, 0.5] + 0.7 * change + 0.1 * rng.normal(size=200)
+
+    def remaining(columns):
+        return float(np.linalg.lstsq(columns, residual, rcond=None)[1][0])
+
+    both = remaining(np.column_stack([block, change]))
+    expected = (remaining(block) - both) / float(residual @ residual)
+    assert _estimate_gain(block, change, residual) == pytest.approx(expected, rel=1e-9)
+    # A law that would need another sign, or is far too large, gains nothing.
+    assert _estimate_gain(block, -change, residual) == 0.0
+    assert _estimate_gain(block, 100.0 * change, residual) == 0.0
+
+
+def test_a_step_without_damping_solves_the_least_squares_problem():
+    block = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
+    np.testing.assert_allclose(_solve_damped(block, block @ [2.0, -3.0], 0.0), [2.0, -3.0])
+    # The damping adds its share of the diagonal: (3 + 3) x = 6 for one unknown.
+    np.testing.assert_allclose(_solve_damped(block[:, :1], np.full(3, 2.0), 1.0), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("servos", "channels", "expected"),
+    [
+        ("mmmm", "abcd", True),
+        ("mmm-", "abcd", False),
+        ("mmmm", "abc", False),
+        ("mmm", "abc", False),
+    ],
+)
+def test_only_arms_with_a_servo_and_an_encoder_at_every_joint_are_identified(
+    servos, channels, expected
+):
+    coordinates = [f"q.{name}" for name in "abcd"[: len(servos)]]
+    system = SimpleNamespace(
+        coordinates=coordinates,
+        servos={i: f"u.{name}" for i, name in enumerate(servos) if name != "-"},
+    )
+    evaluator = SimpleNamespace(
+        simulator=SimpleNamespace(system=system), channels=[f"q.{name}" for name in channels]
+    )
+    assert has_servos_alone(SimpleNamespace(evaluator=evaluator)) is expected
