@@ -312,6 +312,7 @@ class Failing(Tuner):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_terminal_says_who_is_best_and_marks_a_tuner_whose_runs_all_failed(
     tmp_path, capsys, spring
 ):

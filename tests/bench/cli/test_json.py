@@ -3,7 +3,6 @@
 import copy
 import json
 import subprocess
-import sys
 from contextlib import redirect_stdout
 from io import StringIO
 
@@ -14,6 +13,7 @@ from bench.cli.main import COMMANDS, main
 from bench.schemas import find_violations, list_schema_names, load_schema
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
+from tests.without_drawing import COMMAND, undrawn
 
 PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
 ARM = """<mujoco><worldbody><body name="arm"><joint name="hinge" type="hinge" axis="0 1 0"/>
@@ -59,7 +59,8 @@ def place(tmp_path_factory):
 def compared(place):
     """Document printed by `simgap compare`."""
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--jobs", 0, "--out", place / "run"]
-    return document_of(command)
+    with undrawn():
+        return document_of(command)
 
 
 @pytest.fixture(scope="module")
@@ -397,9 +398,8 @@ def test_what_a_tuner_prints_does_not_come_to_stand_in_the_document(place):
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--plugin", place / "verbose.py"]
     command += ["--tuners", "verbose", "--jobs", "0", "--out", place / "verbose", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "bench.cli.main", *map(str, command)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        [*COMMAND, *map(str, command)], capture_output=True, text=True, timeout=120, check=False
+    )
     found = json.loads(done.stdout)
     assert find_violations(found, "compare") == []
     # A crashed run is a result, and the exit code reports it.

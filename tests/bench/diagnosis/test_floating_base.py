@@ -166,6 +166,7 @@ def compared(tmp_path, *given):
     return rows.groupby("target").last()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_log_of_what_floats_is_tuned_to(tmp_path):
     last = compared(tmp_path, "--recording", str(recorded(tmp_path)))
     found = last["recommendation_drag.linear@boom"].to_numpy()
@@ -174,6 +175,7 @@ def test_a_log_of_what_floats_is_tuned_to(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_what_floats_is_tuned_to_simulations_of_itself(tmp_path):
     (tmp_path / "satellite.xml").write_text(MODEL)
     last = compared(tmp_path, "--model", str(tmp_path / "satellite.xml"))

@@ -128,19 +128,13 @@ def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "effect", "number"),
-    [
-        ({"options": 'noslip_iterations="5"', "samples": 100}, "numerics.noslip", 5),
-        # The residual is 1.2 times the noise, and the coarser integrator made the recording.
-        ({"change": (OPTIONS, 'integrator="Euler"')}, "numerics.integrator", 0),
-    ],
-)
-def test_an_option_that_hardly_shows_is_the_only_cause(tmp_path, arguments, effect, number):
-    answer = explain(write_block_recording(tmp_path, **arguments)).answer
+def test_an_integrator_that_hardly_shows_is_the_only_cause(tmp_path):
+    """The residual is 1.2 times the noise, and the coarser integrator made the recording."""
+    changed = (OPTIONS, 'integrator="Euler"')
+    answer = explain(write_block_recording(tmp_path, change=changed)).answer
     assert answer.verdict == "named"
-    assert [cause.effect for cause in answer.causes] == [effect]
-    assert answer.causes[0].coefficients["coefficient"].value == number
+    assert [cause.effect for cause in answer.causes] == ["numerics.integrator"]
+    assert answer.causes[0].coefficients["coefficient"].value == 0
 
 
 @pytest.mark.slow

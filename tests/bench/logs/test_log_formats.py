@@ -13,7 +13,7 @@ from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motio
 from tests.malformed_input.input_strategies import log_folders, run_cases
 from tests.malformed_input.malformed_case import tried
 
-DAMAGES = 12
+DAMAGES = 6
 """Number of damaged folders of each format; `make malformed KINDS=logs` makes thousands."""
 
 
@@ -41,13 +41,11 @@ def test_the_numbers_of_a_folder_are_those_that_were_logged(kind, tmp_path):
         np.testing.assert_allclose(run.times[own] - run.times[own][0], times, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["csv", "npz"])
-def test_two_commands_give_a_verdict(kind, tmp_path, capsys):
+def test_two_commands_give_a_verdict(tmp_path, capsys):
     """The test above shows that the other formats give the same recording."""
-    logs, model = write_folder(tmp_path, kind)
+    logs, model = write_folder(tmp_path, "csv")
     out, answer = tmp_path / "log.toml", tmp_path / "answer"
-    assert main(["import", str(logs), "--model", str(model), "--out", str(out),
-                 *OPTIONS.get(kind, ())]) == 0  # fmt: skip
+    assert main(["import", str(logs), "--model", str(model), "--out", str(out)]) == 0
     assert main(["explain", str(out), "--out", str(answer), "--jobs", "1"]) == 0
     verdict = json.loads((answer / "verdict.json").read_text())
     assert verdict["verdict"] == "adequate", capsys.readouterr().out

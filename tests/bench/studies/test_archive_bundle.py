@@ -14,6 +14,7 @@ from bench.cli.main import main
 from bench.studies import archive_bundle as archives
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
+from tests.without_drawing import undrawn
 
 PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
 CENTRAL = b"PK\x01\x02\x14\x03\x14\0"
@@ -27,7 +28,8 @@ def place(tmp_path_factory):
     document = {**SPRING, "salt": "", "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]}
     (folder / "small.toml").write_text(tomli_w.dumps(document))
     command = ["compare", str(folder / "small.toml"), *PLUGIN, "--jobs", "1", "--salt", "a secret"]
-    assert main([*command, "--out", str(folder / "run")]) == 0
+    with undrawn():
+        assert main([*command, "--out", str(folder / "run")]) == 0
     log = folder / "swing.csv"
     command = ["simulate", "pendulum", "--effect", "drag.linear=4e-4", "--noise", "q=0.01"]
     assert main([*command, "--observe", "q", "--runs", "2", "--seconds", "2", "--rate", "50",
