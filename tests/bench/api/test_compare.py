@@ -11,6 +11,7 @@ from bench.cli.main import main
 from tests.conftest import PLUGINS
 from tests.docs.documentation_pages import ROOT
 from tests.sample_experiments import SPRING
+from tests.without_drawing import undrawn
 
 
 class Halving(simgap.Tuner):
@@ -47,7 +48,8 @@ def untimed(table):
 @pytest.mark.slow
 def test_python_and_the_command_make_the_same(experiment, tmp_path):
     command = ["compare", str(experiment), "--plugin", str(PLUGINS / "spring.py"), "--jobs", "1"]
-    assert main([*command, "--out", str(tmp_path / "command")]) == 0
+    with undrawn():
+        assert main([*command, "--out", str(tmp_path / "command")]) == 0
     for jobs in (0, 1):
         run = simgap.compare(
             experiment,

@@ -42,7 +42,7 @@ CASES = {
         tuple(Drive(name, "position", kp, 0.1 * kp, 300.0)
               for name, kp in zip(IIWA, (900, 900, 400, 400, 60, 60, 8), strict=True)),
         (0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0), (0.5,) * 7, {"input.delay@m_" + IIWA[3]: (0.006,)},
-        seconds=1.2, runs=3, engine=FINE,
+        seconds=0.8, runs=3, engine=FINE,
     ),
     "example-robot-data double pendulum": Case(
         "pinocchio", "double_pendulum_description/urdf/double_pendulum_simple.urdf",

@@ -114,11 +114,7 @@ def test_what_is_compared_touches(stones):
     assert found > 10
 
 
-ROBOTS = (
-    "so_arm_description/urdf/so101.urdf",
-    "solo_description/robots/solo12.urdf",
-    "ur_description/urdf/ur5_robot.urdf",
-)
+ROBOTS = ("so_arm_description/urdf/so101.urdf", "solo_description/robots/solo12.urdf")
 
 
 @pytest.mark.slow
