@@ -277,6 +277,8 @@ def _fit_all_servos(context: SearchContext) -> FittedModel:
     )
 
 
+FURTHER_STEPS = 4
+"""Maximum number of further Gauss-Newton steps of a competing model that has improved much."""
 MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
 MIN_SAME_JOINT_GAIN_SHARE = 0.5
@@ -432,7 +434,12 @@ def _confirm_by_filter(
     ):
         return None
     followed, names = filters.follow_with_effects(start.theta, start.effects, steps)
-    loss = filters.get_filter(best).log_likelihood - followed.log_likelihood
+    highest = filters.get_filter(best).log_likelihood
+    gained = followed.log_likelihood - filters.log_likelihood(start.theta)
+    if 0.5 * COMPETING_MODEL_MARGIN < highest - followed.log_likelihood < gained:
+        # The coefficient was far from its best value.
+        followed, names = filters.follow_with_effects(followed.theta, names, FURTHER_STEPS)
+    loss = highest - followed.log_likelihood
     return (
         None
         if 2.0 * loss > COMPETING_MODEL_MARGIN

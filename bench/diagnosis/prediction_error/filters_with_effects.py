@@ -93,10 +93,12 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
 
     Args:
         evaluator: the runs.
-        name: name of the effect.
+        name: name of the effect; at a body, the joints are those that carry it.
     """
     count = len(evaluator.simulator.system.coordinates)
     joints = {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
+    if evaluator.available_effects[name].at == "body":
+        joints = _list_joints_of_body(evaluator, name.partition("@")[2])
     return {
         other
         for other in evaluator.library
@@ -104,6 +106,23 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
         and not other.endswith("@*")
         and acts_at_joint(evaluator, other, joints)
     }
+
+
+def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:
+    """Return the joints that move a body against the body before it.
+
+    The inertia of such a body and the armature of its joint may have the same effect.
+
+    Args:
+        evaluator: the runs of a robot.
+        body: name of the body; empty for an effect at all bodies.
+    """
+    assert isinstance(evaluator.simulator, RobotSimulator)
+    model = evaluator.simulator.robot.compiled
+    owners = [
+        model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]
+    ]
+    return {joint for joint, owner in enumerate(owners) if owner == body}
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:

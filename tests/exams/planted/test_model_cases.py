@@ -1,11 +1,13 @@
 """Tests of recordings of model files as people have them."""
 
 import csv
+import json
 
 import mujoco
 import numpy as np
 import pytest
 
+from bench.cli.main import main
 from sims.core.toml_validation import tomllib
 from tests.exams.exam import UndrawableError
 from tests.exams.planted.model_cases import MIN_GAP, ModelExperiment, ModelQuestion, questions
@@ -92,3 +94,15 @@ def test_unmeasured_joints_of_a_loop_have_no_channel():
     experiment = ModelExperiment("biped-with-rods", 0)
     assert "q.left_knee" not in experiment.channel_names
     assert "left_knee" in experiment.places
+
+
+@pytest.mark.slow
+def test_a_large_armature_and_the_inertia_of_its_body_are_equals(tmp_path):
+    # The regression is linear and far off; the competing filter needs several steps.
+    case = drawn("quadruped-hanging", 1)
+    assert case.change.effect == "inertia.armature@RR_hip_joint"
+    case.write(tmp_path)
+    assert main(["explain", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]) == 0
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    (cause,) = verdict["causes"]
+    assert {cause["effect"], *cause["alternatives"]} == {case.change.effect, "inertia.scale@RR_hip"}
