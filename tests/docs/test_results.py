@@ -99,7 +99,6 @@ def folder(tmp_path_factory, spring):
     return path
 
 
-@pytest.mark.slow
 def test_the_folder_holds_the_files_of_the_page(folder):
     files = {f"{f.name}/" if f.is_dir() else f.name for f in folder.iterdir()}
     assert files == set(list_documented_names("## compare"))

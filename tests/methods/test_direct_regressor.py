@@ -12,7 +12,6 @@ def fitted():
     return tuner
 
 
-@pytest.mark.slow
 def test_estimates_from_the_target_alone_and_simulates_once(fitted):
     off = []
     for seed in range(20):

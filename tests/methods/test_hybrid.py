@@ -29,7 +29,6 @@ def errors(tuner, toy, budget=12, seeds=12, **kwargs):
     return np.mean(rows, axis=0)
 
 
-@pytest.mark.slow
 def test_starts_as_the_network_and_ends_as_least_squares(two):
     toy = Toy(2, runs=3)
     error, searched = errors(two, toy), errors(LeastSquares(), toy)

@@ -20,7 +20,6 @@ def fitted():
     return tuner
 
 
-@pytest.mark.slow
 def test_a_first_guess_without_a_simulation_and_then_steps_that_fall(fitted):
     error = errors(fitted, Toy())
     assert error[0] < 0.02

@@ -35,7 +35,6 @@ def tuner():
     return trained
 
 
-@pytest.mark.slow
 def test_error_falls_although_the_target_is_seen_by_another_sensor_only(tuner):
     fell = errors(tuner, Filmed(), spoil=hide)
     assert fell[1] < 0.3 * fell[0]

@@ -193,7 +193,6 @@ def test_a_frame_is_explained_and_scored_as_its_file(folder, frame, stated, tmp_
     assert simgap.score(extended, frame, **given) == simgap.score(extended, folder / "swing.csv")
 
 
-@pytest.mark.slow
 def test_a_frame_has_a_data_sheet_and_stands_next_to_a_file(folder, frame, stated):
     given = {"units": UNITS, **stated}
     sheet = simgap.datasheet(frame, system="pendulum", **given)

@@ -183,7 +183,6 @@ def test_bad_files_are_one_line(folder, capsys, tmp_path):
     assert "none" in faulty(capsys, "score", model, tmp_path / "none.csv")
 
 
-@pytest.mark.slow
 def test_a_tuner_may_find_where_the_fit_begins(folder, capsys, tmp_path):
     assert (
         main(
@@ -266,7 +265,6 @@ def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, 
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.slow
 def test_a_thorough_search_changes_nothing_where_nothing_is_left_over(folder, tmp_path):
     command = ["explain", str(folder / "swing.csv"), "--thorough", "--out", str(tmp_path / "o")]
     assert main(command) == 0

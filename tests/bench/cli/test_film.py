@@ -43,7 +43,6 @@ def drop(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_a_tracked_film_gives_the_heights_and_explain_reads_it_unedited(drop, tmp_path):
     out = tmp_path / "tracked.csv"
     assert main(["track", str(drop / "drop.mp4"), "--out", str(out)]) == 0

@@ -80,7 +80,6 @@ def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
     assert "Changes of the model file" not in nothing._repr_html_()
 
 
-@pytest.mark.slow
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
     shown = make_report()
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))

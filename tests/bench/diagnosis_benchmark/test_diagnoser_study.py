@@ -79,7 +79,6 @@ def finished_study(tmp_path_factory):
     return code, out
 
 
-@pytest.mark.slow
 def test_a_diagnoser_of_a_plugin_file_is_in_the_table(finished_study):
     _, out = finished_study
     own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
@@ -170,7 +169,6 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     assert "declines does not support 2 of the cases: it knows no sliders." in page
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_study_resumes(finished_study, tmp_path, capsys):
     path = written(tmp_path, "fifteen")

@@ -69,7 +69,6 @@ def mean(folder, metric, model, tuner="least_squares"):
     return row
 
 
-@pytest.mark.slow
 def test_the_bias_of_the_plain_simulator_is_the_one_of_theory(folder):
     problem = TuningProblem(small())
     expected = []

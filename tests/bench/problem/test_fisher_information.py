@@ -202,7 +202,6 @@ def test_errors_along_directions_and_of_prediction_are_recorded(folder):
     assert problem.has_several_parameters
 
 
-@pytest.mark.slow
 def test_folder_has_the_spectra_and_the_table_the_metrics(folder):
     folder, results = folder
     said = []

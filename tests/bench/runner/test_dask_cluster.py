@@ -27,7 +27,7 @@ def started(tmp_path):
 def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_nothing(
     started, tmp_path
 ):
-    experiment = write(tmp_path / "e.toml", tuners=TUNERS, targets=5, training_budget=60)
+    experiment = write(tmp_path / "e.toml", tuners=TUNERS, targets=3, training_budget=60)
     common = ["compare", experiment, "--plugin", SPRING_PLUGIN]
     local = simgap(*common, "--jobs", 2, "--out", tmp_path / "local")
     assert local.returncode == 0, local.stderr

@@ -53,7 +53,6 @@ def two_workers():
     return compared(spring_experiment(tuners=EVERYTHING), jobs=2)
 
 
-@pytest.mark.slow
 def test_other_tuners_in_the_comparison_change_nothing(two_workers):
     alone = frame(compared(spring_experiment(tuners={"cma_es": {}}), jobs=2)).drop(columns=MEASURED)
     among = (

@@ -84,7 +84,6 @@ def listed_again(files, top):
     return {**files, f"{top}/manifest.json": json.dumps(manifest).encode()}
 
 
-@pytest.mark.slow
 def test_the_folder_is_in_it_whole_and_the_same_folder_gives_the_same_bytes(
     place, compared, tmp_path
 ):

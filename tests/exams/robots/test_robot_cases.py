@@ -22,7 +22,6 @@ def item():
     return robot_cases.draw_robot_case("single", "arm2-servo", "friction.coulomb", 0)
 
 
-@pytest.mark.slow
 def test_a_case_is_determined_by_its_name(item):
     first = robot_cases.draw_robot_case("clean", "arm2-servo", "any", 0)
     was = robot_cases.setting_of(first.name)
@@ -106,7 +105,6 @@ def test_a_slipping_encoder_jumps_and_stays(item):
     assert jump[-1] == pytest.approx(total)
 
 
-@pytest.mark.slow
 def test_equivalent_causes_in_a_servo_are_separated_by_a_force_sensor(item):
     """A constant force is equivalent to a command offset multiplied by kp."""
     whole = robot_cases.setting_of(item.name)

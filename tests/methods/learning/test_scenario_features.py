@@ -100,7 +100,6 @@ def test_each_run_has_its_own_and_a_short_one_none():
     )
 
 
-@pytest.mark.slow
 def test_a_network_that_reads_the_inputs_beats_one_that_does_not(informed, blind):
     knows, guesses = errors(informed, Driven()), errors(blind, Driven())
     assert knows[1] < 0.02 < guesses[1] / 2
