@@ -117,7 +117,7 @@ RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
 """Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
-REFIT_ITERATIONS = 3
+REFIT_ITERATIONS = 8
 """Maximum number of steps of the fit of more effects with another time step."""
 MAX_ROTATION_ERROR = 0.5
 """Maximum error in rad of the simulated orientation of a floating body.
@@ -1306,8 +1306,7 @@ class _ExplainRun:
     ) -> tuple[float, float]:
         """Fit subsets of a finding's effects with the present step, and rate the best model.
 
-        All subsets are fitted if there are only few effects; otherwise all effects together, with
-        few iterations, and none.
+        All subsets are fitted if there are only few effects; otherwise only all together.
 
         Args:
             search: search with another step, whose fixed parameters stay fixed.
@@ -1319,7 +1318,7 @@ class _ExplainRun:
         names, fit = finding.model.effects, finding.model.fit
         coefficient_slices = self.fitting.coefficient_slices
         starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
-        for count in range(len(names) + 1) if has_few_effects else (0, len(names)):
+        for count in range(0 if has_few_effects else len(names), len(names) + 1):
             for subset in combinations(names, count):
                 theta = fit.theta.copy()
                 for omitted in set(names) - set(subset):

@@ -41,6 +41,11 @@ from sims.robot.robot_simulator import RobotSimulator
 
 MAX_REGRESSION_PROPOSALS = 4
 """Maximum number of effects that are proposed by regression."""
+MAX_FAMILY_PROPOSALS = 2
+"""Maximum number among them of effects at all places.
+
+If much process noise hides the differences, those with many coefficients gain most.
+"""
 MAX_JOINT_PROPOSALS = 3
 """Maximum number of effects of the joint and servo models that are added to a set."""
 MIN_GAIN_SHARE = 0.3
@@ -116,7 +121,9 @@ class EffectProposals:
         proposals: dict[str, Array] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
-            if group.effect in (*current.names, *proposals):
+            families = [name for name in proposals if name.endswith("@*")]
+            is_surplus = group.effect.endswith("@*") and len(families) == MAX_FAMILY_PROPOSALS
+            if is_surplus or group.effect in (*current.names, *proposals):
                 continue
             too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
             if len(proposals) == MAX_REGRESSION_PROPOSALS or too_little:

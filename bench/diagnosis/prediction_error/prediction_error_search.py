@@ -66,7 +66,7 @@ from bench.diagnosis.prediction_error.regression_selection import (
 )
 from bench.diagnosis.prediction_error.servo_identification import (
     MIN_EXCESS,
-    has_servos_alone,
+    has_unknown_servos,
     identify_servos,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
@@ -76,6 +76,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
+    select_lowest_of_each,
     select_more_likely,
     select_with_shapes,
 )
@@ -92,6 +93,8 @@ from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6
 """Minimum share of the joints of a real arm whose servo or friction the model lacks."""
+MAX_SINGLE_SQUARES_SHARE = 0.3
+"""Maximum share of the squared residual that a single likely effect leaves before any fit."""
 TRIED_SHARES = (1.0, 0.5)
 """Shares of the regression coefficients with which a filter must follow the runs better."""
 
@@ -174,14 +177,13 @@ class PredictionErrorSearch(EffectSearch):
             selected: the selection by regression.
 
         Returns:
-            The identified set; None if the robot has other drives, if the base model or the
-            selection leaves a small residual, or if other effects than those of the servos may be
-            missing.
+            The identified set; None if the servos' gains are known, if the base model or the
+            selection leaves a small residual, or if other effects may be missing.
         """
         context = self._search_context
-        if not self.compute_excess_residual(self.base_model) > MIN_EXCESS or not has_servos_alone(
-            context
-        ):
+        if not self.compute_excess_residual(self.base_model) > MIN_EXCESS:
+            return None
+        if not has_unknown_servos(context) or self._is_single_effect_likely():
             return None
         best = fit_quick_selection(context, selected)
         excess = self.compute_excess_residual(best)
@@ -201,6 +203,15 @@ class PredictionErrorSearch(EffectSearch):
         ):
             return None
         return IdentifiedSet(model, gains, is_residual_tested=False)
+
+    def _is_single_effect_likely(self) -> bool:
+        """Return whether one effect removes most of the residual without being fitted."""
+        context = self._search_context
+        starts = context.proposals.of(context.filters.empty_set)
+        if not starts:
+            return False
+        lowest_cost, _ = select_lowest_of_each(context, starts)[0]
+        return lowest_cost < MAX_SINGLE_SQUARES_SHARE * self.base_model.fit.cost
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

@@ -47,6 +47,8 @@ DRY_FRICTION = "friction.coulomb"
 """Effect that is tried first, at every joint."""
 MIN_EXCESS = 30.0
 """Minimum excess of the best model so far, in units of the noise, that real servos may leave."""
+MIN_RESIDUAL = 3.0
+"""Minimum residual of a joint, in units of the noise, to which a law is added."""
 MIN_JOINTS = 4
 """Minimum number of joints; fewer are identified by filters, or by a search over all effects."""
 MAX_COEFFICIENTS = 1
@@ -132,23 +134,26 @@ class _Trial:
     parameters: Array
 
 
-def has_servos_alone(context: SearchContext) -> bool:
-    """Return whether a robot has several joints, all of them with position servos and encoders.
+def has_unknown_servos(context: SearchContext) -> bool:
+    """Return whether a robot has several joints, all with encoders and with servos of unknown gain.
 
     Args:
         context: context of the search.
     """
     evaluator = context.evaluator
     coordinates = evaluator.simulator.system.coordinates
+    free = {evaluator.parameters[i].name for i in evaluator.base_indices.tolist()}
+    servos = [get_servo_input(evaluator, joint) for joint in range(len(coordinates))]
+    gains = {f"{law}@{servo.partition('.')[2]}" for law in SERVO_MODEL for servo in servos}
     return (
         len(coordinates) >= MIN_JOINTS
         and set(coordinates) == set(evaluator.channels)
-        and all(get_servo_input(evaluator, joint) for joint in range(len(coordinates)))
+        and gains <= free
     )
 
 
 def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]:
-    """Identify the servos of a robot that `has_servos_alone`.
+    """Identify the servos of a robot that `has_unknown_servos`.
 
     Args:
         context: context of the search.
@@ -169,7 +174,7 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
         if not growing or evaluator.search_control.is_over():
             break
         evaluator.search_control.begin_stage(f"identifying the servos, round {number + 1}")
-        larger = fitter.add_laws(model, growing)
+        larger = fitter.add_laws(model, growing & fitter.list_far_from_noise(model))
         growing = {joint for joint in growing if larger.laws[joint] != model.laws[joint]}
         model = fitter.share_laws(larger, joint_model)
     final_fitter = _ServoFitter(context, all_runs)
@@ -289,10 +294,8 @@ class _ServoFitter:
 
     def fit_joint_model(self) -> ServoModel:
         """Fit the servos, and then dry friction at the joints whose residual it reduces."""
-        servo_laws = [
-            tuple(laws[law] for law in SERVO_MODEL if law in laws) for laws in self._laws_at_joint
-        ]
-        start = self.simulate(self.context.search.base_model.fit.theta, servo_laws)
+        none: list[tuple[str, ...]] = [()] * len(self._joints)
+        start = self.simulate(self.context.search.base_model.fit.theta, none)
         model = self.fit(start, FIRST_ITERATIONS)
         theta, laws = model.theta.copy(), list(model.laws)
         for joint, available in enumerate(self._laws_at_joint):
@@ -453,7 +456,7 @@ class _ServoFitter:
         Returns:
             The fitted larger model; the given one if no law reduces a residual enough.
         """
-        trials = self._estimate_gains(model, joints)
+        trials = self._estimate_gains(model, joints) if joints else {}
         best = dict[int, ServoModel]()
         for number in range(MAX_FITTED_LAWS):
             chosen = {
@@ -537,6 +540,11 @@ class _ServoFitter:
         """Return whether a model is better at a joint, each further law with enough gain."""
         added = max(len(model.laws[joint]) - len(other.laws[joint]), 0)
         return bool(model.costs[joint] < (1.0 - MIN_GAIN) ** added * other.costs[joint])
+
+    def list_far_from_noise(self, model: ServoModel) -> set[int]:
+        """Return the joints whose residual is far above the noise, so that a law may be missing."""
+        mean_squares = model.costs / self._mask.sum(axis=(0, 1))
+        return set(np.flatnonzero(mean_squares > MIN_RESIDUAL**2).tolist())
 
     def _helps(self, model: ServoModel, larger: ServoModel, joint: int) -> bool:
         """Return whether a larger model reduces a joint's residual enough.

@@ -10,7 +10,7 @@ from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error.servo_identification import (
     _estimate_gain,
     _solve_damped,
-    has_servos_alone,
+    has_unknown_servos,
 )
 from tests.exams.robots.robot_signals import profiled
 
@@ -127,23 +127,29 @@ def test_a_step_without_damping_solves_the_least_squares_problem():
 
 
 @pytest.mark.parametrize(
-    ("servos", "channels", "expected"),
+    ("servos", "channels", "free", "expected"),
     [
-        ("mmmm", "abcd", True),
-        ("mmm-", "abcd", False),
-        ("mmmm", "abc", False),
-        ("mmm", "abc", False),
+        ("mmmm", "abcd", "mmmm", True),
+        ("mmm-", "abcd", "mmmm", False),
+        ("mmmm", "abc", "mmmm", False),
+        ("mmm", "abc", "mmm", False),
+        ("mnop", "abcd", "mno", False),
+        ("mnop", "abcd", "mnop", True),
     ],
 )
-def test_only_arms_with_a_servo_and_an_encoder_at_every_joint_are_identified(
-    servos, channels, expected
+def test_only_arms_with_unknown_servos_and_encoders_at_every_joint_are_identified(
+    servos, channels, free, expected
 ):
     coordinates = [f"q.{name}" for name in "abcd"[: len(servos)]]
     system = SimpleNamespace(
         coordinates=coordinates,
         servos={i: f"u.{name}" for i, name in enumerate(servos) if name != "-"},
     )
+    gains = [f"actuator.{law}@{name}" for name in free for law in ("stiffness", "damping")]
     evaluator = SimpleNamespace(
-        simulator=SimpleNamespace(system=system), channels=[f"q.{name}" for name in channels]
+        simulator=SimpleNamespace(system=system),
+        channels=[f"q.{name}" for name in channels],
+        parameters=[SimpleNamespace(name=name) for name in gains],
+        base_indices=np.arange(len(gains)),
     )
-    assert has_servos_alone(SimpleNamespace(evaluator=evaluator)) is expected
+    assert has_unknown_servos(SimpleNamespace(evaluator=evaluator)) is expected
