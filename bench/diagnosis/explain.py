@@ -1289,7 +1289,8 @@ class _ExplainRun:
             self._restore_evaluators(present_evaluators, before)
             return None
         refinement = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
-        if refinement is None:
+        # The residual of a model that stays incomplete is far larger than an error of the step.
+        if refinement is None or finding.is_incomplete:
             return None
         self._set_up(refinement.kind)
         finer_merit = self._rate_best_subset(search, finding)
