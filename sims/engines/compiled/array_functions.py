@@ -19,14 +19,11 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.core.simulator import InputError
 from sims.engines.compiled import intrinsics, machine_code
+from sims.engines.compiled.array_shapes import INTEGERS, Array, measure_arrays
 
-Array = NDArray[Any]
-INTEGERS = "#"
-"""Prefix of the shapes of integer arrays, and the shape of an integer argument."""
 HAS_LLVMLITE = importlib.util.find_spec("llvmlite") is not None
 """True if machine code can be loaded; numba may not support this Python version yet."""
 _MAX_COMPILE_SECONDS = 20
@@ -39,14 +36,11 @@ _lock = Lock()
 class ArrayFunctions:
     """Functions on arrays of a module, compiled on first use into one piece of machine code.
 
-    A shape has one letter per dimension: equal letters are equal sizes in a call, and a digit is a
-    fixed size. Numbers are of double precision; the prefix `INTEGERS` declares 64-bit integers.
-
     Args:
         module: name of the module, which holds this object under the name ``COMPILED``.
         description: what is compiled, for messages to the user.
-        shapes: shapes of the arguments of each function. A function with one parameter receives
-            them as one tuple, whose class is its annotation.
+        shapes: shapes of the arguments of each function (`array_shapes`). A function with one
+            parameter receives them as one tuple, whose class is its annotation.
         can_run_uncompiled: whether the functions run as Python where llvmlite is not installed, a
             hundred times slower.
     """
@@ -176,39 +170,6 @@ def _format_argument(shape: str, word: str) -> str:
     kind = "int" if shape.startswith(INTEGERS) else "real"
     sizes = "".join(f"{size}, " for size in shape.removeprefix(INTEGERS))
     return f"carray(to_{kind}_pointer({word}), ({sizes}))"
-
-
-def measure_arrays(shapes: Sequence[str], arguments: Sequence[Any]) -> dict[str, int]:
-    """Return the sizes of arrays by the letters of their shapes.
-
-    Args:
-        shapes: shapes as for `ArrayFunctions`.
-        arguments: arrays, and integers where the shape is `INTEGERS`.
-
-    Raises:
-        ValueError: an array has another shape, type or memory layout than declared.
-    """
-    sizes: dict[str, int] = {}
-    for shape, array in zip(shapes, arguments, strict=True):
-        if shape == INTEGERS:
-            continue
-        letters = shape.removeprefix(INTEGERS)
-        kind = np.int64 if shape.startswith(INTEGERS) else np.float64
-        expected = tuple(
-            int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
-            for letter, size in zip(letters, array.shape, strict=False)
-        )
-        if (
-            array.shape != expected
-            or array.ndim != len(letters)
-            or array.dtype != kind
-            or not array.flags.c_contiguous
-        ):
-            raise ValueError(
-                f"expected a contiguous array of shape {expected} of {kind.__name__}, got"
-                f" {array.dtype} of shape {array.shape}"
-            )
-    return sizes
 
 
 _NullArray = ctypes.c_char * 0

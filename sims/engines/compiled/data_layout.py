@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import Effect, Force, Friction
 from sims.core.system import System
-from sims.engines.compiled.array_functions import measure_arrays
+from sims.engines.compiled.array_shapes import measure_arrays
 from sims.engines.compiled.traced_array import EXTERNAL
 
 FloatArray = NDArray[np.float64]
@@ -139,7 +139,7 @@ BLOCK_SHAPES = (
     *("#i5", "#4", "#q", "#d", "#6", "#s", "#s", "sp", "l", "ld", "ld", "kt", "ujt"),
     *("l", "l", "l", "4l", "2", "lyz", "rw", "aw", "#nw", "#", "#"),
 )
-"""Shapes of the arrays of `Block` for `ArrayFunctions`.
+"""Shapes of the arrays of `Block`, see `array_shapes`.
 
 d coordinates, s of l elements, t steps, u inputs, p parameters, w slots; k and j are 1 or l.
 """

@@ -15,10 +15,8 @@ from importlib import import_module
 from types import FunctionType
 from typing import Any
 
-import numpy as np
-
 from sims.engines.compiled import intrinsics, machine_code
-from sims.engines.compiled.array_functions import INTEGERS, ArrayFunctions
+from sims.engines.compiled.array_shapes import make_example
 from sims.engines.compiled.data_layout import BLOCK_SHAPES, Block
 
 _INLINED_FUNCTIONS = frozenset(
@@ -85,7 +83,7 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
     # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
     entry_function = getattr(import_module(module), entry)
-    if isinstance(entry_function, ArrayFunctions):
+    if not isinstance(entry_function, FunctionType):
         entry_function = entry_function.make_entry()
     space = _compile_functions(numba, entry_function, constants)
     types = numba.types
@@ -208,16 +206,8 @@ def _get_argument_types(numba: Any) -> dict[str, Any]:
         "bool": True,
         "int": 1,
         "float": 1.0,
-        "FloatArray": _make_example("ij"),
-        "IntTable": _make_example("#ij"),
-        "Block": Block(*map(_make_example, BLOCK_SHAPES)),
+        "FloatArray": make_example("ij"),
+        "IntTable": make_example("#ij"),
+        "Block": Block(*map(make_example, BLOCK_SHAPES)),
     }
     return {name: numba.typeof(value) for name, value in examples.items()}
-
-
-def _make_example(shape: str) -> Any:
-    """Return an example of an argument with a shape of `ArrayFunctions`."""
-    if shape == INTEGERS:
-        return 1
-    kind = np.int64 if shape.startswith(INTEGERS) else np.float64
-    return np.zeros((1,) * len(shape.removeprefix(INTEGERS)), dtype=kind)
