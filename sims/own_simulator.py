@@ -18,7 +18,7 @@ import numpy as np
 from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect, Level
 from sims.core.engine import Engine
 from sims.core.plain_values import is_plausible_number, truncate_text
-from sims.core.simulator import Array, Channel, InputError, Parameter
+from sims.core.simulator import Array, InputError
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 from sims.engines.external.bullet_world import import_pybullet
 from sims.own_simulator_engine import OwnSimulatorEngine, find_level_effect, make_level_effects
@@ -31,12 +31,6 @@ class OwnSimulatorSystem(System):
     name = "own"
     says = "a user's own simulator"
     kind: ClassVar[SystemKind] = "linear"
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
-    channels: ClassVar[tuple[Channel, ...]] = ()
-    coordinates: ClassVar[tuple[str, ...]] = ()
-    rates: ClassVar[tuple[str, ...]] = ()
-    states: ClassVar[Mapping[str, float]] = {}
-    sensed: ClassVar[tuple[str, ...]] = ()
     simulator: ClassVar[type[OwnSimulator]]
 
     @classmethod

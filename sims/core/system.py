@@ -18,7 +18,7 @@ force.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -246,14 +246,14 @@ class System(ABC):
     name: ClassVar[str]
     says: ClassVar[str]
     kind: ClassVar[SystemKind]
-    parameters: ClassVar[tuple[Parameter, ...]]
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
     constants: ClassVar[tuple[Constant, ...]] = ()
     inputs: ClassVar[tuple[Channel, ...]] = ()
-    channels: ClassVar[tuple[Channel, ...]]
-    coordinates: ClassVar[tuple[str, ...]]
-    rates: ClassVar[tuple[str, ...]]
-    states: ClassVar[Mapping[str, float]]
-    sensed: ClassVar[tuple[str, ...]]
+    channels: ClassVar[tuple[Channel, ...]] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    sensed: ClassVar[tuple[str, ...]] = ()
     primary: ClassVar[int] = 0
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
@@ -328,18 +328,20 @@ class System(ABC):
         """
         return ""
 
-    @abstractmethod
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the generalised inertia (L, 1); 1 for a system that counts force per unit mass.
+
+        A system whose engine computes inertia and gravity itself does not define it.
 
         Args:
             theta: (L, p) parameters.
             constants: Constants (L, 1) by name.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def weight(self, moment: StateSnapshot) -> Array:
-        """Return the generalised force (L, D) of gravity."""
+        """Return the generalised force (L, D) of gravity; see `mass`."""
+        raise NotImplementedError
 
     def drive(self, moment: StateSnapshot) -> Array:
         """Return the generalised force (L, D) of the inputs, applied by the actuator."""
@@ -365,11 +367,14 @@ class System(ABC):
         """
         raise NotImplementedError
 
-    @abstractmethod
     def observe(
-        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+        self,
+        x: Array,
+        v: Array,
+        a: Array,  # noqa: ARG002
+        constants: Mapping[str, Array],  # noqa: ARG002
     ) -> dict[str, Array]:
-        """Return the channels (L, S) by name.
+        """Return the channels (L, S) by name; unless overridden, each of them is a state.
 
         Args:
             x: (L, S, D) positions.
@@ -377,6 +382,8 @@ class System(ABC):
             a: (L, S, D) accelerations.
             constants: Constants (L, 1) by name.
         """
+        motion = dict(zip(self.coordinates + self.rates, [*x.T, *v.T], strict=True))
+        return {channel.name: motion[channel.name].T for channel in self.channels}
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
         """Return the value (L, 1) of the last coordinate at which it strikes the ground."""

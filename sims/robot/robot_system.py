@@ -11,8 +11,8 @@ import numpy as np
 from sims import effects as library
 from sims.core.effect import ALL_PLACES, Effect
 from sims.core.registry import PartUnavailableError
-from sims.core.simulator import Array, Channel, InputError, Parameter, make_unknown_name_error
-from sims.core.system import StateSnapshot, System, SystemKind
+from sims.core.simulator import Channel, InputError, Parameter, make_unknown_name_error
+from sims.core.system import System, SystemKind
 from sims.robot.contact_pairs import PAIR_SEPARATOR, find_geom
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.series_joints import find_compile_error, list_added_elements
@@ -59,12 +59,6 @@ class RobotSystem(System):
     name = "robot"
     says = "a robot of a model file"
     kind: ClassVar[SystemKind] = "rotary"
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
-    channels: ClassVar[tuple[Channel, ...]] = ()
-    coordinates: ClassVar[tuple[str, ...]] = ()
-    rates: ClassVar[tuple[str, ...]] = ()
-    states: ClassVar[Mapping[str, float]] = MappingProxyType({})
-    sensed: ClassVar[tuple[str, ...]] = ()
     has_model = True
     usual_recording = LazyDefaultRecording()
     robot: ClassVar[RobotModel]
@@ -240,32 +234,6 @@ class RobotSystem(System):
             return bool(cls.placed(library.get_effect(name)))
         except PartUnavailableError:
             return False
-
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Raise an error: only the engine computes the pose-dependent inertia matrix.
-
-        Args:
-            theta: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
-
-    def weight(self, moment: StateSnapshot) -> Array:
-        """Raise an error: only the engine computes gravity forces."""
-        raise NotImplementedError
-
-    def observe(
-        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
-    ) -> dict[str, Array]:
-        """Raise an error: the engine reads the channels itself.
-
-        Args:
-            x: unused.
-            v: unused.
-            a: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
 
 
 def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[RobotSystem]:

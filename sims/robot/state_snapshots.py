@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,36 +17,8 @@ class SingleJointSystem(System):
     name = "joint"
     says = "one joint of a robot"
     kind: ClassVar[SystemKind] = "rotary"
-    parameters = ()
-    channels = ()
     coordinates = ("q",)
     rates = ("qd",)
-    states: ClassVar[dict[str, float]] = {}
-    sensed = ()
-
-    def mass(self, theta: Array, constants: Any) -> Array:
-        """Raise an error: the inertia is not known for one joint alone.
-
-        Args:
-            theta: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
-
-    def weight(self, moment: StateSnapshot) -> Array:
-        """Raise an error: the gravity force is not known for one joint alone."""
-        raise NotImplementedError
-
-    def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Raise an error: a joint alone has no channels.
-
-        Args:
-            x: unused.
-            v: unused.
-            a: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
 
 
 class SingleSlideSystem(SingleJointSystem):

@@ -23,7 +23,7 @@ class PendulumSystem(System):
     name = "pendulum"
     says = "a rigid body that swings on a hinge"
     kind: ClassVar[SystemKind] = "rotary"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
             "inertia",
             "kg*m^2",
@@ -33,11 +33,11 @@ class PendulumSystem(System):
             says="moment of inertia about the hinge",
         ),
     )
-    channels = (
+    channels: ClassVar[tuple[Channel, ...]] = (
         Channel("q", "rad", 1.0, "angle, 0 when hanging"),
         Channel("qd", "rad/s", 10.0, "rate of the angle"),
     )
-    constants = (
+    constants: ClassVar[tuple[Constant, ...]] = (
         Constant("mass", "kg", 0.15, positive=True, limits=MASS_RANGE),
         Constant(
             "length",
@@ -49,11 +49,11 @@ class PendulumSystem(System):
         ),
         Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY_RANGE),
     )
-    inputs = (Channel("u", "N*m", says="torque at the hinge"),)
+    inputs: ClassVar[tuple[Channel, ...]] = (Channel("u", "N*m", says="torque at the hinge"),)
     coordinates = ("q",)
     rates = ("qd",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.5, "qd": 0.0})
-    sensed = ("q", "qd")
+    sensed: ClassVar[tuple[str, ...]] = ("q", "qd")
     usual_recording = DefaultRecording(initial={"q": (0.5, 1.5)})
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
@@ -89,19 +89,6 @@ class PendulumSystem(System):
             return np.zeros_like(moment.x)
         torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
         return torque
-
-    def observe(
-        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
-    ) -> dict[str, Array]:
-        """Return angle and rate.
-
-        Args:
-            x: (L, S, D) positions.
-            v: (L, S, D) velocities.
-            a: (L, S, D) accelerations.
-            constants: constants by name.
-        """
-        return {"q": x[:, :, 0], "qd": v[:, :, 0]}
 
 
 class Pendulum(SystemSimulator):

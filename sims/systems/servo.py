@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,10 +26,9 @@ from sims.core.system import (
     DerivedQuantity,
     RenderedModelFile,
     StateSnapshot,
-    System,
-    SystemKind,
 )
 from sims.system_simulator import SystemSimulator
+from sims.systems.pendulum import PendulumSystem
 
 SERVO_MJCF_TEMPLATE = """<mujoco model="servo">
   <compiler angle="radian"/>
@@ -83,7 +82,7 @@ _ARMATURE = slice(2, 3)
 """Column of the inertia of motor and gears among the parameters."""
 
 
-class ServoSystem(System):
+class ServoSystem(PendulumSystem):
     """Pendulum on a motor with a proportional position controller.
 
         (armature + mass length^2) q'' = torque - mass gravity length sin q    (1)
@@ -96,7 +95,6 @@ class ServoSystem(System):
 
     name = "servo"
     says = "a position-controlled servo motor that carries a pendulum"
-    kind: ClassVar[SystemKind] = "rotary"
     parameters = (
         Parameter(
             "torque_constant",
@@ -144,8 +142,6 @@ class ServoSystem(System):
         Channel("torque_enable", "1", says="1 while the motor is driven, 0 while it is free"),
     )
     channels = (Channel("q", "rad", says="angle, 0 when hanging"),)
-    coordinates = ("q",)
-    rates = ("qd",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
     sensed = ("q",)
     servo = "goal"
@@ -204,12 +200,6 @@ class ServoSystem(System):
         """
         return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
 
-    def weight(self, moment: StateSnapshot) -> Array:
-        """Return the torque of gravity (L, 1)."""
-        k = moment.constants
-        torque: Array = -k["mass"] * k["gravity"] * k["length"] * np.sin(moment.x)
-        return torque
-
     def drive(self, moment: StateSnapshot) -> Array:
         """Return the motor's torque (L, 1), including its back electromotive force."""
         k = moment.constants
@@ -220,33 +210,6 @@ class ServoSystem(System):
         voltage = duty * k["voltage"] - kt * moment.v
         torque = kt * voltage / moment.theta[:, _RESISTANCE]  # (3)
         return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
-
-    def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
-        """Return the torque (L, 1) of 1 m/s^2 of horizontal acceleration.
-
-        The pendulum swings in the plane of x and the vertical.
-
-        Args:
-            moment: state snapshot.
-            axis: horizontal axis of the acceleration.
-        """
-        if axis == "y":
-            return np.zeros_like(moment.x)
-        torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
-        return torque
-
-    def observe(
-        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
-    ) -> dict[str, Array]:
-        """Return the angle of the encoder.
-
-        Args:
-            x: (L, S, D) positions.
-            v: (L, S, D) velocities.
-            a: (L, S, D) accelerations.
-            constants: constants by name.
-        """
-        return {"q": x[:, :, 0]}
 
 
 class Servo(SystemSimulator):

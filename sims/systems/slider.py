@@ -80,19 +80,6 @@ class SliderSystem(System):
         """
         return moment.theta[:, :1] if axis == "x" else np.zeros_like(moment.x)
 
-    def observe(
-        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
-    ) -> dict[str, Array]:
-        """Return position and rate.
-
-        Args:
-            x: (L, S, D) positions.
-            v: (L, S, D) velocities.
-            a: (L, S, D) accelerations.
-            constants: constants by name.
-        """
-        return {"x": x[:, :, 0], "v": v[:, :, 0]}
-
 
 class Slider(SystemSimulator):
     """Slider; see `SliderSystem`."""

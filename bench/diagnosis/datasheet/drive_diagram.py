@@ -13,7 +13,7 @@ In between, the joint holds. The laws are those of the registered effects, evalu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -46,21 +46,8 @@ class _StaticJoint(System):
     name = "bench"
     says = "a joint between a drive and a load"
     kind: ClassVar[SystemKind] = "rotary"
-    parameters = ()
-    channels = ()
     coordinates = ("q",)
     rates = ("qd",)
-    states: ClassVar[Mapping[str, float]] = {}
-    sensed = ()
-
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Raise an error, because the joint does not move.
-
-        Args:
-            theta: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
 
     def weight(self, moment: StateSnapshot) -> Array:
         """Return the load as a force that acts against the drive."""
@@ -73,17 +60,6 @@ class _StaticJoint(System):
     def passive(self, moment: StateSnapshot) -> Array:
         """Return the given load."""
         return moment.inputs["load"]
-
-    def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Raise an error, because the joint has no channels.
-
-        Args:
-            x: unused.
-            v: unused.
-            a: unused.
-            constants: unused.
-        """
-        raise NotImplementedError
 
 
 class _Slide(_StaticJoint):
