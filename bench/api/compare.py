@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from bench.benchmark.runner.stored_study import Study
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.run_status import StudyOutcome
 
@@ -197,7 +198,7 @@ def begin_studies(
     experiment: Experiment,
     options: ComparisonOptions,
     report_missing: Callable[[str, str], None] = _warn_of_missing_problem,
-) -> list[study.Study]:
+) -> list[Study]:
     """Plan the studies of an experiment in new folders, without running them.
 
     Args:
@@ -280,7 +281,7 @@ def _connect_to_cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _report_study(started_study: study.Study, outcome: StudyOutcome) -> ComparisonResult:
+def _report_study(started_study: Study, outcome: StudyOutcome) -> ComparisonResult:
     """Write the tables and figures of a study that has been run, and return its results.
 
     Args:

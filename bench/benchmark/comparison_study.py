@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.storage.csv_reader import RunsTable
 from bench.benchmark.storage.result_file_consistency import (
     check_plan,
@@ -16,9 +17,7 @@ from bench.benchmark.storage.result_file_consistency import (
 )
 from bench.benchmark.storage.result_folder import (
     read_comparison,
-    read_configuration,
     read_salt,
-    reveal_salt,
     write_results,
 )
 from bench.benchmark.storage.run_journal import (
@@ -37,7 +36,6 @@ from bench.benchmark.storage.run_status import (
     RunEnd,
     RunStatus,
     StudyOutcome,
-    StudyProgress,
 )
 from sims.core.files import write_atomically
 from sims.core.simulator import InputError
@@ -48,10 +46,7 @@ if TYPE_CHECKING:
     from bench.benchmark.runner.worker_pools import Pool
 
 
-PrintLine = Callable[[str], None]
-
-
-class Comparison:
+class Comparison(Study):
     """Comparison of tuners x targets x seeds in a result folder; implements `study.Study`.
 
     Args:
@@ -68,15 +63,8 @@ class Comparison:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open a comparison for reading: its configuration is read, but no plan and no runs.
-
-        `plugins` are the plugin files of the configuration. `secret` is the salt from which hidden
-        targets are drawn; it stays None here, because only `begin` and `resume` need it.
-        """
-        self.folder = folder
-        self.configuration = read_configuration(folder)
-        self.plugins = self.configuration.plugins
-        self.secret: str | None = None
+        """Open a comparison for reading: its configuration is read, but no plan and no runs."""
+        super().__init__(folder)
         self.results: ExperimentRun | None = None
 
     @classmethod
@@ -98,7 +86,6 @@ class Comparison:
             check_classes_importable(new.experiment)
         hashes = compute_fingerprint(new.experiment, new.plugins)
         comparison = cls(new.create_folder(hashes, results.redraws))
-        comparison.secret = new.secret
         comparison._attach(results)
         return comparison
 
@@ -116,8 +103,7 @@ class Comparison:
         comparison = cls(folder)
         experiment = comparison.configuration.experiment
         comparison.plugins = check_resumable(folder, comparison.configuration, plugins)
-        comparison.secret = read_salt(folder, experiment)
-        comparison._attach(prepare_experiment(experiment, comparison.secret))
+        comparison._attach(prepare_experiment(experiment, read_salt(folder, experiment)))
         return comparison
 
     def _attach(self, results: ExperimentRun) -> None:
@@ -209,7 +195,7 @@ class Comparison:
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Run what is missing, and write the results; see `bench.studies.study.Study.make`.
+        """Run what is missing, and write the results; see `Study.run`.
 
         Args:
             jobs: number of worker processes; 0 for none.
@@ -243,8 +229,7 @@ class Comparison:
                 len(journal.statuses), len(results.plan), results.interrupted, results.stopped
             )
             if outcome.is_complete:
-                reveal_salt(self.folder, self.secret)
-                self.configuration = read_configuration(self.folder)
+                self.reveal_salt()
                 journal.delete_segments()
             else:
                 journal.close()
@@ -282,30 +267,14 @@ class Comparison:
             )
             write_atomically(self.folder / "identifiability.csv", table.to_csv(index=False))
 
-    def status(self) -> StudyProgress:
-        """Return what the folder contains and what is missing; another process may be running it.
-
-        Raises:
-            InputError: the folder is damaged.
-        """
-        configuration = self.configuration
-        run_ends = tuple(self._list_run_ends())
-        return StudyProgress(
-            configuration.experiment.name,
-            "runs finished",
-            configuration.fingerprint,
-            run_ends,
-            self._is_unfinished,
-        )
-
-    def _list_run_ends(self) -> list[RunEnd]:
+    def list_run_ends(self) -> list[RunEnd]:
         """List how every run ended, for `simgap status`.
 
         A finished comparison has one table of statuses. In an unfinished one they are in its
         segments (the journal and its parts), which are checked against the plan; a planned run that
         has not ended has no status.
         """
-        if not self._is_unfinished:
+        if not self.is_unfinished:
             return [_find_run_end(status.run, status) for status in self._list_finished_statuses()]
         planned_ids, experiment = read_plan(self.folder), self.configuration.experiment
         if planned_ids is not None:
@@ -321,7 +290,7 @@ class Comparison:
         ]
 
     @property
-    def _is_unfinished(self) -> bool:
+    def is_unfinished(self) -> bool:
         """True if the comparison is unfinished: its journal is deleted when all is written."""
         return (self.folder / SEGMENTS_FOLDER).exists()
 

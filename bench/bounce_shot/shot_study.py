@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from bench.benchmark.runner.experiment_runner import (
     no_progress,
 )
 from bench.benchmark.runner.plugin_discovery import describe_plugins
+from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.runner.study_creation import PreparedStudy
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
@@ -27,13 +28,11 @@ from bench.benchmark.runner.tuner_training import (
     get_weights_folder,
     train_or_load,
 )
-from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
-from bench.benchmark.storage.result_folder import read_configuration, read_salt, reveal_salt
+from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
-    StudyProgress,
 )
 from bench.bounce_shot import true_world, tuned_shots
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
@@ -54,10 +53,8 @@ from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
 from sims.vision import video_files
 
-PrintLine = Callable[[str], None]
 
-
-class BounceShotStudy:
+class BounceShotStudy(Study):
     """Study of shots by several methods, stored in a folder; implements `study.Study`.
 
     Args:
@@ -72,11 +69,7 @@ class BounceShotStudy:
         InputError: the folder does not contain such a study, or it is damaged.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Read the stored configuration of the study."""
-        self.folder = folder
-        self.configuration = read_configuration(folder)
-        self.plugins = self.configuration.plugins
+    counted = "shots made"
 
     @classmethod
     def begin(cls, new: PreparedStudy) -> BounceShotStudy:
@@ -102,7 +95,7 @@ class BounceShotStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
-        """Open an interrupted study to run what is missing; see `bench.studies.study.Study.resume`.
+        """Open an interrupted study to run what is missing; see `Study.resume`.
 
         Args:
             folder: result folder.
@@ -140,14 +133,12 @@ class BounceShotStudy:
     @cached_property
     def shots(self) -> list[ShotSetup]:
         """All shots of the study."""
-        experiment = self.configuration.experiment
-        salt = read_salt(self.folder, experiment) or experiment.salt
-        return draw_shots(experiment, self.config, salt)
+        return draw_shots(self.configuration.experiment, self.config, self.salt)
 
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Execute the missing shots; see `bench.studies.study.Study.make`.
+        """Execute the missing shots; see `Study.run`.
 
         Args:
             jobs: number of worker processes.
@@ -155,39 +146,19 @@ class BounceShotStudy:
             pool: worker pool; None to create one.
         """
         if reason := true_world.find_missing_requirement():
-            return self._finish_study(skipped=reason)
+            return self.count_finished(skipped=reason)
         if pool is not None or jobs:
             check_classes_importable(self.experiment)
-        try:
+
+        def make_missing_shots() -> None:
+            # The kinds of balls alternate, so a partial result covers all.
             missing_shots = list_missing_shots(self.folder, self.shots)
             if missing_shots:
                 _ShotStages(self, missing_shots, progress or no_progress).run(jobs, pool)
-        except KeyboardInterrupt:  # the kinds of balls alternate, so a partial result covers all
-            return self._finish_study(interrupted=True)
-        except PoolLostError as error:
-            return self._finish_study(stopped=str(error))
-        return self._finish_study()
 
-    def _finish_study(self, **why: Any) -> StudyOutcome:
-        """Return the outcome of a run of the study; reveal its salt if no shot is missing.
+        return self.finish(make_missing_shots)
 
-        A secret salt stays hidden as long as shots are missing, because it determines the balls.
-
-        Args:
-            **why: reason for which the run ended early (``interrupted``, ``stopped`` or
-                ``skipped``); empty if it did not.
-        """
-        missing_shots = list_missing_shots(self.folder, self.shots)
-        if not missing_shots and not why:
-            experiment = self.configuration.experiment
-            reveal_salt(self.folder, read_salt(self.folder, experiment))
-            self.configuration = read_configuration(self.folder)
-        return StudyOutcome(len(self.shots) - len(missing_shots), len(self.shots), **why)
-
-    def close(self) -> None:
-        """Close the study; it holds no open files."""
-
-    def status(self) -> StudyProgress:
+    def list_run_ends(self) -> list[RunEnd]:
         """Return which shots are stored and which are missing.
 
         Raises:
@@ -195,14 +166,10 @@ class BounceShotStudy:
         """
         check_shots(self.folder, self.shots)
         missing = {setup.name for setup in list_missing_shots(self.folder, self.shots)}
-        run_ends = tuple(
+        return [
             RunEnd(setup.name, setup.ball.name, MISSING_STATUS if setup.name in missing else "made")
             for setup in self.shots
-        )
-        configuration = self.configuration
-        return StudyProgress(
-            configuration.experiment.name, "shots made", configuration.fingerprint, run_ends
-        )
+        ]
 
     def report(self, print_line: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 from sims.core.plain_values import to_json_value
 
 if TYPE_CHECKING:
-    from bench.studies.study import Study
+    from bench.benchmark.runner.stored_study import Study
 
 
 JsonDocument = dict[str, Any]

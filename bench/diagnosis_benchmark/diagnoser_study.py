@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
@@ -33,17 +33,15 @@ from bench.benchmark.runner.plugin_discovery import (
     register_plugins,
 )
 from bench.benchmark.runner.run_fingerprint import check_unchanged
+from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.runner.study_creation import PreparedStudy
 from bench.benchmark.runner.tuner_process_reuse import find_preloadable_packages
 from bench.benchmark.runner.tuner_training import get_weights_folder as trained
-from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
-from bench.benchmark.storage.result_folder import read_configuration, reveal_salt
-from bench.benchmark.storage.result_folder import read_salt as kept_salt
+from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
-    StudyProgress,
 )
 from bench.core.plugin_registries import PartUnavailableError, diagnosers, simulators
 from bench.core.random_streams import PUBLIC_SALT, make_rng
@@ -67,7 +65,6 @@ from bench.diagnosis_benchmark.diagnoser_training import (
 )
 from sims.core.simulator import InputError
 
-PrintLine = Callable[[str], None]
 BASE_SOURCE_FOLDERS = (
     "sims",
     "bench/benchmark/problem",
@@ -88,7 +85,7 @@ _CASE_DRAW_SECONDS = 300.0
 """Maximum time to draw one case, seconds."""
 
 
-class DiagnosisStudy:
+class DiagnosisStudy(Study):
     """Comparison of diagnosers on cases, stored in a folder; implements `study.Study`.
 
     Args:
@@ -103,11 +100,11 @@ class DiagnosisStudy:
         InputError: the folder does not contain such a comparison, or it is damaged.
     """
 
+    counted = "answers given"
+
     def __init__(self, folder: Path) -> None:
-        """Read the stored configuration; the file of the answers is opened only by `run`."""
-        self.folder = folder
-        self.configuration = read_configuration(folder)
-        self.plugins = self.configuration.plugins
+        super().__init__(folder)
+        # The file of the answers is opened only by `run`.
         self._answer_store: AnswerStore | None = None
 
     @classmethod
@@ -181,39 +178,22 @@ class DiagnosisStudy:
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Collect the missing answers; see `bench.studies.study.Study.make`.
+        """Collect the missing answers; see `Study.run`.
 
         Args:
             jobs: number of worker processes.
             progress: makes progress callbacks; None for no progress output.
             pool: worker pool; None to create one.
         """
-        self._answer_store = AnswerStore(self.folder)
-        try:
-            _EvaluationRun(self, self._answer_store, progress or no_progress).run(jobs, pool)
-        except KeyboardInterrupt:
-            return self._finish_study(interrupted=True)
-        except PoolLostError as error:
-            return self._finish_study(stopped=str(error))
-        finally:
-            self.close()
-        return self._finish_study()
 
-    def _finish_study(self, **why: Any) -> StudyOutcome:
-        """Return the outcome of a run of the study; reveal its salt if no answer is missing.
+        def run_missing() -> None:
+            self._answer_store = AnswerStore(self.folder)
+            try:
+                _EvaluationRun(self, self._answer_store, progress or no_progress).run(jobs, pool)
+            finally:
+                self.close()
 
-        A secret salt stays hidden as long as answers are missing, because it determines the cases.
-
-        Args:
-            **why: reason for which the run ended early (``interrupted`` or ``stopped``); empty
-                if it did not.
-        """
-        run_ends = self.status().ends
-        missing = sum(end.status == MISSING_STATUS for end in run_ends)
-        if not missing and not why:
-            reveal_salt(self.folder, kept_salt(self.folder, self.configuration.experiment))
-            self.configuration = read_configuration(self.folder)
-        return StudyOutcome(len(run_ends) - missing, len(run_ends), **why)
+        return self.finish(run_missing)
 
     def close(self) -> None:
         """Close the answer file and release its lock."""
@@ -226,7 +206,7 @@ class DiagnosisStudy:
         """All stored answers, by case."""
         return read_answers(self.folder)
 
-    def status(self) -> StudyProgress:
+    def list_run_ends(self) -> list[RunEnd]:
         """Return which answers are stored and which are missing, one entry per case and diagnoser.
 
         Cases whose hidden cause the sensors cannot show count as done, because no
@@ -247,9 +227,7 @@ class DiagnosisStudy:
                 else:
                     row = answer["rows"][name]
                     run_ends.append(RunEnd(label, name, row["status"], row["reason"]))
-        configured = self.configuration
-        name = configured.experiment.name
-        return StudyProgress(name, "answers given", configured.fingerprint, tuple(run_ends))
+        return run_ends
 
     def report(self, print_line: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.
@@ -284,9 +262,7 @@ class _EvaluationRun:
         self._study, self._answer_store, self._progress = study, answer_store, progress
         self._experiment = study.configuration.experiment
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
-        self._salt = (
-            kept_salt(study.folder, self._experiment) or self._experiment.salt or PUBLIC_SALT
-        )
+        self._salt = study.salt or PUBLIC_SALT
         self._limits = AnswerLimits(
             self._experiment.budget, self._experiment.timeout, self._experiment.memory
         )

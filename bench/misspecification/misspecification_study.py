@@ -8,24 +8,22 @@ of comparisons.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.benchmark.comparison_study import Comparison
+from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
-    read_configuration,
     read_salt,
-    reveal_salt,
 )
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
-    StudyProgress,
 )
 from bench.misspecification.calibration import (
     MODEL_LABELS,
@@ -44,17 +42,14 @@ if TYPE_CHECKING:
     from bench.benchmark.runner.study_creation import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
-PrintLine = Callable[[str], None]
 CALIBRATION_FILE = "calibration.csv"
 """Calibration recording from which explain extends the simulator."""
 EXTENDED_MODEL_FILE = "explain/extended.toml"
 """Extended simulator that explain writes."""
 
 
-class MisspecificationStudy:
+class MisspecificationStudy(Study):
     """Study of tuners in a simulator with a missing effect and in the extended one.
-
-    It implements `bench.studies.study.Study`.
 
     Args:
         folder: result folder of such a study.
@@ -67,12 +62,6 @@ class MisspecificationStudy:
     Raises:
         InputError: the folder does not contain such a study, or it is damaged.
     """
-
-    def __init__(self, folder: Path) -> None:
-        """Read the stored configuration of the study."""
-        self.folder = folder
-        self.configuration = read_configuration(folder)
-        self.plugins = self.configuration.plugins
 
     @classmethod
     def begin(cls, new: PreparedStudy) -> MisspecificationStudy:
@@ -95,7 +84,7 @@ class MisspecificationStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecificationStudy:
-        """Open an interrupted study to run what is missing; see `bench.studies.study.Study.resume`.
+        """Open an interrupted study to run what is missing; see `Study.resume`.
 
         Args:
             folder: result folder.
@@ -110,7 +99,7 @@ class MisspecificationStudy:
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Run what is missing; see `bench.studies.study.Study.make`.
+        """Run what is missing; see `Study.run`.
 
         Args:
             jobs: number of worker processes.
@@ -142,8 +131,7 @@ class MisspecificationStudy:
                     outcome.stopped,
                     outcome.skipped,
                 )
-        reveal_salt(self.folder, read_salt(self.folder, self.configuration.experiment))
-        self.configuration = read_configuration(self.folder)
+        self.reveal_salt()
         segments = self.folder / SEGMENTS_FOLDER
         if segments.is_dir() and not any(segments.iterdir()):
             segments.rmdir()
@@ -174,14 +162,9 @@ class MisspecificationStudy:
         # If only one of the two files exists, the process was killed while writing.
         for file in (table, table.with_suffix(".toml")):
             file.unlink(missing_ok=True)
-        write_calibration_recording(experiment, self._get_salt(), table)
+        write_calibration_recording(experiment, self.salt, table)
         run_explain(table, experiment, jobs)
         step()
-
-    def _get_salt(self) -> str:
-        """Return the salt of the calibration recording: the secret one, or else the public one."""
-        experiment = self.configuration.experiment
-        return read_salt(self.folder, experiment) or experiment.salt
 
     def _open_comparison(self, model: str, jobs: int) -> Comparison:
         """Create or resume the comparison in one of the simulators.
@@ -227,35 +210,37 @@ class MisspecificationStudy:
         extended = load_extended(self.folder / EXTENDED_MODEL_FILE)
         return make_extended_experiment(experiment, list_effect_coefficients(extended, kind))
 
-    def close(self) -> None:
-        """Close the study; its comparisons are opened when they run."""
+    @property
+    def is_unfinished(self) -> bool:
+        """True if results remain to be written, here or in one of the comparisons."""
+        comparisons = [Comparison(self.folder / m) for m in MODEL_LABELS if self._has_begun(m)]
+        return (self.folder / SEGMENTS_FOLDER).exists() or any(
+            comparison.is_unfinished for comparison in comparisons
+        )
 
-    def status(self) -> StudyProgress:
+    def _has_begun(self, model: str) -> bool:
+        """Return whether the comparison in one of the two simulators has a folder."""
+        return (self.folder / model / CONFIGURATION_FILE).is_file()
+
+    def list_run_ends(self) -> list[RunEnd]:
         """Return which runs are stored and which are missing, in both simulators.
 
         Raises:
             InputError: the study is damaged.
         """
-        configuration = self.configuration
         run_ends: list[RunEnd] = []
-        is_unfinished = (self.folder / SEGMENTS_FOLDER).exists()
         for model in MODEL_LABELS:
-            if not (self.folder / model / CONFIGURATION_FILE).is_file():
+            if self._has_begun(model):
+                run_ends += [
+                    RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
+                    for e in Comparison(self.folder / model).list_run_ends()
+                ]
+            else:
                 run_ends += [
                     RunEnd(f"{model} {i}", model, MISSING_STATUS)
                     for i in range(self._count_planned_runs())
                 ]
-                continue
-            progress = Comparison(self.folder / model).status()
-            is_unfinished = is_unfinished or progress.is_unfinished
-            run_ends += [
-                RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
-                for e in progress.ends
-            ]
-        name = configuration.experiment.name
-        return StudyProgress(
-            name, "runs finished", configuration.fingerprint, tuple(run_ends), is_unfinished
-        )
+        return run_ends
 
     def report(self, print_line: PrintLine) -> int:
         """Write tables and figures, and print a summary.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
@@ -19,85 +19,8 @@ from bench.benchmark.storage.result_folder import (
 from bench.core.random_streams import generate_salt
 
 if TYPE_CHECKING:
-    from bench.benchmark.comparison_study import PrintLine
     from bench.benchmark.problem.experiment import Experiment
-    from bench.benchmark.runner.experiment_runner import ProgressFactory
-    from bench.benchmark.runner.study_creation import PreparedStudy
-    from bench.benchmark.runner.worker_pools import Pool
-    from bench.benchmark.storage.result_folder import FolderConfiguration
-    from bench.benchmark.storage.run_status import StudyOutcome, StudyProgress
-
-
-class Study(Protocol):
-    """A study in its result folder.
-
-    ``Kind(folder)`` opens a study for status and report, without disturbing a process that runs it.
-    `begin_studies` and `resume_study` give a study that can be run.
-
-    Attributes:
-        folder: result folder.
-        configuration: configuration of the study.
-    """
-
-    folder: Path
-    configuration: FolderConfiguration
-
-    def __init__(self, folder: Path) -> None: ...
-
-    @classmethod
-    def begin(cls, new: PreparedStudy) -> Study:
-        """Check and plan a study in a new folder.
-
-        Args:
-            new: folder, experiment, plugins and salt, from `prepare_study`.
-
-        Raises:
-            InputError: the experiment has an error.
-        """
-        ...
-
-    @classmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Study:
-        """Open an interrupted study to complete it.
-
-        Args:
-            folder: result folder.
-            plugins: additional plugin files; the study's own are loaded in any case.
-
-        Raises:
-            InputError: the folder is damaged, or something relevant has changed since.
-        """
-        ...
-
-    def run(
-        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
-    ) -> StudyOutcome:
-        """Run the runs of the plan that are not yet stored in the folder.
-
-        Args:
-            jobs: number of worker processes; 0 to run everything in this process.
-            progress: called for every step.
-            pool: pool to use instead, for example of a cluster.
-
-        Returns:
-            How far the study came, also if it was interrupted.
-
-        Raises:
-            InputError: workers cannot be started; finished runs are stored.
-        """
-        ...
-
-    def close(self) -> None:
-        """Release the folder without running what is missing."""
-        ...
-
-    def status(self) -> StudyProgress:
-        """Return what the folder contains, and what is missing."""
-        ...
-
-    def report(self, print_line: PrintLine) -> int:
-        """Write tables and figures, print the results, and return the number of failures."""
-        ...
+    from bench.benchmark.runner.stored_study import PrintLine, Study
 
 
 def begin_studies(

@@ -23,9 +23,9 @@ from bench.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
+    from bench.benchmark.runner.stored_study import Study
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.run_status import StudyOutcome
-    from bench.studies.study import Study
 
 _UNCHANGED_BY_RESUME = ("jobs", "plugins", "cluster", "force", "pdf", "progress")
 """Options that may be given together with ``--resume``."""

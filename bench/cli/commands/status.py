@@ -10,8 +10,8 @@ from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDo
 from bench.cli.shared_options import parse_path
 
 if TYPE_CHECKING:
+    from bench.benchmark.runner.stored_study import Study
     from bench.benchmark.storage.run_status import RunEnd, StudyProgress
-    from bench.studies.study import Study
 
 _MAX_LISTED_RUNS = 20
 """Maximum number of runs that are listed without ``--runs``."""
