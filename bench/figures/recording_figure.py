@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.figures.figure_output import render_png_and_pdf, write_figure
+from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
     BLUE,
     HELD_OUT_GREY,
@@ -132,7 +133,8 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
     if part.run.held_out:
         axis.axvspan(float(times[0]), float(times[-1]), color=HELD_OUT_GREY, linewidth=0)
     missing = np.isnan(values)
-    t, y = _reduce_points(times, values)
+    shown = thin_signal(values, _MAX_POINTS_PER_RUN)
+    t, y = times[shown], values[shown]
     # A sample between two missing ones forms no line and needs a marker to be visible.
     marked = values.size <= _MAX_SAMPLES_WITH_MARKERS or missing.mean() > 0.2
     colour = _HELD_OUT if part.run.held_out else _FITTING
@@ -142,30 +144,6 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
         foot = np.full(missing.sum(), 0.02)
         transform = axis.get_xaxis_transform()
         axis.plot(times[missing], foot, "|", color="black", markersize=5, transform=transform)
-
-
-def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
-    """Reduce a signal (T,) to about `_MAX_POINTS_PER_RUN` points: minimum and maximum of each part.
-
-    The curve then looks the same, and the file stays small.
-
-    Args:
-        times: (T,) times in seconds.
-        values: (T,) signal, NaN where missing.
-    """
-    if values.size <= _MAX_POINTS_PER_RUN:
-        return times, values
-    size = -(-values.size // (_MAX_POINTS_PER_RUN // 2))
-    kept_indices = set()
-    for start in range(0, values.size, size):
-        stretch = values[start : start + size]
-        if np.isfinite(stretch).any():
-            kept_indices |= {start + int(np.nanargmin(stretch)), start + int(np.nanargmax(stretch))}
-        else:
-            # One missing sample keeps the gap open.
-            kept_indices.add(start)
-    rows = np.array(sorted(kept_indices))
-    return times[rows], values[rows]
 
 
 def _style_panels(axes: Sequence[Axes], placed_runs: Sequence[_PlacedRun]) -> None:

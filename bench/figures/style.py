@@ -8,7 +8,9 @@ settings and open figures are unchanged.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
@@ -284,6 +286,17 @@ def make_panel_grid(
 
     figure = NotebookFigure(figsize=size, layout=layout)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+@contextmanager
+def apply_settings(settings: Mapping[Any, Any]) -> Iterator[None]:
+    """Apply settings of Matplotlib while figures are drawn or written; hide missing glyphs."""
+    from matplotlib import rc_context
+
+    with rc_context(dict(settings)), warnings.catch_warnings():
+        # A title may be in any script; characters that the font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph")
+        yield
 
 
 def set_title(axis: Axes, title: str) -> None:

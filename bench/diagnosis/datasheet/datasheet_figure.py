@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,7 +57,7 @@ _MAX_DIAGRAM_HEIGHT = 0.36
 """Maximum height of the diagram, as a share of the page height."""
 _LETTERS = 110
 """Maximum number of characters of a line across the page."""
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8,
     "text.usetex": False,
@@ -79,7 +77,7 @@ _FOOT_HEIGHT = 0.045
 
 def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
     """Render the diagram as SVG for the page, and as PDF if requested."""
-    with _apply_sheet_style():
+    with style.apply_settings(STYLE):
         figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
         draw_diagram(axes[0, 0], diagram)
         pdf = figure_output.render_pdf(figure) if is_pdf_wanted() else None
@@ -137,7 +135,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
 
 def render_pdf(content: SheetContent) -> bytes:
     """Render the sheet as a PDF of one page."""
-    with _apply_sheet_style():
+    with style.apply_settings(STYLE):
         return figure_output.render_pdf(draw_sheet(content))
 
 
@@ -328,14 +326,3 @@ def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float
         )
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, 34))
     figure.text(x, y, text, va="top", linespacing=1.4, fontsize=7.5)
-
-
-@contextmanager
-def _apply_sheet_style() -> Iterator[None]:
-    """Apply the Matplotlib style of data sheets in a `with` block; hide missing-glyph warnings."""
-    from matplotlib import rc_context
-
-    with rc_context(_STYLE), warnings.catch_warnings():
-        # A title may be in any script; characters that the font lacks are drawn as boxes.
-        warnings.filterwarnings("ignore", message="Glyph")
-        yield

@@ -8,9 +8,7 @@ requested (`bench.figures.figure_settings`). Texts from files are never parsed a
 from __future__ import annotations
 
 import textwrap
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -34,8 +32,8 @@ from bench.diagnosis.report.figure_panels import (
     EXTENDED_MODEL_LINE,
     LONGEST_NAME,
     MAX_OUTLINED_DOTS,
+    MAX_SAMPLES,
     RunView,
-    decimate,
     draw_gap_location_panel,
     draw_profile_panel,
     format_profile_label,
@@ -54,6 +52,7 @@ from bench.diagnosis.verdict import Candidate
 from bench.figures import figure_output
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
+from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,
@@ -61,6 +60,7 @@ from bench.figures.style import (
     NOISE_BAND_GREY,
     SKY_BLUE,
     ZERO_LINE_GREY,
+    apply_settings,
     make_panel_grid,
 )
 from bench.figures.text_layout import break_name, count_max_lines, measure_text_width
@@ -435,7 +435,7 @@ def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     figure_names = list_figure_names(report)
     if name not in figure_names:
         raise make_unknown_name_error("figure", name, figure_names)
-    with _apply_style():
+    with apply_settings(_STYLE):
         figure = _FIGURE_FUNCTIONS[name](report)
         # Ticks take their style from the settings that are active when they are first drawn.
         figure.draw_without_rendering()
@@ -461,7 +461,7 @@ class RenderedFigure(NamedTuple):
 
 def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
     """Draw all figures and render their files, by name."""
-    with _apply_style():
+    with apply_settings(_STYLE):
         # The settings must stay active, because text is laid out again when a figure is written.
         figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
         rendered = {}
@@ -480,17 +480,6 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
             )
             rendered["robot"] = rendered["robot"]._replace(joint_positions=positions)
         return rendered
-
-
-@contextmanager
-def _apply_style() -> Iterator[None]:
-    """Apply the style settings while figures are drawn or written."""
-    from matplotlib import rc_context
-
-    with rc_context(_STYLE), warnings.catch_warnings():
-        # A title may be in any script; characters that the font lacks are drawn as boxes.
-        warnings.filterwarnings("ignore", message="Glyph")
-        yield
 
 
 def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, float]:
@@ -578,7 +567,7 @@ def _draw_signal(
     times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.
     signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
-    shown_samples = decimate(signals[0])
+    shown_samples = thin_signal(signals[0], MAX_SAMPLES)
     t = times[shown_samples]
     measured, before, after = (signal[shown_samples] for signal in signals)
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.diagnosis.report.effect_and_unit_text import format_label, sanitise
 from bench.diagnosis.report.report_data import (
@@ -27,7 +25,6 @@ from bench.figures.style import (
     ZERO_LINE_GREY,
 )
 from bench.figures.text_layout import break_name
-from sims.core.simulator import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -361,16 +358,3 @@ def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
     return f"Run {shorten_label(view.data_split.names[view.row])}, the {kind} {reason}"
-
-
-def decimate(values: Array) -> NDArray[np.intp]:
-    """Select about `MAX_SAMPLES` samples at most: minimum and maximum of each part of the run."""
-    if values.size <= MAX_SAMPLES:
-        return np.arange(values.size)
-    edges = np.linspace(0, values.size, MAX_SAMPLES // 2 + 1).astype(int)
-    # A missing sample is neither minimum nor maximum.
-    low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
-    chosen = []
-    for begin, end in pairwise(edges):
-        chosen += [begin + np.argmin(low[begin:end]), begin + np.argmax(high[begin:end])]
-    return np.unique(chosen)

@@ -18,13 +18,14 @@ from bench.diagnosis.report.figure_panels import (
     BASE_MODEL_LINE,
     EXTENDED_MODEL_LINE,
     MAX_OUTLINED_DOTS,
+    MAX_SAMPLES,
     RunView,
-    decimate,
     format_selected_run,
     has_extended_model,
     shorten_label,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,
@@ -225,7 +226,7 @@ def _draw_motion(
         a[view.row, : len(times), row.motion_channel]
         for a in (split.observed, split.before, split.after)
     ]
-    shown_samples = decimate(signals[0])
+    shown_samples = thin_signal(signals[0], MAX_SAMPLES)
     measured, before, after = (signal[shown_samples] for signal in signals)
     t = times[shown_samples]
     size = 4.0 if shown_samples.size < 250 else 3.4  # points: smaller dots for many samples
@@ -294,7 +295,7 @@ def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: i
     models = ("before", "after") if has_extended_model(report) else ("before",)
     for model in models:
         residual = _compute_scaled_residual(report, view, c, model)
-        rows = decimate(residual)
+        rows = thin_signal(residual, MAX_SAMPLES)
         line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
         if model == "after":
             line_style = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}

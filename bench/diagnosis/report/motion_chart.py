@@ -7,7 +7,6 @@ from math import ceil, floor, isfinite, log10
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.diagnosis.report.effect_and_unit_text import (
     format_label,
@@ -19,6 +18,7 @@ from bench.diagnosis.report.figure_panels import has_extended_model, select_wors
 from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_joint_rows
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.report.summary_text import list_data_splits
+from bench.figures.signal_thinning import select_extreme_samples
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
 from bench.figures.text_layout import shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
@@ -142,35 +142,6 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
         max_rows: maximum number of samples of a run in the chart.
     """
     return max(1, max_rows // (6 if has_extended_model(report) else 4))
-
-
-def select_extreme_samples(signals: Sequence[Array], part_count: int) -> NDArray[np.intp]:
-    """Select the samples at which any signal has its minimum or maximum within a part of the run.
-
-    The first and the last sample are included.
-
-    Args:
-        signals: Signals (T,), NaN where missing.
-        part_count: Number of parts, of nearly equal length.
-
-    Returns:
-        Sorted indices of the samples.
-    """
-    size = len(signals[0])
-    edges = np.linspace(0, size, part_count + 1).astype(int)[:-1]
-    part_length = np.diff([*edges, size]).max()
-    # Each row holds one part; shorter parts are padded with values that are never extremes.
-    indices = np.minimum(edges[:, None] + np.arange(part_length), size - 1)
-    is_inside = indices < np.append(edges[1:], size)[:, None]
-    rows = np.arange(len(edges))
-    selected_samples = [np.array([0, size - 1])]
-    for signal in signals:
-        for sign in (1.0, -1.0):
-            values = np.where(
-                is_inside & np.isfinite(signal[indices]), sign * signal[indices], -np.inf
-            )
-            selected_samples.append(indices[rows, values.argmax(axis=1)])
-    return np.unique(np.concatenate(selected_samples))
 
 
 def _format_rows(

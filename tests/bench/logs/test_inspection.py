@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
-from bench.figures.recording_figure import _reduce_points
+from bench.figures.signal_thinning import thin_signal
 from bench.logs.quality.noise_estimation import count_gaps, estimate_noise
 from bench.logs.recording_loading import load_recording
 from bench.logs.recording_summary import format_summary
@@ -149,12 +149,13 @@ def test_thinning_keeps_the_extremes():
     t = np.arange(100_000) / 100
     y = np.sin(t)
     y[31_415], y[27_182], y[50_000:60_000] = 9.0, -9.0, np.nan
-    thin_t, thin_y = _reduce_points(t, y)
+    kept = thin_signal(y, 4000)
+    thin_t, thin_y = t[kept], y[kept]
     assert thin_t.size <= 4000
     assert (np.diff(thin_t) > 0).all()
     assert (np.nanmax(thin_y), np.nanmin(thin_y)) == (9.0, -9.0)
     assert np.isnan(thin_y[(thin_t > 501) & (thin_t < 599)]).all()
-    assert _reduce_points(t[:4000], y[:4000])[0].size == 4000
+    assert thin_signal(y[:4000], 4000).size == 4000
 
 
 def test_faults_are_one_line(odd, tmp_path, capsys):

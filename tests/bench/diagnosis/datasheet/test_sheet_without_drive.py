@@ -15,6 +15,7 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.datasheet import datasheet_figure
 from bench.diagnosis.datasheet.datasheet import DataSheet
 from bench.diagnosis.datasheet.datasheet_subject import make_subject
+from bench.figures.style import apply_settings
 from tests.bench.diagnosis.explained_samples import recording
 from tests.bench.figures.figure_readability import unreadable
 
@@ -54,7 +55,7 @@ def test_there_is_no_drive_and_no_diagram_in_any_file(swing: Path) -> None:
 
 def test_the_printed_page_says_it_too_and_can_be_read(swing: Path) -> None:
     made = datasheet(swing / "swing.csv", explained=swing / "sheet" / "explained")
-    with datasheet_figure._apply_sheet_style():
+    with apply_settings(datasheet_figure.STYLE):
         page = datasheet_figure.draw_sheet(made)
         assert unreadable(page) == []
     assert not page.axes, "no diagram is drawn"
@@ -65,7 +66,7 @@ def test_the_printed_page_says_it_too_and_can_be_read(swing: Path) -> None:
 def test_a_driven_joint_has_its_diagram_and_a_page_that_can_be_read(sheet: DataSheet) -> None:
     assert sheet.is_driven
     assert "diagram" in sheet.document()
-    with datasheet_figure._apply_sheet_style():
+    with apply_settings(datasheet_figure.STYLE):
         page = datasheet_figure.draw_sheet(sheet)
         assert unreadable(page) == []
     assert len(page.axes) == 1

@@ -14,7 +14,6 @@ from bench.diagnosis.report.cause_text import (
 from bench.diagnosis.report.explanation_figures import render_figures
 from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.figure_panels import (
-    decimate,
     draw_profile_panel,
     select_gap_locations,
     select_informative_profiles,
@@ -120,16 +119,6 @@ def test_of_many_channels_the_worst_three_are_shown():
     wide.before[:, :, [1, 4, 5]] += 5.0
     shot = select_worst_run(replace(told, held_out=wide, channels=told.channels * 3))
     assert shot.channels == [1, 4, 5]
-
-
-def test_long_runs_are_thinned_without_losing_peaks():
-    values = np.sin(np.arange(50_000) / 50.0)
-    values[[12_345, 23_456]] = 9.0, -7.0
-    values[30_000:40_000] = np.nan
-    rows = decimate(values)
-    assert rows.size <= 3000
-    assert {12_345, 23_456} <= set(rows.tolist())
-    assert decimate(values[:3000]).size == 3000
 
 
 def test_profiles_are_chosen_by_how_much_they_stand_out_one_a_variable_first():

@@ -12,9 +12,9 @@ from bench.diagnosis.report.motion_chart import (
     MAX_ROWS,
     MIN_ROWS_PER_CHANNEL,
     build_motion_table,
-    select_extreme_samples,
 )
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
+from bench.figures.signal_thinning import select_extreme_samples
 from tests.bench.diagnosis.sample_report_data import make_report
 
 
