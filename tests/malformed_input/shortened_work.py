@@ -52,7 +52,7 @@ SHORT = {
     "bench.datasets.dataset_download._download_content": _no_network,
     "bench.benchmark.comparison_report.build_tables": _cut,
     "bench.studies.comparison_verification.build_tables": _cut,
-    "bench.suite.multi_problem_statistics.ComparisonCollection.build_tables": _cut,
+    "bench.suite.multi_problem_report.ComparisonCollection.build_tables": _cut,
     "bench.benchmark.storage.provenance.distributions": _nothing,
     "bench.diagnosis.explain._ExplainRun.run": _cut,
     "bench.conformance.run_checks._run_all_checks": _cut,

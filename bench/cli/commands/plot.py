@@ -79,7 +79,7 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     if not options.out:
         raise InputError("several comparisons have a joint result: give its folder with --out DIR")
     from bench.benchmark.comparison_study import Comparison
-    from bench.suite.multi_problem_statistics import compare_across_problems
+    from bench.suite.multi_problem_report import compare_across_problems
 
     for folder in options.runs:
         if not isinstance(study := open_study(folder), Comparison):

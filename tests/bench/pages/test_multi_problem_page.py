@@ -6,13 +6,17 @@ import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.benchmark.statistics.tuner_ranking import MIN_PROBLEMS_FOR_RANKS
-from bench.bounce_shot.hit_rate_table import build_result_table, compute_wilson_interval
+from bench.bounce_shot.hit_rate_table import build_result_table
 from bench.bounce_shot.shot_report import render_page
 from bench.figures.figure_output import render_all_formats
 from bench.figures.style import make_panel_grid
-from bench.suite.multi_problem_page import render_multi_problem_page
-from bench.suite.multi_problem_statistics import ComparisonCollection, LoadedComparison
+from bench.suite.multi_problem_report import (
+    ComparisonCollection,
+    LoadedComparison,
+    render_multi_problem_page,
+)
 from tests.bench.figures.sample_comparisons import stored
 from tests.browser import WIDTHS, Opened
 
@@ -45,9 +49,9 @@ def page_of(count, tmp_path, drop=None):
     together = ComparisonCollection([one] * count, one.statistics.curves.list_tuners())
     frames = together.build_tables()
     pictures = dict.fromkeys(["runtime-distribution", "critical-difference"], drawn())
-    several = together.build_page_data(frames, pictures, [tmp_path / "a <b>"], tmp_path / "all")
+    page = render_multi_problem_page(together, frames, pictures, ["simgap", "plot", "a <b>"])
     file = tmp_path / "report.html"
-    file.write_text(render_multi_problem_page(several), encoding="utf-8")
+    file.write_text(page, encoding="utf-8")
     return file, frames
 
 
@@ -103,7 +107,7 @@ def test_a_bounce_shot_has_a_page(browser, tmp_path):
     pictures = dict.fromkeys(["success", "off", "shots"], drawn())
     page = render_page(load_experiment("bounce-shot"), "results/shot", lines, rows, pictures)
     file.write_text(page, encoding="utf-8")
-    low, high = (round(100 * end, 1) for end in compute_wilson_interval(60, 60))
+    low, high = (round(100 * end, 1) for end in compute_proportion_interval(60, 60))
     assert (low, high) == (94.0, 100.0)
     with Opened(browser, file) as one:
         said = one.text(".conclusion").replace("\xa0", " ")

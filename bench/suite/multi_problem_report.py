@@ -1,10 +1,14 @@
-"""Joint statistics over several comparisons: mean ranks, runtime distribution, ERT and pairs."""
+"""Joint statistics over several comparisons, and their page (`simgap plot A B --out DIR`).
+
+They are mean ranks, runtime distributions, expected running times (ERT) and tests of pairs.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,11 +16,12 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_figures import draw_critical_difference_figure
+from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.comparison_tables import add_trust_column
-from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.error_curves import RunCurves, select_checkpoints
 from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,
     compute_solved_fraction,
@@ -29,13 +34,17 @@ from bench.benchmark.statistics.tuner_ranking import (
 )
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
-from bench.figures.style import TunerStyles, add_trust_note, finish_figure
-from bench.pages.chart_figure import draw_chart
-from bench.suite.multi_problem_page import (
-    MultiProblemPageData,
-    make_runtime_panel,
-    render_multi_problem_page,
+from bench.figures.style import (
+    PANEL_TITLES,
+    MarkStyle,
+    TunerStyles,
+    add_trust_note,
+    finish_figure,
+    get_mark_style,
 )
+from bench.pages.chart import Axis, Panel, PrintedFigure, Series
+from bench.pages.chart_figure import draw_chart
+from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
 
@@ -43,6 +52,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_TEMPLATE = Path(__file__).with_name("multi_problem.html")
+_DIGITS = 7
+"""Number of significant digits of values that are in no file next to the page."""
+_METRIC_LABELS = {
+    "param_error": "mean parameter error [training widths], median",
+    "stiff_error": "error along stiff directions [training widths], median",
+    "heldout_error": "RMSE on held-out runs, median",
+    "obs_error": "RMSE on the runs tuned on, median",
+}
 _MIN_TUNERS_FRIEDMAN = 3
 """Minimum number of tuners for Friedman's test."""
 
@@ -109,10 +127,8 @@ def compare_across_problems(
         print_line(f"figure  {figure_files[0]}")
         files += figure_files
     files.append(out / REPORT_FILE)
-    write_atomically(
-        files[-1],
-        render_multi_problem_page(collection.build_page_data(frames, pictures, folders, out)),
-    )
+    command = ["simgap", "plot", *map(str, folders), "--out", str(out)]
+    write_atomically(files[-1], render_multi_problem_page(collection, frames, pictures, command))
     print_line(f"report  {files[-1]}")
     return MultiProblemResult(collection, files)
 
@@ -207,36 +223,6 @@ class ComparisonCollection:
             )
         return frames
 
-    def build_page_data(
-        self,
-        frames: Mapping[str, pd.DataFrame],
-        pictures: Mapping[str, FigureFiles],
-        folders: Sequence[Path],
-        out: Path,
-    ) -> MultiProblemPageData:
-        """Build the data of the page.
-
-        Args:
-            frames: tables by name.
-            pictures: rendered figures by name.
-            folders: result folders of the comparisons.
-            out: folder of the page.
-        """
-        friedman, p_values = self.rank_tests if self.has_enough_problems else (float("nan"), None)
-        parts = [(part.experiment, part.statistics) for part in self.parts]
-        return MultiProblemPageData(
-            parts,
-            self.tuners,
-            self.mean_ranks,
-            p_values,
-            friedman,
-            self._compute_runtime_distributions(),
-            frames,
-            pictures,
-            [str(folder) for folder in folders],
-            str(out),
-        )
-
     @property
     def has_trusted_runs(self) -> bool:
         """True if tuners ran without isolation in any of the comparisons."""
@@ -264,19 +250,28 @@ class ComparisonCollection:
         It is the share of solved targets against the number of simulations. The tuners are ordered
         by mean rank. An `Experiment` of all tuners is made for their styles only.
         """
-        order = list(self.mean_ranks.mean().sort_values(kind="stable").index)
         experiment = Experiment(
             "all",
             f"{len(self.mean_ranks)} problems",
             tuners=tuple(TunerEntry(t, t) for t in self.tuners),
         )
-        style = TunerStyles(experiment, order)
-        mark_styles = [(name, style.get_mark_style(name)) for name in style.order]
-        panel, table = make_runtime_panel(mark_styles, self._compute_runtime_distributions())
+        style = TunerStyles(experiment, list(self.styles))
+        panel, table = self.make_runtime_panel()
         figure, axes = draw_chart([panel], {panel.table: table})
         caption = "Mean over problems, each with equal weight."
         finish_figure(figure, axes, style, experiment, caption)
         return figure
+
+    @property
+    def styles(self) -> dict[str, MarkStyle]:
+        """Style of each tuner, in the order of their mean ranks, the best first."""
+        order = self.mean_ranks.mean().sort_values(kind="stable").index
+        places = {name: place for place, name in enumerate(self.tuners)}
+        return {str(name): get_mark_style(places[str(name)]) for name in order}
+
+    def make_runtime_panel(self) -> tuple[Panel, pd.DataFrame]:
+        """Make the panel of runtime distributions over all problems, with its table."""
+        return _make_runtime_panel(self.styles, self._compute_runtime_distributions())
 
     def _compute_runtime_distributions(self) -> dict[str, Array]:
         """Compute the runtime distribution of each tuner (101,), the mean over problems.
@@ -315,3 +310,114 @@ def _compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[s
             }
         )
     return shares
+
+
+def _make_runtime_panel(
+    styles: Mapping[str, MarkStyle], shares: Mapping[str, Array]
+) -> tuple[Panel, pd.DataFrame]:
+    """Make the panel of runtime distributions over all problems, with its table.
+
+    Args:
+        styles: tuners in the order of the legend, each with its style.
+        shares: by tuner, the share reached after 0, 1, 2, ... hundredths of each problem's budget.
+    """
+    tables = [
+        pd.DataFrame({"tuner": name, "hundredths": np.arange(len(share)), "share": share})
+        for name, share in shares.items()
+    ]
+    series = tuple(
+        Series(name, "share", mark_style, {"tuner": name}, draw="steps")
+        for name, mark_style in styles.items()
+    )
+    x_axis = Axis("simulations used, in hundredths of the problem's budget", scales=("linear",))
+    # A margin of 0.02, so that lines at 0 and 1 are visible.
+    y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
+    panel = Panel("All problems", "runtime", "hundredths", series, x_axis, y_axis)
+    return panel, pd.concat(tables, ignore_index=True)
+
+
+def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], pd.DataFrame]:
+    """Make the panels of error against simulations, one per problem, with their table."""
+    frames, panels = [], []
+    counts: Counter[str] = Counter()
+    for part in collection.parts:
+        experiment, statistics = part.experiment, part.statistics
+        metric = statistics.metric
+        x_axis = Axis(
+            "simulations used on the target",
+            "symlog",
+            ("symlog", "linear"),
+            tuple(float(k) for k in select_checkpoints(experiment.budget)),
+            # Marks at the ends must not be cut off.
+            ends=(-0.08, experiment.budget * 1.1),
+        )
+        for kind in dict.fromkeys(statistics.curves.keys["range"]):
+            medians = statistics.compute_median_curves(metric, str(kind))
+            medians = medians[medians["tuner"].isin(collection.tuners)]
+            problem = f"{experiment.name} {kind}"
+            counts[problem] += 1
+            # If an experiment is given twice, its curves must not be mixed.
+            problem += f", {counts[problem]}" if counts[problem] > 1 else ""
+            frames.append(medians.assign(problem=problem, metric=metric))
+            present_tuners = set(medians["tuner"])
+            series = tuple(
+                Series(
+                    name, "median", mark_style, {"tuner": name, "problem": problem}, "low", "high"
+                )
+                for name, mark_style in collection.styles.items()
+                if name in present_tuners
+            )
+            targets = statistics.target_counts[str(kind)]
+            title = f"{experiment.title or experiment.name}. {PANEL_TITLES[str(kind)]} ({targets})"
+            y_axis, facets = Axis(_METRIC_LABELS[metric], "log"), {"problem": problem}
+            panels.append(Panel(title, "errors", "simulations", series, x_axis, y_axis, facets))
+    return panels, pd.concat(frames, ignore_index=True)
+
+
+def render_multi_problem_page(
+    collection: ComparisonCollection,
+    tables: Mapping[str, pd.DataFrame],
+    pictures: Mapping[str, FigureFiles],
+    command: Sequence[str],
+) -> str:
+    """Render the page as HTML.
+
+    Args:
+        collection: comparisons.
+        tables: tables by name, as written next to the page.
+        pictures: printed figures by name.
+        command: words of the command that makes the page.
+    """
+    page = HtmlPage()
+    for name in ("ranks", "ert", "pairs"):
+        if len(tables[name]):
+            page.add_table(name, tables[name])
+    runtime_panel, shares = collection.make_runtime_panel()
+    page.add_table(runtime_panel.table, shares, _DIGITS)
+    error_panels, errors = _make_error_panels(collection)
+    page.add_table("errors", errors, _DIGITS)
+    friedman, p_values = collection.rank_tests if collection.has_enough_problems else (None, None)
+    mean_ranks = collection.mean_ranks.mean().sort_values(kind="stable")
+    best = str(mean_ranks.index[0])
+    significantly_worse: list[str] = []
+    undecided_tuners: list[str] = []
+    if p_values is not None:
+        for tuner, p_value in p_values[best].drop(best).items():
+            (significantly_worse if p_value < SIGNIFICANCE_LEVEL else undecided_tuners).append(
+                str(tuner)
+            )
+    return page.render(
+        _TEMPLATE,
+        tuners=collection.tuners,
+        friedman=friedman,
+        figure=partial(PrintedFigure.from_files, pictures),
+        command=command,
+        problem_count=len(collection.mean_ranks),
+        best=best,
+        best_rank=float(mean_ranks.iloc[0]),
+        better=significantly_worse,
+        undecided=undecided_tuners,
+        runtime_panel=runtime_panel,
+        error_panels=error_panels,
+        rank_columns=[[name, "", 3] for name in collection.styles],
+    )
