@@ -6,6 +6,7 @@ import math
 
 import pandas as pd
 
+from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.figures.style import get_mark_style
 from bench.pages.chart import Axis, Panel, Series
@@ -30,26 +31,6 @@ RESULT_COLUMNS = [
 ]
 NO_SHOT_STATUSES = (*FAILED_STATUSES, "no plan", "no recording")
 """Statuses of a method without a shot, or without one that was planned in a tuned model."""
-
-
-def compute_wilson_interval(hits: int, shots: int) -> tuple[float, float]:
-    """Compute the 95 % score interval of a proportion by Wilson's method.
-
-    Source: E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927, doi:10.2307/2276774 (scipy).
-
-    Args:
-        hits: number of hits.
-        shots: number of shots.
-
-    Returns:
-        Lower and upper bound; NaN without shots.
-    """
-    from scipy.stats import binomtest
-
-    if shots < 1:
-        return float("nan"), float("nan")
-    interval = binomtest(hits, shots).proportion_ci(0.95, method="wilson")
-    return float(interval.low), float(interval.high)
 
 
 def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -91,7 +72,7 @@ def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[objec
         shots,
         hits,
         hits / shots,
-        *compute_wilson_interval(hits, shots),
+        *compute_proportion_interval(hits, shots),
         *miss_quantiles,
         errors.median(),
         errors.mean(),

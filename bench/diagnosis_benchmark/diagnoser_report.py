@@ -29,6 +29,7 @@ from bench.diagnosis_benchmark.result_tables import (
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
 from bench.figures.style import add_trust_note
 from sims.core.files import write_atomically
+from sims.core.plain_values import align_columns
 
 ANSWERS_TABLE_FILE = "items.csv"
 """File with one row per answer."""
@@ -190,6 +191,4 @@ def format_summary(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> 
         cost = costs[name]
         cells += [f"{cost['simulations_median']:.0f}", f"{cost['processor_seconds_median']:.2f}"]
         lines.append(cells)
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    padded = [[c.ljust(w) for c, w in zip(line, widths, strict=True)] for line in lines]
-    return ["  ".join(cells).rstrip() for cells in padded]
+    return align_columns(lines, len(head))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.paired_tests import correct_holm
+from bench.benchmark.statistics.paired_tests import compute_proportion_interval, correct_holm
 
 MIN_GRADED_SIZE = 1.0
 """Minimum size of an effect that must be diagnosed, in units of the noise."""
@@ -67,13 +67,9 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
     Returns:
         The keys count, of, share, low and high; the last three are NaN without trials.
     """
-    from scipy.stats import binomtest
-
-    if not of:
-        return {"count": 0, "of": 0, "share": np.nan, "low": np.nan, "high": np.nan}
-    interval = binomtest(hits, of).proportion_ci(0.95, method="exact" if exact else "wilson")
-    limits = {"low": float(interval.low), "high": float(interval.high)}
-    return {"count": hits, "of": of, "share": hits / of, **limits}
+    low, high = compute_proportion_interval(hits, of, "exact" if exact else "wilson")
+    share = hits / of if of else np.nan
+    return {"count": hits, "of": of, "share": share, "low": low, "high": high}
 
 
 def _compute_share(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:

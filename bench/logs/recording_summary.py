@@ -12,7 +12,7 @@ from bench.logs.signal_statistics import (
     compute_signal_statistics,
     list_recorded_signals,
 )
-from sims.core.plain_values import format_unit
+from sims.core.plain_values import align_columns, format_unit
 from sims.core.simulator import Simulator
 from sims.recording.recording import (
     Recording,
@@ -69,13 +69,11 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
     yield ""
-    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MAX_LISTED_RUNS])], left_columns=2)
+    yield from align_columns([_RUN_HEAD, *map(_run_row, runs[:_MAX_LISTED_RUNS])], left_columns=2)
     if len(runs) > _MAX_LISTED_RUNS:
         yield f"... and {len(runs) - _MAX_LISTED_RUNS} more runs"
     yield ""
-    yield from _align_columns(
-        [_SIGNAL_HEAD, *_iterate_signal_rows(recording, kind)], left_columns=3
-    )
+    yield from align_columns([_SIGNAL_HEAD, *_iterate_signal_rows(recording, kind)], left_columns=3)
     yield _CAVEAT
     yield ""
     yield from _format_constants(recording, kind)
@@ -179,20 +177,6 @@ def _format_run_names(names: Sequence[str]) -> str:
 
 def _format_count(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' if number != 1 else ''}"
-
-
-def _align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> Iterator[str]:
-    """Align a table as text, with the first `left_columns` columns left-justified.
-
-    Args:
-        rows: cells of the table.
-        left_columns: number of columns that are left-justified.
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = zip(row, widths, strict=True)
-        aligned = [c.ljust(w) if i < left_columns else c.rjust(w) for i, (c, w) in enumerate(cells)]
-        yield "  ".join(aligned).rstrip()
 
 
 LIMIT_TOLERANCE = 0.01

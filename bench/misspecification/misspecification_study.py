@@ -213,12 +213,12 @@ class MisspecificationStudy(Study):
     @property
     def is_unfinished(self) -> bool:
         """True if results remain to be written, here or in one of the comparisons."""
-        comparisons = [Comparison(self.folder / m) for m in MODEL_LABELS if self._has_begun(m)]
+        comparisons = [Comparison(self.folder / m) for m in MODEL_LABELS if self._is_prepared(m)]
         return (self.folder / SEGMENTS_FOLDER).exists() or any(
             comparison.is_unfinished for comparison in comparisons
         )
 
-    def _has_begun(self, model: str) -> bool:
+    def _is_prepared(self, model: str) -> bool:
         """Return whether the comparison in one of the two simulators has a folder."""
         return (self.folder / model / CONFIGURATION_FILE).is_file()
 
@@ -230,7 +230,7 @@ class MisspecificationStudy(Study):
         """
         run_ends: list[RunEnd] = []
         for model in MODEL_LABELS:
-            if self._has_begun(model):
+            if self._is_prepared(model):
                 run_ends += [
                     RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
                     for e in Comparison(self.folder / model).list_run_ends()

@@ -36,6 +36,7 @@ from bench.schemas import find_violations
 from bench.studies.comparison_verification import (
     VerificationFailure,
     VerificationResult,
+    print_failures,
     verify_comparison,
 )
 from bench.studies.explanation_verification import (
@@ -44,7 +45,6 @@ from bench.studies.explanation_verification import (
     VERDICT_FILE,
     ExplanationVerification,
     PrintLine,
-    format_result,
     verify_extended_model,
 )
 from bench.studies.study import list_study_folders
@@ -563,14 +563,14 @@ def verify_archive(
             VerificationFailure(mismatch.file, 0, mismatch.says) for mismatch in unpacked.mismatches
         ]
         if doubts:
-            format_result(doubts, archive, print_line)
+            print_failures(doubts, archive, print_line)
             return ArchiveVerification(description, doubts, [], None)
         print_line(
             f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
         )
         if description["kind"] == "explanation":
             explained = verify_extended_model(unpacked.folder, print_line)
-            format_result(explained.doubts, archive, print_line)
+            print_failures(explained.doubts, archive, print_line)
             return ArchiveVerification(description, [], [], explained)
         verifications = [
             verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(

@@ -131,13 +131,26 @@ def verify_comparison(
     finally:
         problem.close()
     doubts += _verify_tables(folder, stored, note)
+    print_failures(doubts, folder, print_line)
+    if not doubts:
+        print_line("all results are reproducible")
+    return VerificationResult(folder, tuple(checks), tuple(doubts))
+
+
+def print_failures(
+    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
+) -> None:
+    """Print the doubts (numbers that do not follow from others), at most 20 of them.
+
+    Args:
+        doubts: verification failures.
+        folder: folder of the results.
+        print_line: prints one line of text.
+    """
     for doubt in doubts[:20]:
         print_line(f"NOT REPRODUCED  {folder}/{doubt}")
     if len(doubts) > 20:
         print_line(f"and {len(doubts) - 20} more")
-    if not doubts:
-        print_line("all results are reproducible")
-    return VerificationResult(folder, tuple(checks), tuple(doubts))
 
 
 def _describe_salt(experiment: Experiment) -> str:

@@ -30,10 +30,10 @@ from bench.studies.diff_explanations import (
     describe_side,
     find_changes,
     format_changes,
-    format_columns,
     format_number,
     select_relevant_environment,
 )
+from sims.core.plain_values import align_columns
 from sims.core.simulator import Array, InputError
 
 COMPARED_SIMULATION_COUNTS = (3, 10)
@@ -142,11 +142,7 @@ class ComparisonDiff:
         if not lines:
             return pd.DataFrame()
         frame = pd.DataFrame(lines)
-        has_p_value = frame["p_value"].notna().to_numpy()
-        frame["p_holm"] = np.nan
-        frame.loc[has_p_value, "p_holm"] = correct_holm(
-            frame.loc[has_p_value, "p_value"].to_numpy(dtype=float)
-        )
+        frame["p_holm"] = correct_holm(frame["p_value"].to_numpy(dtype=float))
         frame["significant"] = frame["p_holm"] < FAMILYWISE_ERROR_RATE
         return frame
 
@@ -375,7 +371,7 @@ class ComparisonDiff:
                     format_number(row["p_holm"]),
                 )
             )
-        yield from format_columns(table_rows)
+        yield from align_columns(table_rows, 3)
         if len(error_rows) > len(listed_rows):
             count = len(error_rows) - len(listed_rows)
             yield f"({count} more lines without a significant difference; --json has all)"

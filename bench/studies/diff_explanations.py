@@ -9,7 +9,7 @@ is conservative. Holm's correction is over all numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from bench.benchmark.statistics.paired_tests import correct_holm
 from bench.benchmark.storage.provenance import read_environment
 from bench.diagnosis.verdict import Verdict
 from bench.studies.explanation_verification import EXTENDED_MODEL_FILE, read_verdict
+from sims.core.plain_values import align_columns
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
@@ -110,18 +111,6 @@ def format_changes(changes: Iterable[Mapping[str, Any]]) -> list[str]:
 def _shorten_text(value: Any) -> str:
     text = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def format_columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align columns of texts: the first three to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if i < 3 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def format_number(value: float | None) -> str:
@@ -226,10 +215,7 @@ class ExplanationDiff:
         )
         parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
         rows = [*coefficients, *parameters]
-        p = np.array([_compute_p_value(row) for row in rows])
-        is_known = np.isfinite(p)
-        corrected = np.full(len(p), np.nan)
-        corrected[is_known] = correct_holm(p[is_known])
+        corrected = correct_holm(np.array([_compute_p_value(row) for row in rows]))
         for row, value in zip(rows, corrected, strict=True):
             row["significant"] = bool(value < FAMILYWISE_ERROR_RATE) if np.isfinite(value) else None
         return coefficients, parameters
@@ -341,7 +327,7 @@ class ExplanationDiff:
                 _format_interval(row, "b"),
             ]
             rows.append((row["name"], row["unit"], mark, *cells))
-        yield from format_columns(rows)
+        yield from align_columns(rows, 3)
         for row in document["heldout"]:
             if row["a"] is not None or row["b"] is not None:
                 change = f"{format_number(row['a'])} -> {format_number(row['b'])}"

@@ -13,7 +13,7 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict
 from bench.schemas import find_violations
-from bench.studies.comparison_verification import VerificationFailure
+from bench.studies.comparison_verification import VerificationFailure, print_failures
 from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
@@ -55,22 +55,6 @@ class ExplanationVerification(NamedTuple):
         return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
 
 
-def format_result(
-    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
-) -> None:
-    """Print the doubts (numbers that do not follow from others), at most 20 of them.
-
-    Args:
-        doubts: verification failures.
-        folder: folder of the explanation.
-        print_line: prints one line of text.
-    """
-    for doubt in doubts[:20]:
-        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
-    if len(doubts) > 20:
-        print_line(f"and {len(doubts) - 20} more")
-
-
 def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerification:
     """Verify that the files of an explanation are valid and consistent.
 
@@ -81,7 +65,7 @@ def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerifi
         print_line: prints a line.
     """
     verification = verify_extended_model(folder, print_line)
-    format_result(verification.doubts, folder, print_line)
+    print_failures(verification.doubts, folder, print_line)
     return verification
 
 

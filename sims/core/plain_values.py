@@ -7,9 +7,29 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
+
+
+def align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> list[str]:
+    """Align a table of texts for a terminal.
+
+    Args:
+        rows: cells of the table.
+        left_columns: number of columns, from the first one, that are left-justified.
+
+    Returns:
+        One line per row.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < left_columns else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
 
 
 def to_toml_value(value: Any) -> Any:

@@ -36,7 +36,7 @@ class Study(ABC):
     """
 
     counted: ClassVar[str] = "runs finished"
-    """What its status counts."""
+    """Words for the runs that its status counts."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -86,17 +86,41 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=PAIR_COLUMNS)
 
 
+def compute_proportion_interval(
+    hits: int, trials: int, method: Literal["wilson", "exact"] = "wilson"
+) -> tuple[float, float]:
+    """Compute the 95 % interval of a proportion.
+
+    Args:
+        hits: number of successes.
+        trials: number of trials.
+        method: ``wilson`` for the score interval (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
+            doi:10.2307/2276774), ``exact`` for that of Clopper and Pearson.
+
+    Returns:
+        Lower and upper bound; NaN without trials.
+    """
+    from scipy.stats import binomtest
+
+    if trials < 1:
+        return float("nan"), float("nan")
+    interval = binomtest(hits, trials).proportion_ci(0.95, method=method)
+    return float(interval.low), float(interval.high)
+
+
 def correct_holm(p: Array) -> Array:
     """Apply the Holm correction to the p-values (n,) of one family of tests.
 
     It bounds the probability of any false rejection in the family. The k-th smallest p-value is
-    multiplied by n + 1 - k; a corrected value is at least as large as the one before it.
+    multiplied by n + 1 - k; a corrected value is at least as large as the one before it. NaN, for
+    a test that was not possible, stays NaN and does not count.
     """
     # statsmodels' `multipletests` takes a second to import and collects all garbage in each call.
-    order = np.argsort(p)
-    corrected = np.empty(len(p))
-    corrected[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
-    return np.minimum(corrected, 1.0)
+    order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]
+    corrected: Array = np.full(len(p), np.nan)
+    raised = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
+    corrected[order] = np.minimum(raised, 1.0)
+    return corrected
 
 
 def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:

@@ -15,8 +15,9 @@ from bench.benchmark.problem.experiment import list_experiment_names, load_exper
 from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
+from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.bounce_shot import shot_study, tuned_shots
-from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table, compute_wilson_interval
+from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table
 from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import execute_shot
 from bench.bounce_shot.shot_sampling import build_pixel_runs, draw_shot, draw_shots, record_drop
@@ -54,12 +55,14 @@ def experiment():
 
 
 def test_wilson_interval_of_known_counts():
-    assert compute_wilson_interval(8, 10) == pytest.approx((0.4901625, 0.9433178), abs=1e-6)
-    assert compute_wilson_interval(0, 10) == pytest.approx((0.0, 0.2775328), abs=1e-6)
-    assert compute_wilson_interval(50, 50)[1] == 1.0
+    assert compute_proportion_interval(8, 10) == pytest.approx((0.4901625, 0.9433178), abs=1e-6)
+    assert compute_proportion_interval(0, 10) == pytest.approx((0.0, 0.2775328), abs=1e-6)
+    assert compute_proportion_interval(50, 50)[1] == 1.0
     exact = binomtest(261, 300).proportion_ci(0.95, method="wilson")
-    assert compute_wilson_interval(261, 300) == pytest.approx((exact.low, exact.high), abs=1e-12)
-    assert all(math.isnan(v) for v in compute_wilson_interval(0, 0))
+    assert compute_proportion_interval(261, 300) == pytest.approx(
+        (exact.low, exact.high), abs=1e-12
+    )
+    assert all(math.isnan(v) for v in compute_proportion_interval(0, 0))
 
 
 def test_table_counts_misses_that_never_met_the_plane():
@@ -88,7 +91,7 @@ def test_table_counts_misses_that_never_met_the_plane():
     assert lines.hits.to_dict() == {"a": 1, "b": 1, ALL_BALLS: 2}
     assert lines.rate[ALL_BALLS] == 0.5
     assert (lines.low[ALL_BALLS], lines.high[ALL_BALLS]) == pytest.approx(
-        compute_wilson_interval(2, 4)
+        compute_proportion_interval(2, 4)
     )
     assert lines.off_90[ALL_BALLS] == math.inf
     assert lines.failures.to_dict() == {"a": 0, "b": 1, ALL_BALLS: 1}
