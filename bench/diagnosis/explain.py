@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from itertools import combinations
@@ -100,6 +100,12 @@ MAX_EXCESS_SHARE_OF_INCOMPLETE = 0.5
 """Maximum excess, likewise, of a model that stays incomplete with right units, too."""
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
+CONTACT_SEGMENT_SECONDS = 0.5
+"""Duration in seconds of the segments of a robot on the ground."""
+MAX_RESIDUAL_RATIO = 1.25
+"""Maximum residual (RMS) of a segment without a jump, relative to the median of all segments."""
+MAX_LEFT_OUT_SHARE = 0.25
+"""Maximum share of the segments that are left out because of jumps."""
 MAX_LINEAR_RESIDUAL = 3.0
 """Maximum residual of the base model, in units of the noise, at which effects act linearly."""
 MAX_COMPETING_SQUARES_RATIO = 2.0
@@ -182,6 +188,7 @@ def _run_in_segments(
     while True:
         with _explain_run(recording, attempt) as run:
             run.may_divide = run.is_divisible and options.pieces is None and bool(retried)
+            run.may_divide = run.may_divide and not run.is_on_ground
             try:
                 return action(run)
             except DivergingSimulationError:
@@ -345,7 +352,10 @@ class _ExplainRun:
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.
         self.identified: Array | None = None
+        self._filtered: FollowedRuns | None = None
         self._set_up(kind)
+        if self.is_on_ground and self._leave_out_unpredictable_runs():
+            self._set_up(kind)
         self._add_notes(
             f"{effect} is not tested: {reason}" for effect, reason in kind.system.left_out.items()
         )
@@ -353,7 +363,6 @@ class _ExplainRun:
         # Options of the solver that replace those of the file, and those that may replace them.
         self.changed_options: OptionFinding | None = None
         self.possible_options: RatedOptions | None = None
-        self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
         self.finer: Reusable[StepRefinement] | None = None
         self.file = RunEvaluators(self.kind, self.fitting, self.validation)
@@ -375,7 +384,7 @@ class _ExplainRun:
         self.recording, thinning_note = thin_recording(self.recording, kind)
         self.recording, settling_note = leave_out_settling(self.recording, kind)
         self.recording, segment_note = segment_recording(
-            self.recording, kind, options.pieces, options.whole
+            self.recording, kind, self._get_segment_duration(kind, options), options.whole
         )
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
@@ -383,6 +392,93 @@ class _ExplainRun:
         noise_note = _format_added_noise(noise_free_channels)
         notes = thinning_note, settling_note, segment_note, noise_note
         self._add_notes(note for note in notes if note)
+
+    def _get_segment_duration(
+        self, kind: type[SystemSimulator], options: ExplainOptions
+    ) -> float | None:
+        """Return the duration in seconds of the segments of each run; None for the usual ones.
+
+        Runs of a robot on the ground are cut unless the user requests otherwise: a linear model
+        about a simulated motion is not valid for long where contacts begin and end.
+        """
+        robot: Any = kind
+        if options.pieces is None and kind.has_model and not options.whole:
+            return CONTACT_SEGMENT_SECONDS if robot.robot.is_on_ground else None
+        return options.pieces
+
+    def _leave_out_unpredictable_runs(self) -> bool:
+        """Leave out segments that no simulation predicts; return whether there are any.
+
+        At least half of the segments for fitting and of those for measuring are kept.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+        left_out: list[str] = []
+        for evaluator in self._list_run_evaluators():
+            theta = evaluator.get_nominal_theta()
+            followed = (
+                self._get_filter()
+                if evaluator is self.fitting
+                else FollowedRuns.follow(evaluator, theta, self.noise, max_linearisations=1)
+            )
+            is_followed = followed.are_runs_followed
+            if 2 * is_followed.sum() >= is_followed.size:
+                left_out += [evaluator.runs[i].name for i in np.flatnonzero(~is_followed)]
+        self._leave_out(left_out)
+        return bool(left_out)
+
+    def _leave_out(self, names: Collection[str]) -> None:
+        """Leave out runs with these names, and report it."""
+        if names:
+            runs = tuple(run for run in self.recording.runs if run.name not in names)
+            self.recording = replace(self.recording, runs=runs)
+            note = "contacts make the motion unpredictable in pieces that are left out"
+            self._add_notes([f"{note}: {', '.join(names)}"])
+
+    def _leave_out_jumps(self, simulated: Array) -> bool:
+        """Leave out the few segments that a model alone does not explain; return whether any.
+
+        Where a wheel lifts off or a foot slips, the motion may depend on its initial state by a
+        jump, which neither a fit nor a linear model follows. Few segments with a larger residual
+        than the others show it.
+
+        Args:
+            simulated: (R, T, C) simulation of a model that explains most segments.
+        """
+        residual = (simulated - self.fitting.observed) / self.noise.sigma
+        sizes = np.sqrt(np.nanmean(np.square(residual), axis=(1, 2)))
+        median = float(np.median(sizes))
+        has_jump = sizes > MAX_RESIDUAL_RATIO * median
+        is_rare = 0 < has_jump.sum() <= MAX_LEFT_OUT_SHARE * has_jump.size
+        if not median < MAX_RESIDUAL_RATIO or not is_rare:
+            return False
+        self._leave_out([self.fitting.runs[i].name for i in np.flatnonzero(has_jump)])
+        for evaluator in self._list_run_evaluators():
+            evaluator.filtered_runs = None
+        self._set_up(self.kind)
+        return True
+
+    def _search_without_jumps(self, result: _SearchResult) -> _SearchResult:
+        """Search again without the few segments that the result alone does not explain."""
+        model = result.finding.model
+        if not self._leave_out_jumps(model.fit.simulated):
+            return result
+        base, rng = self._fit_base(), self._make_rng()
+        search = self._create_search(base, rng)
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+
+        if model.effects and isinstance(search, PredictionErrorSearch):
+            states = self.fitting.initial_state_guesses
+            search.likely = FitStart(model.effects, model.fit.theta, states)
+        return _SearchResult(base, search, self._find_causes(search), rng)
+
+    @property
+    def is_on_ground(self) -> bool:
+        """Return whether the recorded pose is that of a robot that stands or drives."""
+        robot: Any = self.kind
+        return self.kind.has_model and bool(robot.robot.is_on_ground)
 
     def _add_notes(self, notes: Iterable[str]) -> None:
         """Report notes to the user, and keep them for the report."""
@@ -517,9 +613,13 @@ class _ExplainRun:
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
+        if self.is_on_ground and self._leave_out_jumps(base.fit.simulated):
+            base = self._fit_base()
         if self.may_divide and self._loses_orientation(base):
             raise DivergingSimulationError(f"{self.path}: the simulation loses the orientation")
         result = self._search_with_friction_forms(base)
+        if self.is_on_ground and not self._is_explained(result) and not self.unit_errors:
+            result = self._search_without_jumps(result)
         result = self._search_with_better_step(result.search, result.finding) or result
         result = self._search_with_possible_options(result) or result
         base, search, finding, rng = result
@@ -605,6 +705,8 @@ class _ExplainRun:
         from bench.diagnosis.conventions.corrected_description import list_changed_tables
 
         self.search_control.begin_stage("comparing conventions of log and model")
+        if self.is_on_ground:
+            return
         if self._has_contacts and self._is_linear_model_wrong_at_contacts(self._get_filter()):
             return
         differences = ConventionComparison(self._unit_check_subject).differences()
@@ -893,7 +995,8 @@ class _ExplainRun:
         force that is larger than all typical forces.
         """
         force_share = float((filtered_runs.force / filtered_runs.typical).max())
-        return self._has_contacts and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+        is_linear_about_readings = self._has_contacts and not self.is_on_ground
+        return is_linear_about_readings and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
 
     @property
     def _has_contacts(self) -> bool:
@@ -969,6 +1072,7 @@ class _ExplainRun:
         """
         if (
             not self._has_contacts
+            or self.is_on_ground
             or self.tuner is not None
             or self.search_control.is_over()
             or not np.isfinite(base.fit.cost)

@@ -210,6 +210,11 @@ class RobotModel:
         other.__dict__["compiled"] = self.compiled
         return other
 
+    @property
+    def is_on_ground(self) -> bool:
+        """True if a floating body whose pose is recorded touches something, such as a floor."""
+        return bool(self.contacts and self.recorded_bases)
+
     @cached_property
     def base_orientations(self) -> Mapping[str, tuple[float, ...]]:
         """Orientation (w, x, y, z) in the file of each body with a recorded pose, by its joint."""

@@ -14,7 +14,7 @@ doi:10.1016/0005-1098(80)90078-3).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -61,6 +61,11 @@ MAX_VELOCITY_PRIOR = 1e3
 """Maximum prior standard deviation of a velocity, rad/s or m/s."""
 UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
 """Prior standard deviations of unrecorded joints: position in rad or m, velocity per second."""
+MEASURED_PRIOR = 10.0
+"""Prior standard deviation of a first state of a robot on the ground, in units of its noise.
+
+The noise of a velocity is that of positions per sample interval.
+"""
 FIRST_FORCE = 0.1
 """Initial missing force of the process noise fit, as a share of a typical force."""
 MAX_LINEARISATIONS = 4
@@ -192,7 +197,10 @@ class FollowedRuns:
                 evaluator.prepared_runs
             )
             linear = [
-                _linearise_run(evaluator, theta, noise, run, motion[run], neighbour)
+                _linearise_run(
+                    *(evaluator, theta, noise, run, motion[run], neighbour),
+                    reuses_jacobians=not robot.is_on_ground,
+                )
                 for run, neighbour in enumerate(neighbours)
             ]
             initial_force = FIRST_FORCE * typical if force is None else force
@@ -236,6 +244,12 @@ class FollowedRuns:
         ]
         filter_arguments = self.noise, linear, self.force, self.typical
         return self._filter_linear(self.evaluator, theta, *filter_arguments)
+
+    @property
+    def _is_on_ground(self) -> bool:
+        simulator = self.evaluator.simulator
+        assert isinstance(simulator, RobotSimulator)
+        return simulator.robot.is_on_ground
 
     def _has_jacobians_of(self, theta: Array) -> bool:
         """Return whether a model has the Jacobians of this one.
@@ -560,6 +574,15 @@ class FollowedRuns:
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
         return bool(size < MAX_MEAN_SQUARE_INNOVATION)
 
+    @property
+    def are_runs_followed(self) -> Mask:
+        """Which runs (R,) the filter follows: their innovations have the expected size."""
+        with np.errstate(all="ignore"):
+            squares = np.square(self.filtered.whitened).sum(axis=(1, 2))
+            sizes = squares / np.maximum(self.runs.recorded.sum(axis=(1, 2)), 1)
+        is_followed: Mask = sizes < MAX_MEAN_SQUARE_INNOVATION
+        return is_followed
+
     def get_state_prior(self) -> Array | None:
         """Return the prior standard deviations (2 D,) of the first positions and velocities.
 
@@ -571,6 +594,8 @@ class FollowedRuns:
         if len(self.evaluator.state_names) != 2 * joints:
             return None
         prior = self.runs.prior
+        if self._is_on_ground:
+            return self._get_prior_of_measured_states()
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
         return np.concatenate([prior[:joints], velocities])
 
@@ -586,8 +611,11 @@ class FollowedRuns:
         """Return positions and velocities of the joints at the first samples (R, 2 D).
 
         For recorded joints they are estimated from the readings alone, because a stiff servo hides
-        the first velocity from a linear model; for other joints they are smoothed states.
+        the first velocity from a linear model; for other joints, and for robots on the ground, they
+        are smoothed states.
         """
+        if self._is_on_ground:
+            return self._get_smoothed_first_states()
         first_states = []
         for run, trajectory in enumerate(self.trajectories):
             first_step = int(self.linear[run].knots[0])
@@ -597,6 +625,27 @@ class FollowedRuns:
             ).items():
                 x[joint], v[joint] = states[0, :2]
             first_states.append(np.concatenate([x, v]))
+        return np.array(first_states)
+
+    def _get_prior_of_measured_states(self) -> Array:
+        """Return prior standard deviations (2 D,) in multiples of the noise of the positions.
+
+        A first state far from the readings would be in another state of the contacts.
+        """
+        channels = list(self.evaluator.channels)
+        names = self.evaluator.simulator.system.coordinates
+        noise = np.array([self.noise.sigma[channels.index(name)] for name in names])
+        speeds = noise / self.evaluator.sample_interval
+        return np.concatenate([MEASURED_PRIOR * noise, MEASURED_PRIOR * speeds])
+
+    def _get_smoothed_first_states(self) -> Array:
+        """Return smoothed positions and velocities of the joints at the first samples (R, 2 D)."""
+        first_states = []
+        for run, linear in enumerate(self.linear):
+            first_step, deviation = int(linear.knots[0]), self.smoothed.states[run, 0]
+            x, v = linear.trajectory.x[first_step], linear.trajectory.v[first_step]
+            velocities = deviation[linear.positions : linear.positions + v.size]
+            first_states.append(np.concatenate([x + deviation[: x.size], v + velocities]))
         return np.array(first_states)
 
     def _propagate_through_filter(
@@ -697,6 +746,10 @@ def _linearise_run(
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
+    For a robot on the ground the first one is simulated: contacts are less deep than the noise of
+    encoders, so that a measured motion has wrong contact forces. A motion that is smoothed with
+    a model that is linear about it has contacts of the right depth.
+
     Args:
         evaluator: the runs.
         theta: (P,) parameters about which the model is linear.
@@ -711,13 +764,19 @@ def _linearise_run(
     """
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
-    start = evaluator.initial_state_guesses[run, :half], evaluator.initial_state_guesses[run, half:]
+    guess = evaluator.initial_state_guesses[run]
     robot = simulator or evaluator.simulator
+    assert isinstance(robot, RobotSimulator)
+    measured: Mapping[int, Array] | None = None
     if trajectory is None:
-        states = estimate_measured_states(evaluator, noise.sigma, run)
-        return MeasuredLinear(robot, theta, scenario, start, measured=states)
+        measured = estimate_measured_states(evaluator, noise.sigma, run)
+        if robot.robot.is_on_ground:
+            guess = guess.copy()
+            for joint, states in measured.items():
+                guess[joint], guess[half + joint] = states[0, :2]
+            measured = {}
     return MeasuredLinear(
-        *(robot, theta, scenario, start, trajectory, None, neighbour),
+        *(robot, theta, scenario, (guess[:half], guess[half:]), trajectory, measured, neighbour),
         *(reuses_jacobians, reuses_loads),
     )
 

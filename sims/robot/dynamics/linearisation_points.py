@@ -178,6 +178,11 @@ class LinearisationPoints:
         return bool((self._drives < 0).any())
 
     @property
+    def has_contacts(self) -> bool:
+        """True if geoms touch in the recording of a robot without floating bodies."""
+        return bool(self._mujoco_batch.robot.contacts) and not self._floating
+
+    @property
     def steps_joints_by_runge_kutta(self) -> bool:
         """True if the integrator is the classical Runge-Kutta method, for joints alone.
 

@@ -233,6 +233,8 @@ class TangentModel:
             change: size of the change.
             mujoco_batch: batch whose model has the required elements.
         """
+        if self._at.has_contacts and not self._at.steps_joints_by_runge_kutta:
+            return self._perturb_numbers_at_contacts(owner, acting, change, mujoco_batch)
         step_mean_forces = self._mean_acceleration_forces
         with self._at.with_batch(mujoco_batch):
             accelerations, readings = self._at.compute_accelerations(acting, step_mean_forces)
@@ -246,6 +248,25 @@ class TangentModel:
         return Perturbation(
             owner, forces=force, readings=(readings - self._base_accelerations[1]) / change
         )
+
+    def _perturb_numbers_at_contacts(
+        self, owner: int, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
+    ) -> Perturbation:
+        """Return the result of `perturb_model_numbers` for a robot whose geoms touch.
+
+        A contact reacts to a force M da, so that the motion does not change by da. The force that
+        changes the velocity after a step by dv is inv(B) dv, with the derivatives B of this
+        velocity by forces, which include the reaction.
+        """
+        with self._at.with_batch(mujoco_batch):
+            ends, readings = self._at.step_displaced({}, acting)
+        velocities = slice(self._sizes.size, 2 * self._sizes.size)
+        difference = (ends - self._base_step[0])[:, velocities] / change
+        derivatives = self.quotients.forces[:, velocities]
+        force: Array = np.linalg.solve(derivatives, difference[..., None])[..., 0].astype(
+            np.float64
+        )
+        return Perturbation(owner, forces=force, readings=(readings - self._base_readings) / change)
 
     @cached_property
     def _mean_acceleration_forces(self) -> Array:
