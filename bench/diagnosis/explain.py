@@ -459,21 +459,6 @@ class _ExplainRun:
         self._set_up(self.kind)
         return True
 
-    def _search_without_jumps(self, result: _SearchResult) -> _SearchResult:
-        """Search again without the few segments that the result alone does not explain."""
-        model = result.finding.model
-        if not self._leave_out_jumps(model.fit.simulated):
-            return result
-        base, rng = self._fit_base(), self._make_rng()
-        search = self._create_search(base, rng)
-        # This import is needed for robots only.
-        from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
-
-        if model.effects and isinstance(search, PredictionErrorSearch):
-            states = self.fitting.initial_state_guesses
-            search.likely = FitStart(model.effects, model.fit.theta, states)
-        return _SearchResult(base, search, self._find_causes(search), rng)
-
     @property
     def is_on_ground(self) -> bool:
         """Return whether the recorded pose is that of a robot that stands or drives."""
@@ -618,8 +603,6 @@ class _ExplainRun:
         if self.may_divide and self._loses_orientation(base):
             raise DivergingSimulationError(f"{self.path}: the simulation loses the orientation")
         result = self._search_with_friction_forms(base)
-        if self.is_on_ground and not self._is_explained(result) and not self.unit_errors:
-            result = self._search_without_jumps(result)
         result = self._search_with_better_step(result.search, result.finding) or result
         result = self._search_with_possible_options(result) or result
         base, search, finding, rng = result
