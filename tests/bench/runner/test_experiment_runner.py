@@ -147,7 +147,7 @@ def test_snooping_would_find_true_parameters_that_are_there():
 def test_hanging_tuner_is_killed_at_its_limit(monkeypatch):
     monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.5)
     results = compared(
-        spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=1.0)
+        spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=3.0)
     )
     statuses = {s.tuner: s for s in results.run_sink.statuses.values()}
     assert statuses["hanging"].status == "timeout"
