@@ -161,6 +161,12 @@ def explain(
     )
 
 
+def _is_on_ground(kind: type[SystemSimulator]) -> bool:
+    """Return whether a simulator is a robot with a recorded pose that stands or drives."""
+    robot: Any = kind
+    return kind.has_model and bool(robot.robot.is_on_ground)
+
+
 class DivergingSimulationError(InputError):
     """Error if no simulation follows the runs, at any starting point of the base fit."""
 
@@ -188,7 +194,6 @@ def _run_in_segments(
     while True:
         with _explain_run(recording, attempt) as run:
             run.may_divide = run.is_divisible and options.pieces is None and bool(retried)
-            run.may_divide = run.may_divide and not run.is_on_ground
             try:
                 return action(run)
             except DivergingSimulationError:
@@ -401,10 +406,9 @@ class _ExplainRun:
         Runs of a robot on the ground are cut unless the user requests otherwise: a linear model
         about a simulated motion is not valid for long where contacts begin and end.
         """
-        robot: Any = kind
-        if options.pieces is None and kind.has_model and not options.whole:
-            return CONTACT_SEGMENT_SECONDS if robot.robot.is_on_ground else None
-        return options.pieces
+        if options.pieces is not None or options.whole or not _is_on_ground(kind):
+            return options.pieces
+        return CONTACT_SEGMENT_SECONDS
 
     def _leave_out_unpredictable_runs(self) -> bool:
         """Leave out segments that no simulation predicts; return whether there are any.
@@ -462,8 +466,7 @@ class _ExplainRun:
     @property
     def is_on_ground(self) -> bool:
         """Return whether the recorded pose is that of a robot that stands or drives."""
-        robot: Any = self.kind
-        return self.kind.has_model and bool(robot.robot.is_on_ground)
+        return _is_on_ground(self.kind)
 
     def _add_notes(self, notes: Iterable[str]) -> None:
         """Report notes to the user, and keep them for the report."""
@@ -783,13 +786,14 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
 
-        declared_bounds = {p.name: p.bounds for p in self.fitting.parameters}
+        previous_bounds = {p.name: p.bounds for p in self.fitting.parameters}
         result = answer(Confirmation(search, self.validation))
-        bounds = {p.name: p.bounds for p in self.fitting.parameters}
-        self._widen_ranges(
-            {name: bounds[name] for name in bounds if bounds[name] != declared_bounds[name]},
-            declared_bounds | {name: declared for name, (declared, _) in self.wider.items()},
-        )
+        wider_bounds = {
+            parameter.name: parameter.bounds
+            for parameter in self.fitting.parameters
+            if parameter.bounds != previous_bounds[parameter.name]
+        }
+        self._widen_ranges(wider_bounds, previous_bounds)
         return result
 
     def _check_units_of_unexplained(
@@ -1019,22 +1023,22 @@ class _ExplainRun:
         return refiltered_runs
 
     def _widen_ranges(
-        self, wider_bounds: Mapping[str, Bounds], declared_bounds: Mapping[str, Bounds]
+        self, wider_bounds: Mapping[str, Bounds], previous_bounds: Mapping[str, Bounds]
     ) -> None:
         """Report the wider ranges of base parameters, and use them for all runs.
 
         Args:
             wider_bounds: new lower and upper bound of each widened parameter, by name.
-            declared_bounds: bounds that the system or the model file declares.
+            previous_bounds: its previous bounds; the first ones are those that the system or the
+                model file declares.
         """
         for evaluator in self._list_run_evaluators()[1:]:
             use_bounds(evaluator, wider_bounds)
         for name, (low, high) in wider_bounds.items():
             self.say(f"{name} ends at a bound of its range: widened to {low:g} to {high:g}")
-        self.wider |= {
-            parameter: (declared_bounds[parameter], bounds)
-            for parameter, bounds in wider_bounds.items()
-        }
+        for name, bounds in wider_bounds.items():
+            declared_bounds, _ = self.wider.get(name, (previous_bounds[name], bounds))
+            self.wider[name] = declared_bounds, bounds
 
     def _prepare_robot_base(self, base: BaseFit) -> BaseFit:
         """Return the base model of a robot with the step that the data support.
@@ -1235,10 +1239,9 @@ class _ExplainRun:
 
     def _widen_bounds_at_fit(self, base: BaseFit) -> BaseFit:
         """Widen the ranges of base parameters that the fit leaves at a bound."""
-        declared_bounds = {p.name: p.bounds for p in self.fitting.parameters}
-        declared_bounds |= {name: bounds for name, (bounds, _) in self.wider.items()}
+        previous_bounds = {p.name: p.bounds for p in self.fitting.parameters}
         base, wider_bounds = fit_wider(self.fitting, self.noise, base)
-        self._widen_ranges(wider_bounds, declared_bounds)
+        self._widen_ranges(wider_bounds, previous_bounds)
         return base
 
     def _freeze_unidentified(self, base: BaseFit) -> BaseFit:
@@ -1465,8 +1468,12 @@ class _ExplainRun:
 
     @property
     def is_divisible(self) -> bool:
-        """True if runs may be cut into segments: those of a robot without unrecorded poses."""
-        return self.kind.has_model and not self.kind.system.floating_state_units
+        """True if runs may be cut into segments: those of a robot without unrecorded poses.
+
+        Those of a robot on the ground are short already.
+        """
+        has_unknown_states = bool(self.kind.system.floating_state_units)
+        return self.kind.has_model and not has_unknown_states and not self.is_on_ground
 
     def _loses_orientation(self, base: BaseFit) -> bool:
         """Return whether the simulated orientation of a recorded floating body is far from it."""

@@ -13,7 +13,7 @@ from sims.core.effect import ALL_PLACES, Effect
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import Channel, InputError, Parameter, make_unknown_name_error
 from sims.core.system import System, SystemKind
-from sims.robot.contact_pairs import PAIR_SEPARATOR, find_geom
+from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.series_joints import find_compile_error, list_added_elements
 from sims.robot.floating_joints import FloatingJoints
@@ -25,7 +25,6 @@ from sims.robot.places.place_list import (
     MUJOCO_EFFECT_WORDS,
     EffectPlace,
     coupled_joints,
-    has_radius,
     list_places,
     make_contact_place,
     make_geom_place,
@@ -169,10 +168,8 @@ class RobotSystem(System):
             spot = make_contact_place(cls.robot, place, (place,))
             return effect_places.make_placed_effect(registered, spot)
         if registered.at == "geom" and place not in ("", ALL_PLACES):
-            geom_place = make_geom_place(cls.robot, place)
-            if has_radius(cls.robot, find_geom(cls.robot, place)):
-                return effect_places.make_placed_effect(registered, geom_place)
-            raise InputError(f"effect {name} of robot {cls.name}: geom {place} has no radius")
+            spot = make_geom_place(cls.robot, place)
+            return effect_places.make_placed_effect(registered, spot)
         if not effects_by_name:
             raise InputError(f"robot {cls.name} cannot have effect {effect_name}")
         if not place:

@@ -198,7 +198,12 @@ class FollowedRuns:
             )
             linear = [
                 _linearise_run(
-                    *(evaluator, theta, noise, run, motion[run], neighbour),
+                    evaluator,
+                    theta,
+                    noise,
+                    run,
+                    motion[run],
+                    neighbour,
                     reuses_jacobians=not robot.is_on_ground,
                 )
                 for run, neighbour in enumerate(neighbours)
@@ -593,9 +598,9 @@ class FollowedRuns:
         joints = len(self.linear[0].trajectory.x[0])
         if len(self.evaluator.state_names) != 2 * joints:
             return None
-        prior = self.runs.prior
         if self._is_on_ground:
             return self._get_prior_of_measured_states()
+        prior = self.runs.prior
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
         return np.concatenate([prior[:joints], velocities])
 

@@ -84,6 +84,15 @@ class Information(NamedTuple):
     places: list[int]
     matrix: Array
 
+    def select(self, places: list[int]) -> Information:
+        """Return the information of some of the parameters if the others are known.
+
+        Args:
+            places: indices of these parameters in theta.
+        """
+        rows = [self.places.index(i) for i in places]
+        return Information(places, self.matrix[np.ix_(rows, rows)])
+
 
 @dataclass(frozen=True)
 class IdentifiedSet:
@@ -193,26 +202,24 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
     return FilteredSet(best, tuple(names))
 
 
-def _compute_wald_statistics(
-    context: SearchContext, theta: Array, names: Sequence[str], information: Information
+def compute_wald_statistics(
+    evaluator: RunEvaluator, theta: Array, names: Sequence[str], information: Information
 ) -> dict[str, float]:
     """Return the loss in twice the log-likelihood without each effect of a set.
 
     It is c' V^-1 c for the coefficients c of the effect and their covariance V.
 
     Args:
-        context: context of the search.
+        evaluator: the runs.
         theta: (P,) parameters of the set.
         names: its effects.
-        information: Fisher information of the set, or of a larger one.
+        information: Fisher information of all parameters of the set.
     """
-    places = list(_get_bounds(context, names))
-    rows = [information.places.index(i) for i in places]
-    covariance = np.linalg.pinv(information.matrix[np.ix_(rows, rows)], hermitian=True)
+    covariance = np.linalg.pinv(information.matrix, hermitian=True)
     statistics = {}
     for name in names:
-        effect_places = context.evaluator.get_coefficient_indices(name)
-        effect_rows = [places.index(i) for i in effect_places]
+        effect_places = evaluator.get_coefficient_indices(name)
+        effect_rows = [information.places.index(i) for i in effect_places]
         inverse = np.linalg.pinv(covariance[np.ix_(effect_rows, effect_rows)], hermitian=True)
         c = theta[effect_places]
         statistics[name] = float(c @ inverse @ c)
@@ -255,7 +262,12 @@ def _prune_set(
     information = Information(list(bounds), compute_information(followed, bounds))
     min_gains = {name: _compute_min_gain(context, current, name) for name in names}
     while True:
-        gains = _compute_wald_statistics(context, followed.theta, names, information)
+        gains = compute_wald_statistics(
+            context.evaluator,
+            followed.theta,
+            names,
+            information.select(list(_get_bounds(context, names))),
+        )
         negligible = [name for name in names if gains[name] < min_gains[name]]
         if not negligible:
             break

@@ -41,6 +41,10 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
     get_joint_name,
     get_servo_input,
 )
+from bench.diagnosis.prediction_error.identification_without_simulation import (
+    Information,
+    compute_wald_statistics,
+)
 from sims.core.simulator import Array
 
 DRY_FRICTION = "friction.coulomb"
@@ -268,11 +272,10 @@ class _ServoFitter:
 
     @cached_property
     def _base_parameters(self) -> list[list[int]]:
-        """Indices of the free base parameters of each joint's servo."""
+        """Indices of stiffness and damping of each joint's servo."""
         by_name = {self._evaluator.parameters[i].name: i for i in self._evaluator.base_indices}
         return [
-            [by_name[name] for law in SERVO_MODEL if (name := f"{law}@{actuator}") in by_name]
-            for _, actuator, _ in self._places
+            [by_name[f"{law}@{actuator}"] for law in SERVO_MODEL] for _, actuator, _ in self._places
         ]
 
     def _list_parameters(self, joint: int, laws: Sequence[str]) -> list[int]:
@@ -641,21 +644,15 @@ class _ServoFitter:
         Args:
             model: the fitted model.
         """
-        gains = {}
-        blocks = self._compute_jacobians(model, self._joints)
-        for joint, block in blocks.items():
-            indices = self._list_parameters(joint, model.laws[joint])
-            count = int(self._mask[:, :, joint].sum())
-            information = block.T @ block * count / model.costs[joint]
-            covariance = np.linalg.pinv(information, hermitian=True)
-            for name in model.laws[joint]:
-                rows = [indices.index(i) for i in self._evaluator.get_coefficient_indices(name)]
-                c = model.theta[self._evaluator.coefficient_slices[name]]
-                inverse = np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True)
-                gain = float(c @ inverse @ c)
-                if gain > self.context.filters.penalty(name):
-                    gains[name] = gain
-        return gains
+        gains: dict[str, float] = {}
+        for joint, block in self._compute_jacobians(model, self._joints).items():
+            laws, count = model.laws[joint], int(self._mask[:, :, joint].sum())
+            information = Information(
+                self._list_parameters(joint, laws), block.T @ block * count / model.costs[joint]
+            )
+            gains |= compute_wald_statistics(self._evaluator, model.theta, laws, information)
+        penalty = self.context.filters.penalty
+        return {name: gain for name, gain in gains.items() if gain > penalty(name)}
 
 
 def _solve_damped(block: Array, residual: Array, damping: float) -> Array:

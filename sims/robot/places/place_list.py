@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sims.core.simulator import InputError
 from sims.robot.contact_pairs import (
     find_geom,
     find_pair_geoms,
@@ -268,9 +269,12 @@ def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
         name: name of the geom.
 
     Raises:
-        InputError: there is no such geom.
+        InputError: there is no such geom, or it has no radius.
     """
-    radius = float(robot.compiled.geom_size[find_geom(robot, name), 0])
+    geom = find_geom(robot, name)
+    if not has_radius(robot, geom):
+        raise InputError(f"robot {robot.name}: geom {name} has no radius")
+    radius = float(robot.compiled.geom_size[geom, 0])
     stated = {"geom.radius": radius}
     return EffectPlace(name, "geom", None, "", "1", 1.0, 1.0, stated, f"geom {name}")
 
