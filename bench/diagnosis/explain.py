@@ -23,7 +23,7 @@ from bench.diagnosis.evaluation.noise_floor import (
     compute_noise_floor,
 )
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.evaluation.search_control import STAGES, SearchStoppedError
 from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
 from bench.diagnosis.explain_options import ExplainOptions
@@ -356,7 +356,7 @@ class _ExplainRun:
         # By name, the declared range of a base parameter and the wider range that replaced it.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.
-        self.identified: Array | None = None
+        self.identified: IdentifiedParameters | None = None
         self._filtered: FollowedRuns | None = None
         self._set_up(kind)
         if self.is_on_ground and self._leave_out_unpredictable_runs():
@@ -548,7 +548,7 @@ class _ExplainRun:
         evaluator.worker_pool = self.worker_pool
         self.worker_pool.register(evaluator)
         use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
-        evaluator.identified_base = self.identified
+        evaluator.identified = self.identified
         return evaluator
 
     def _make_no_effects_error(self) -> InputError:
@@ -1006,19 +1006,17 @@ class _ExplainRun:
     def _filter_with_fitted_parameters(self, filtered_runs: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
         # These imports are needed for robots only.
-        from bench.diagnosis.kalman.likelihood_fit import identify_base
+        from bench.diagnosis.prediction_error.base_identification import identify_base
         from bench.diagnosis.prediction_error.identification_without_simulation import is_long
 
         evaluator = self.fitting
         declared_bounds = {p.name: p.bounds for p in evaluator.parameters}
         # The joints of a real robot have friction, and long recordings are those of real robots.
-        refiltered_runs, wider_bounds = identify_base(
+        refiltered_runs, identified, wider_bounds = identify_base(
             evaluator, self.noise, filtered_runs, is_long(evaluator)
         )
-        if refiltered_runs is not filtered_runs:
-            self.identified = evaluator.identified_base = refiltered_runs.theta[
-                evaluator.base_indices
-            ]
+        if identified is not None:
+            self.identified = evaluator.identified = identified
         self._widen_ranges(wider_bounds, declared_bounds)
         return refiltered_runs
 
@@ -1507,7 +1505,7 @@ class _ExplainRun:
         They come from a registered tuner, or are those identified by prediction errors.
         """
         if self.tuner is None:
-            return self.identified
+            return None if self.identified is None else self.identified.base
         # Few users request a tuner, and the code that drives one is slow to import.
         from bench.diagnosis.fitting.base_fit import find_start_with_tuner
 

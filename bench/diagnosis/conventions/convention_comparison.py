@@ -483,8 +483,7 @@ class ConventionComparison:
         names = [
             name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
         ]
-        base = _make_unfitted_start(evaluator)
-        probes = [probe for name in names for probe in iterate_first_probes(evaluator, base, name)]
+        probes = [probe for name in names for probe in iterate_first_probes(evaluator, (), name)]
         selected = identify(filtered, filtered.columns(probes))
         samples = int(filtered.runs.recorded.sum())
         best, penalty = filtered.log_likelihood, 0.0

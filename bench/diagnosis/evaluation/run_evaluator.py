@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,19 @@ FREED_CONSTANT_RANGE_FACTOR = 5.0
 """Range factor of a constant that is estimated: from value / 5 to value * 5."""
 
 
+class IdentifiedParameters(NamedTuple):
+    """Parameters of a robot that a filter identified by prediction errors.
+
+    Attributes:
+        base: (b,) base parameters.
+        effects: coefficients (k,) of the effects that were identified with them, by name; empty if
+            no effect is needed, or if some of what is missing stays unknown.
+    """
+
+    base: Array
+    effects: Mapping[str, Array] = MappingProxyType({})
+
+
 class RunEvaluator:
     """Simulates the runs of a recording for given parameters, effects and initial states.
 
@@ -101,8 +115,7 @@ class RunEvaluator:
         cached_responses: responses to effects that have no linearisation, by name and coefficients.
         filtered_runs: the runs of a robot as followed by a state filter, or None
             (`bench.diagnosis.kalman.candidate_responses`).
-        identified_base: (b,) base parameters of a robot identified by prediction errors; None if
-            there are none.
+        identified: parameters of a robot identified by prediction errors; None if there are none.
         state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
             follows the runs of a robot; else None.
         is_in_contact: whether geoms of a robot touch, so that initial states were estimated by a
@@ -198,7 +211,7 @@ class RunEvaluator:
         self.cached_linearisations: dict[tuple[int, bytes, bytes], Any] = {}
         self.cached_responses: dict[tuple[str, bytes], Array] = {}
         self.filtered_runs: Any = None
-        self.identified_base: Array | None = None
+        self.identified: IdentifiedParameters | None = None
         self.is_in_contact = False
         self.state_prior: Array | None = None
         self.measured_states: dict[int, Mapping[int, Array]] = {}
@@ -501,9 +514,9 @@ class RunEvaluator:
             self.filtered_runs,
             self.initial_state_guesses,
         )
-        evaluator.state_derivatives, evaluator.identified_base = (
+        evaluator.state_derivatives, evaluator.identified = (
             self.state_derivatives,
-            self.identified_base,
+            self.identified,
         )
         evaluator.state_prior = self.state_prior
         evaluator.is_in_contact = self.is_in_contact

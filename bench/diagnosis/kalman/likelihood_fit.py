@@ -16,99 +16,20 @@ from typing import TypeAlias
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
-from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
+from bench.diagnosis.fitting.base_fit import Bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 
 Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
 
-MAX_BASE_ITERATIONS = 8
-"""Maximum number of Gauss-Newton steps for base parameters."""
 DIFFERENCE_SHARE = 1e-3
 """Finite-difference step of a parameter, as a share of its plausible range."""
 MIN_STEP_GAIN = 1.0
 """Minimum gain in log-likelihood by a step for which another step follows."""
 MAX_HALVINGS = 3
 """Maximum number of times that a step without gain is halved."""
-RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
-"""Effects at a joint that are fitted together with base parameters."""
-MAX_JOINTS = 3
-"""Maximum number of joints at which resisting effects are fitted with base parameters."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
-MIN_BASE_GAIN = 2.0
-"""Minimum gain in log-likelihood of base parameters over the nominal ones."""
-
-
-def identify_base(
-    evaluator: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
-) -> tuple[FollowedRuns, dict[str, Bounds]]:
-    """Identify the base parameters of a robot from the innovations of a filter.
-
-    If they leave a force missing, friction and constant forces at the joints are fitted with them
-    and then set to zero again. Without these effects, a mass would be overestimated.
-
-    Args:
-        evaluator: the runs for fitting; ranges that do not contain an estimate are replaced.
-        noise: sensor noise.
-        followed: the runs, filtered with the nominal parameters.
-        is_resisted: whether friction is certain, so that the parameters are not tried without it.
-
-    Returns:
-        The runs, filtered with the estimates, and the new ranges by name. If the likelihood gains
-        nothing, an estimate is at its widest bound, or the search has to end, the filter with
-        nominal parameters.
-    """
-    search_control = evaluator.search_control
-
-    def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        search_control.begin_stage("identifying the base parameters")
-        return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
-
-    base_indices = evaluator.base_indices.tolist()
-    limits = {i: compute_range_around(evaluator, i) for i in base_indices}
-    resisting_bounds = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
-    accepted = []
-    for further_bounds in [resisting_bounds] if is_resisted else [{}, resisting_bounds]:
-        try:
-            fitted = maximise_innovation_likelihood(
-                followed, limits | further_bounds, MAX_BASE_ITERATIONS, follow
-            )
-        except SearchStoppedError:
-            search_control.record_abandoned_fit(True)
-            return followed, {}
-        bounds_reached = [bound_of(float(fitted.theta[i]), *bounds) for i, bounds in limits.items()]
-        if fitted.has_expected_innovations and not any(bounds_reached):
-            accepted.append(fitted)
-        # The base parameters alone leave no force missing, so friction is not needed.
-        if accepted and not fitted.has_missing_force:
-            break
-    best = max(accepted, key=lambda one: one.log_likelihood, default=followed)
-    if best.log_likelihood - followed.log_likelihood < MIN_BASE_GAIN:
-        return followed, {}
-    values = {i: float(best.theta[i]) for i in base_indices}
-    wider_bounds = {}
-    for i, value in values.items():
-        low, high = evaluator.parameters[i].bounds
-        if not low <= value <= high:
-            wider_bounds[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
-    use_bounds(evaluator, wider_bounds)
-    theta = followed.theta.copy()
-    theta[base_indices] = best.theta[base_indices]
-    return follow(theta, best), wider_bounds
-
-
-def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
-    """Return effects that resist the motion of the joints with the largest missing forces."""
-    evaluator = followed.evaluator
-    coordinates = evaluator.simulator.system.coordinates
-    joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
-    names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
-    return [name for name in names if name in evaluator.coefficient_slices]
 
 
 def maximise_innovation_likelihood(

@@ -266,12 +266,12 @@ class ModelFilters:
         Without effects, the base model may need absurd values.
         """
         theta: Array = self.models.base_model.fit.theta.copy()
-        identified = self.evaluator.identified_base
+        identified = self.evaluator.identified
         if identified is not None:
             is_free = [
                 i not in self.models.fixed_parameters for i in self.evaluator.base_indices.tolist()
             ]
-            theta[self.evaluator.base_indices[is_free]] = identified[is_free]
+            theta[self.evaluator.base_indices[is_free]] = identified.base[is_free]
         return theta
 
     def make_theta_with(self, name: str, coefficients: Array) -> Array:

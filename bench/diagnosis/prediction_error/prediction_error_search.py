@@ -125,8 +125,9 @@ class PredictionErrorSearch(EffectSearch):
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
         """
         context, self.best_supported_model, best = self._search_context, self.base_model, None
-        if self.likely is not None:
-            best = remove_idle_effects(context, fit_by_simulation(context, self.likely))
+        likely = self.likely or self._make_identified_start()
+        if likely is not None:
+            best = remove_idle_effects(context, fit_by_simulation(context, likely))
         else:
             self.identified = identify_incomplete(context)
         if self.identified is not None:
@@ -136,6 +137,18 @@ class PredictionErrorSearch(EffectSearch):
             best = self._search_effects()
         self.best_supported_model = best
         return best
+
+    def _make_identified_start(self) -> FitStart | None:
+        """Return a start with the effects that were identified with the base parameters, if any."""
+        identified, filters = self.evaluator.identified, self._search_context.filters
+        if identified is None or not identified.effects:
+            return None
+        theta = filters.reference.copy()
+        for name, coefficients in identified.effects.items():
+            theta[self.evaluator.coefficient_slices[name]] = coefficients
+        return FitStart(
+            tuple(identified.effects), theta, filters.estimate_first_states(filters.base)
+        )
 
     def _search_effects(self) -> FittedModel:
         """Select effects by regression and fit them by simulation, until only noise is left.

@@ -106,20 +106,8 @@ class LibraryColumns:
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return small trial coefficients (probes) of effects; their responses are regressors."""
-        base, evaluator, probes = (
-            self.filters.models.base_model,
-            self.filters.evaluator,
-            list[CandidateDirection](),
-        )
-        for name in names:
-            bounds = compute_coefficient_bounds(evaluator, name)
-            for probe in iterate_first_probes(evaluator, base.fit, name):
-                # The value in the model file may be too large, so the correction may be negative.
-                signed = probe.can_be_negative or (
-                    bounds[probe.coefficient_index][0] < 0 and not probe.is_single_size
-                )
-                probes.append(replace(probe, can_be_negative=signed))
-        return probes
+        model = self.filters.models.base_model
+        return list_probes(self.filters.evaluator, model.effects, names)
 
     def select(self) -> Selected:
         """Select effects of the library by regression."""
@@ -189,6 +177,28 @@ class LibraryColumns:
             indices += evaluator.get_coefficient_indices(name)
             first_column += 1 + len(displaced)
         return KnownJacobian(np.array(indices, dtype=np.intp), np.stack(derivatives, axis=-1))
+
+
+def list_probes(
+    evaluator: RunEvaluator, model_effects: Sequence[str], names: Sequence[str]
+) -> list[CandidateDirection]:
+    """Return small trial coefficients (probes) of effects; their responses are regressors.
+
+    Args:
+        evaluator: the runs.
+        model_effects: names of the effects that the model contains.
+        names: names of the candidates.
+    """
+    probes = list[CandidateDirection]()
+    for name in names:
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for probe in iterate_first_probes(evaluator, model_effects, name):
+            # The value in the model file may be too large, so the correction may be negative.
+            signed = probe.can_be_negative or (
+                bounds[probe.coefficient_index][0] < 0 and not probe.is_single_size
+            )
+            probes.append(replace(probe, can_be_negative=signed))
+    return probes
 
 
 def group_coefficients(

@@ -584,7 +584,9 @@ def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> s
         return f"{name} = {format_tuned_value(p, 1)}."
     before, after = format_tuned_value(p, 0), format_tuned_value(p, 1)
     end = ": it had absorbed part of the gap." if has_absorbed_gap(p) else "."
-    return f"{name} {before} before, {after} after ({format_shift(p)}){end}"
+    # A change from the model file is small if the file is right, and its percentage then is not.
+    shift = "" if p.in_file else f" ({format_shift(p)})"
+    return f"{name} {before} before, {after} after{shift}{end}"
 
 
 def format_tuned_value(p: ParameterChange, model_index: int) -> str:

@@ -15,7 +15,7 @@ the input reaches it), the direction is the whole change at one size, and is val
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -103,7 +103,9 @@ def compute_directions(
         fit: the fitted model.
         names: names of effects that the model does not contain.
     """
-    probes = [probe for name in names for probe in iterate_first_probes(evaluator, fit, name)]
+    probes = [
+        probe for name in names for probe in iterate_first_probes(evaluator, fit.effects, name)
+    ]
     responses = _compute_directions(evaluator, fit, probes)
     is_acting = _find_observable_probes(evaluator, probes, responses)
     # The first responses show which coefficients only modify, for effects that act at all.
@@ -123,7 +125,7 @@ def compute_directions(
 
 
 def iterate_first_probes(
-    evaluator: RunEvaluator, fit: TrajectoryFit, name: str
+    evaluator: RunEvaluator, model_effects: Collection[str], name: str
 ) -> Iterator[CandidateDirection]:
     """Yield the coefficients at which the directions of an effect are computed.
 
@@ -134,7 +136,7 @@ def iterate_first_probes(
 
     Args:
         evaluator: the runs.
-        fit: the fitted model.
+        model_effects: names of the effects that the model contains.
         name: name of the effect.
     """
     parameters = list_coefficients(evaluator, name)
@@ -150,7 +152,7 @@ def iterate_first_probes(
     travel = evaluator.get_effect_travel(name)
     grids = [
         parameters[i].bounds[:1]
-        if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, fit, name)
+        if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, model_effects, name)
         else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
         for i in shape_indices
     ]
@@ -188,19 +190,21 @@ def iterate_first_probes(
         yield from _make_limit_probes(evaluator, name, group, shapes if shape_indices else None)
 
 
-def _is_contained_in_model(evaluator: RunEvaluator, fit: TrajectoryFit, name: str) -> bool:
+def _is_contained_in_model(
+    evaluator: RunEvaluator, model_effects: Collection[str], name: str
+) -> bool:
     """Return whether the model already has a simpler effect that the effect `name` contains.
 
     The simpler effect may also be in the model as a member of a family (one effect at all places).
 
     Args:
         evaluator: the runs, with all available effects.
-        fit: fit of the model.
+        model_effects: names of the effects that the model contains.
         name: name of the candidate effect.
     """
-    effects = [evaluator.available_effects[effect_name] for effect_name in fit.effects]
-    model_effects = {m.name for effect in effects for m in members_of(effect)}
-    return bool(model_effects & set(evaluator.available_effects[name].contains))
+    effects = [evaluator.available_effects[effect_name] for effect_name in model_effects]
+    members = {m.name for effect in effects for m in members_of(effect)}
+    return bool(members & set(evaluator.available_effects[name].contains))
 
 
 def _make_end_stop_probes(

@@ -504,7 +504,7 @@ def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
     """Exclude effects from scores whose shape parameters have many values to try."""
     evaluator, base = search.evaluator, search.base_model.fit
     probe_counts = {
-        name: sum(1 for _ in iterate_first_probes(evaluator, base, name))
+        name: sum(1 for _ in iterate_first_probes(evaluator, base.effects, name))
         for name in evaluator.library
     }
     search.excluded_effects = frozenset(

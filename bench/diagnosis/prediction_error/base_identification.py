@@ -1,0 +1,202 @@
+"""Identification of a robot's free base parameters by the likelihood of prediction errors.
+
+A cause that the model lacks changes the estimates of the free parameters: without friction, a mass
+is overestimated; without a payload, the gains of servos are. So base parameters are estimated alone
+and, if they leave a force missing, together with effects, which are then removed again. The search
+for causes begins at these estimates.
+
+An effect is proposed with the free parameters at the values of the model file. With both free, the
+regression would prefer gains and inertias that are all too small: far from the right model the
+filter needs much process noise, and then no forces at all are nearly as likely as the right ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
+from bench.diagnosis.evaluation.search_control import SearchStoppedError
+from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.likelihood_fit import (
+    Follow,
+    maximise_innovation_likelihood,
+)
+from bench.diagnosis.prediction_error.filters_with_effects import has_many_shapes
+from bench.diagnosis.prediction_error.regression_columns import group_coefficients, list_probes
+from bench.diagnosis.prediction_error.regression_selection import regress
+from sims.core.simulator import Array
+
+MAX_ITERATIONS = 8
+"""Maximum number of Gauss-Newton steps."""
+RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
+"""Effects at a joint that are fitted together with base parameters."""
+MAX_JOINTS = 3
+"""Maximum number of joints at which resisting effects are fitted with base parameters."""
+MAX_TRIED_EFFECTS = 6
+"""Maximum number of effects from a regression that are tried with base parameters."""
+EFFECT_ITERATIONS = 3
+"""Maximum number of Gauss-Newton steps of an effect with nominal base parameters."""
+MIN_GAIN = 2.0
+"""Minimum gain in log-likelihood of base parameters over the nominal ones."""
+
+
+class IdentifiedBase(NamedTuple):
+    """Result of an identification.
+
+    Attributes:
+        followed: the runs, filtered with the identified base parameters and without any effect.
+        parameters: the identified parameters; None if they are the nominal ones.
+        wider_bounds: new ranges of base parameters, by name.
+    """
+
+    followed: FollowedRuns
+    parameters: IdentifiedParameters | None
+    wider_bounds: Mapping[str, Bounds]
+
+
+class _Start(NamedTuple):
+    """Start of a fit of base parameters.
+
+    Attributes:
+        followed: the runs, filtered with the initial parameters.
+        effects: names of the effects that are fitted too.
+        penalty: minimum gain in log-likelihood that these effects need.
+        is_cause: whether the effects may be a cause of the gap.
+    """
+
+    followed: FollowedRuns
+    effects: Sequence[str]
+    penalty: float = 0.0
+    is_cause: bool = False
+
+
+def identify_base(
+    evaluator: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
+) -> IdentifiedBase:
+    """Identify the base parameters of a robot from the innovations of a filter.
+
+    They are fitted alone, then with friction and constant forces at the joints, then with the
+    effect that explains most, until no force is missing.
+
+    Args:
+        evaluator: the runs for fitting; ranges that do not contain an estimate are replaced.
+        noise: sensor noise.
+        followed: the runs, filtered with the nominal parameters.
+        is_resisted: whether friction is certain, so that only the second of these fits is made.
+
+    Returns:
+        The identified parameters. They are the nominal ones if the likelihood gains nothing, an
+        estimate is at its widest bound, or the search has to end.
+    """
+    search_control = evaluator.search_control
+
+    def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
+        search_control.begin_stage("identifying the base parameters")
+        return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
+
+    base_indices = evaluator.base_indices.tolist()
+    limits = {i: compute_range_around(evaluator, i) for i in base_indices}
+    best, best_log_likelihood = followed, followed.log_likelihood + MIN_GAIN
+    effects: dict[str, Array] = {}
+    for start in _iterate_starts(followed, follow, is_resisted):
+        bounds = limits | get_bounds_by_index(evaluator, start.effects)
+        try:
+            fitted = maximise_innovation_likelihood(start.followed, bounds, MAX_ITERATIONS, follow)
+        except SearchStoppedError:
+            search_control.record_abandoned_fit(True)
+            return IdentifiedBase(followed, None, {})
+        is_at_bound = any(bound_of(float(fitted.theta[i]), *limits[i]) for i in base_indices)
+        log_likelihood = fitted.log_likelihood - start.penalty
+        if not fitted.has_expected_innovations or is_at_bound:
+            continue
+        is_complete = not fitted.has_missing_force
+        if log_likelihood > best_log_likelihood:
+            best, best_log_likelihood = fitted, log_likelihood
+            causes = start.effects if start.is_cause and is_complete else ()
+            effects = {name: fitted.theta[evaluator.coefficient_slices[name]] for name in causes}
+        if is_complete:
+            break
+    if best is followed:
+        return IdentifiedBase(followed, None, {})
+    wider_bounds = {}
+    for i in base_indices:
+        value, (low, high) = float(best.theta[i]), evaluator.parameters[i].bounds
+        if not low <= value <= high:
+            wider_bounds[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
+    use_bounds(evaluator, wider_bounds)
+    theta = followed.theta.copy()
+    theta[base_indices] = best.theta[base_indices]
+    identified = IdentifiedParameters(theta[evaluator.base_indices], effects)
+    return IdentifiedBase(follow(theta, best), identified, wider_bounds)
+
+
+def _iterate_starts(followed: FollowedRuns, follow: Follow, is_resisted: bool) -> Iterator[_Start]:
+    """Yield starts of fits of base parameters, the simplest first.
+
+    Args:
+        followed: the runs, filtered with the nominal parameters.
+        follow: filters the runs with other parameters.
+        is_resisted: whether only resisting effects are fitted with the base parameters.
+    """
+    if not is_resisted:
+        yield _Start(followed, ())
+    yield _Start(followed, _list_resisting_effects(followed))
+    if not is_resisted:
+        start = _start_with_effect(followed, follow)
+        if start is not None:
+            yield start
+
+
+def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
+    """Return effects that resist the motion of the joints with the largest missing forces."""
+    evaluator = followed.evaluator
+    coordinates = evaluator.simulator.system.coordinates
+    joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
+    names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
+    return [name for name in names if name in evaluator.coefficient_slices]
+
+
+def _start_with_effect(followed: FollowedRuns, follow: Follow) -> _Start | None:
+    """Return a start with the effect that explains most with nominal base parameters.
+
+    Args:
+        followed: the runs, filtered with the nominal parameters.
+        follow: filters the runs with other parameters.
+
+    Returns:
+        The start with the likeliest of the effects that a regression proposes; None if there is
+        none.
+    """
+    evaluator = followed.evaluator
+    names = [name for name in evaluator.library if not has_many_shapes(name)]
+    evaluator.search_control.begin_stage(f"testing {len(names)} effects with the base parameters")
+    columns = followed.columns(list_probes(evaluator, (), names))
+    regression = regress(followed, columns)
+    gains = regression.compute_net_gains()
+    starts: dict[str, _Start] = {}
+    for i in np.argsort(-gains, kind="stable").tolist():
+        group = regression.groups[i]
+        if len(starts) == MAX_TRIED_EFFECTS or not gains[i] > 0.0:
+            break
+        if group.effect not in starts:
+            theta = followed.theta.copy()
+            theta[evaluator.coefficient_slices[group.effect]] = group_coefficients(
+                evaluator, columns.probes, group, regression.solve([group])[1][0]
+            )
+            fitted = maximise_innovation_likelihood(
+                follow(theta, followed),
+                get_bounds_by_index(evaluator, [group.effect]),
+                EFFECT_ITERATIONS,
+                follow,
+            )
+            penalty = 0.5 * regression.price(group)
+            starts[group.effect] = _Start(fitted, (group.effect,), penalty, is_cause=True)
+    return max(
+        starts.values(), key=lambda one: one.followed.log_likelihood - one.penalty, default=None
+    )
