@@ -170,8 +170,8 @@ def _start_with_effect(followed: FollowedRuns, follow: Follow) -> _Start | None:
         follow: filters the runs with other parameters.
 
     Returns:
-        The start with the likeliest of the effects that a regression proposes; None if there is
-        none.
+        The start with the likeliest of the proposed effects; None if the regression proposes no
+        effect.
     """
     evaluator = followed.evaluator
     names = [name for name in evaluator.library if not has_many_shapes(name)]
