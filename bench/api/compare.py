@@ -25,7 +25,7 @@ from bench.benchmark.problem.robot_experiment import (
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.comparison_resources import check_comparison_size
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.comparison_statistics import build_tables
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.reference_results import find_reference
 from bench.benchmark.storage.result_folder import StoredComparison, read_comparison
@@ -38,7 +38,7 @@ from bench.benchmark.storage.table_schemas import (
     SHOT_TABLE_COLUMNS,
 )
 from bench.core.options import with_options
-from bench.diagnosis_benchmark import table_columns as diagnosis
+from bench.diagnosis_benchmark import result_tables as diagnosis
 from bench.diagnosis_benchmark.diagnosers import language_model
 from bench.figures.figure_settings import pdf_figures
 from bench.misspecification.calibration import MODEL_LABELS

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.problem.experiment import (
     Experiment,
     TunerEntry,

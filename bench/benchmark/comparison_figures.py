@@ -16,8 +16,10 @@ from bench.benchmark.comparison_charts import (
 )
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.comparison_tables import IDENTIFIABILITY_COLUMNS
+from bench.benchmark.statistics.comparison_statistics import (
+    IDENTIFIABILITY_COLUMNS,
+    ComparisonStatistics,
+)
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.benchmark.storage.result_folder import StoredComparison

@@ -16,11 +16,10 @@ from bench.benchmark.comparison_page import (
     format_redraws,
     render_page,
 )
-from bench.benchmark.isolation.isolation_errors import ISOLATION_NOTE, without_isolation
+from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.error_curves import build_summary
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,

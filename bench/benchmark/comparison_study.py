@@ -42,7 +42,7 @@ from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
     from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
-    from bench.benchmark.runner.study_creation import PreparedStudy
+    from bench.benchmark.runner.stored_study import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 
@@ -259,7 +259,7 @@ class Comparison(Study):
         single parameter.
         """
         if results.spectra:
-            from bench.benchmark.statistics.comparison_tables import build_identifiability_table
+            from bench.benchmark.statistics.comparison_statistics import build_identifiability_table
 
             problem = results.problem
             table = build_identifiability_table(

@@ -11,7 +11,7 @@ import pandas as pd
 
 from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.statistics.comparison_tables import add_trust_column
+from bench.benchmark.statistics.comparison_statistics import add_trust_column
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
 from bench.bounce_shot.hit_rate_table import (

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.experiment_runner import (
     ProgressFactory,
@@ -19,8 +19,7 @@ from bench.benchmark.runner.experiment_runner import (
     no_progress,
 )
 from bench.benchmark.runner.plugin_discovery import describe_plugins
-from bench.benchmark.runner.stored_study import PrintLine, Study
-from bench.benchmark.runner.study_creation import PreparedStudy
+from bench.benchmark.runner.stored_study import PreparedStudy, PrintLine, Study
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,

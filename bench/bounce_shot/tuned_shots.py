@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.benchmark.isolation.tuner_proxy import TunerSpec, relocate
+from bench.benchmark.isolation.tuner_processes import TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.recording_observations import ObservedRuns, make_scenario
 from bench.benchmark.problem.targets import BlindedTarget

@@ -12,9 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_errors import KilledExternallyError, RunEndedError
-from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT
-from bench.benchmark.isolation.tuner_proxy import IsolatedRun, TunerSpec
+from bench.benchmark.isolation.isolation_layers import (
+    PROJECT_ROOT,
+    KilledExternallyError,
+    RunEndedError,
+)
+from bench.benchmark.isolation.tuner_processes import IsolatedRun, TunerSpec
 from bench.benchmark.runner.tuner_loop import RunTrace, drive_tuner
 from bench.benchmark.runner.tuner_process_reuse import (
     find_preloadable_packages,

@@ -64,9 +64,8 @@ from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRun
 from bench.diagnosis.verdict import RecordingFault
 from bench.diagnosis.verdict_builder import VerdictBuilder
 from bench.logs.importing.sample_selection import leave_out_settling, thin_recording
-from bench.logs.joined_recordings import load_joined
 from bench.logs.quality.clock_checks import check_recording_plausible
-from bench.logs.recording_loading import check_recording_size
+from bench.logs.recording_loading import check_recording_size, load_joined
 from bench.logs.segmentation import segment_recording
 from bench.pages.text_format import joined
 from sims import extended_simulator as extend
@@ -85,7 +84,7 @@ SOFT_FRICTION = (
 STIFF_FRICTION = "soft dry friction does not close the gap either: stiff friction is used"
 """Message to the user when dry friction changes back to the stiff form."""
 if TYPE_CHECKING:
-    from bench.diagnosis.evaluation.integrator_check import StepRefinement
+    from bench.diagnosis.evaluation.solver_options import StepRefinement
     from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
 MIN_SAMPLES_PER_UNKNOWN = 2.0
@@ -1271,7 +1270,7 @@ class _ExplainRun:
         chosen step are then those of the explainer.
         """
         # This import is needed for robots only.
-        from bench.diagnosis.evaluation.integrator_check import find_step_refinements
+        from bench.diagnosis.evaluation.solver_options import find_step_refinements
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
         file_evaluators = RunEvaluators(self.kind, self.fitting, self.validation)

@@ -23,8 +23,7 @@ from bench.benchmark.runner.worker_pools import Pool
 from bench.diagnosis.explain import explain
 from bench.diagnosis.report.effect_and_unit_text import append_unit, format_label
 from bench.figures.figure_settings import is_pdf_wanted
-from bench.logs.joined_recordings import make_log_names
-from bench.logs.recording_loading import compute_recording_digest, read_content
+from bench.logs.recording_loading import compute_recording_digest, make_log_names, read_content
 from bench.pages.text_format import format_csv
 from sims.core.files import check_folder_empty, get_first_line, write_atomically
 from sims.core.simulator import InputError

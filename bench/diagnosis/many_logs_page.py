@@ -21,8 +21,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     joined,
 )
 from bench.figures import figure_output, style
-from bench.figures.style import add_caption
-from bench.figures.text_layout import break_name
+from bench.figures.style import add_caption, break_name
 from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
 from bench.pages.chart_figure import draw_chart
 from bench.pages.html_page import HtmlPage

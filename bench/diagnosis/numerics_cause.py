@@ -24,7 +24,7 @@ from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:
-    from bench.diagnosis.evaluation.integrator_check import StepRefinement
+    from bench.diagnosis.evaluation.solver_options import StepRefinement
     from sims.robot.robot_simulator import RobotSimulator
 
 Item = TypeVar("Item")

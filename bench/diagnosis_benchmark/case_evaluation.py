@@ -17,22 +17,24 @@ from typing import Any
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     ProtocolError,
     pack_arrays,
     unpack_arrays,
 )
-from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import (
+    START_TIMEOUT_SECONDS,
+    IsolatedProcess,
+    TunerSpec,
+)
 from bench.benchmark.runner.tuner_process_reuse import get_fork_server, retry_if_killed
 from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process
-from bench.diagnosis_benchmark.case_catalogue import render_recording
 from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
-from bench.diagnosis_benchmark.case_set import CaseSpec
+from bench.diagnosis_benchmark.case_set import CaseSpec, render_recording
 from sims.core.simulator import Array, InputError
 
 PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"

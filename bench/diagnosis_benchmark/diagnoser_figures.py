@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.diagnosis_benchmark.report_page.diagnoser_charts import (
+from bench.diagnosis_benchmark.diagnoser_page import (
     DiagnoserReportData,
     build_chart_tables,
     make_charts,

@@ -15,9 +15,12 @@ from bench.diagnosis_benchmark import diagnoser_figures
 from bench.diagnosis_benchmark.answer_store import SKIPPED_STATUS, AnswersByCase, build_answer_rows
 from bench.diagnosis_benchmark.case_set import CaseSpec
 from bench.diagnosis_benchmark.diagnoser_figures import draw_confusion_matrices
+from bench.diagnosis_benchmark.diagnoser_page import (
+    DiagnoserReportData,
+    render_page,
+    summarise_unsupported,
+)
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
-from bench.diagnosis_benchmark.report_page.diagnoser_charts import DiagnoserReportData
-from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page, summarise_unsupported
 from bench.diagnosis_benchmark.result_tables import (
     PRIMARY_METRIC,
     build_all_tables,

@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.code_digest import (
     compute_digest,
@@ -33,8 +33,7 @@ from bench.benchmark.runner.plugin_discovery import (
     register_plugins,
 )
 from bench.benchmark.runner.run_fingerprint import check_unchanged
-from bench.benchmark.runner.stored_study import PrintLine, Study
-from bench.benchmark.runner.study_creation import PreparedStudy
+from bench.benchmark.runner.stored_study import PreparedStudy, PrintLine, Study
 from bench.benchmark.runner.tuner_process_reuse import find_preloadable_packages
 from bench.benchmark.runner.tuner_training import get_weights_folder as trained
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.runner.code_digest import (
     compute_digest,
     hash_package_versions,

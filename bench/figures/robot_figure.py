@@ -15,8 +15,14 @@ import numpy as np
 
 from bench.figures.camera_view import Projection, choose_projection, make_posed_data
 from bench.figures.offscreen_rendering import render_robot
-from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY, make_panel_grid
-from bench.figures.text_layout import break_name
+from bench.figures.style import (
+    BLUE,
+    CAPTION_GREY,
+    NEUTRAL_MARK,
+    NULL_LEVEL_GREY,
+    break_name,
+    make_panel_grid,
+)
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:

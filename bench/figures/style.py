@@ -7,6 +7,7 @@ settings and open figures are unchanged.
 
 from __future__ import annotations
 
+import re
 import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +24,73 @@ if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
     from bench.benchmark.storage.reference_results import ReferenceResult
+
+
+POINTS = 72.0
+"""Number of points in an inch."""
+
+
+def break_name(name: str, longest: int) -> str:
+    """Break a name into lines of at most `longest` characters.
+
+    Lines end after underscores and similar characters if possible, and never within the brackets of
+    a unit.
+
+    Args:
+        name: Name to break.
+        longest: Maximum length of a line.
+    """
+    parts = []
+    for bracketed, free in re.findall(r"(\[[^\]]*\]\s*)|([^\[]+|\[)", name):
+        # Do not break after a decimal point.
+        parts += [bracketed] if bracketed else re.split(r"(?<=[_\-/ ])|(?<=\.)(?!\d)", free)
+    lines = [""]
+    for part in parts:
+        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > longest:
+            lines.append("")
+        lines[-1] += part
+    # A part may be too long even for a line of its own.
+    return "\n".join(
+        wrapped_line for line in lines for wrapped_line in textwrap.wrap(line, longest)
+    )
+
+
+def shorten_name(name: str, max_length: int) -> str:
+    """Shorten a long name of a joint's quantity to the quantity.
+
+    Names with more than `max_length` characters are shortened, such as ``velocity of elbow`` to
+    ``velocity`` and ``u.elbow`` to ``u``.
+
+    Args:
+        name: Name to shorten.
+        max_length: Maximum length.
+    """
+    return (
+        name if len(name) <= max_length else re.split(r" of |\.", name, maxsplit=1)[0][:max_length]
+    )
+
+
+def measure_text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:
+    """Return the width of the longest line of some texts, in inches.
+
+    Args:
+        texts: Texts of one or several lines.
+        size: Size of the letters in points.
+        weight: ``normal`` or ``bold``.
+    """
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(family="DejaVu Sans", weight=weight, size=size)
+    lines = [line for text in texts for line in text.split("\n")]
+    widths = [text_to_path.get_text_width_height_descent(line, font, False)[0] for line in lines]
+    return float(max(widths, default=0.0)) / POINTS
+
+
+def count_max_lines(texts: Sequence[str]) -> int:
+    """Return the maximum number of lines of the texts."""
+    return max((text.count("\n") + 1 for text in texts), default=1)
+
 
 # Palette of eight colours safe for colour-blind readers: M. Okabe, K. Ito, Color Universal Design,
 # 2002.

@@ -1,10 +1,10 @@
-"""Load a recording from files or data frames, check its size, and compute its digest."""
+"""Load recordings that users name, cut them into runs, and join several recordings into one."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -32,7 +32,9 @@ from sims.recording.log_formats.hdf5_and_parquet import group_of
 from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
 from sims.recording.log_formats.ros_bags import split_bag_path
 from sims.recording.recording import (
+    MAX_FOLDS,
     Recording,
+    Run,
     read_recording,
     read_system_name,
     recording_of_frame,
@@ -376,3 +378,145 @@ def _list_included_files(model: Path) -> list[Path]:
         files += [file for file in dict.fromkeys(included_files) if file not in files]
         visited_count += 1
     return files
+
+
+def load_joined(
+    sources: Sequence[str | Path | Recording],
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
+    fix_base: bool = False,
+) -> tuple[Recording, type[Simulator]]:
+    """Read several recordings, join them into one, and find their simulator.
+
+    Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
+    runs that it would hold out alone, at least one. A constant that the recordings state
+    differently becomes a constant of the runs; a noise that they state differently is replaced by
+    its root mean square.
+
+    Args:
+        sources: Paths of the tables, or recordings in memory.
+        system: Registered system to use instead of the one that the recordings name.
+        model: Model file of a robot to use instead of the one that the recordings name.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        prepared: Function applied to each recording before its runs are divided.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
+
+    Returns:
+        The joined recording, and the simulator class of its system.
+
+    Raises:
+        InputError: One cannot be read, or they are not of one system with the same channels.
+    """
+    loaded = [
+        load_recording(source, system, model, free, divide=False, fix_base=fix_base)
+        for source in sources
+    ]
+    if prepared is not None:
+        loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
+    first_recording, kind = loaded[0]
+    if len(loaded) == 1:
+        return split_held_out(first_recording, folds=True), kind
+    for recording, other_kind in loaded[1:]:
+        _refuse_other(first_recording, kind, recording, other_kind)
+    recordings = [recording for recording, _ in loaded]
+    runs_of_all = [run for recording in recordings for run in recording.runs]
+    folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
+    if not folds:
+        recordings = [split_held_out(recording) for recording in recordings]
+    names = make_log_names([recording.path for recording in recordings])
+    constants = {
+        key: value
+        for key, value in first_recording.constants.items()
+        if all(recording.constants.get(key) == value for recording in recordings)
+    }
+    default_values = {c.name: c.value for c in kind.constants}
+    differing = {key for recording in recordings for key in recording.constants} - set(constants)
+    runs = [
+        replace(
+            run,
+            name=f"{name}: {run.name}",
+            log=name,
+            constants={key: _get_constant(key, recording, run, default_values) for key in differing}
+            | dict(run.constants),
+        )
+        for name, recording in zip(names, recordings, strict=True)
+        for run in recording.runs
+    ]
+    other_count = len(loaded) - 1
+    joined_recording = replace(
+        first_recording,
+        title=f"{first_recording.title or first_recording.path.stem} and {other_count} more "
+        f"log{'s' if other_count > 1 else ''}",
+        constants=constants,
+        noise=_compute_rms_noise(recordings),
+        runs=tuple(runs),
+        notes=tuple(note for recording in recordings for note in recording.notes),
+    )
+    return (split_held_out(joined_recording, folds=True) if folds else joined_recording), kind
+
+
+def _get_constant(
+    key: str, recording: Recording, run: Run, default_values: dict[str, float]
+) -> float:
+    return run.constants.get(key, recording.constants.get(key, default_values.get(key, np.nan)))
+
+
+def _refuse_other(
+    first: Recording, kind: type[Simulator], other: Recording, other_kind: type[Simulator]
+) -> None:
+    """Reject a recording that cannot be joined with the first one.
+
+    Args:
+        first: the first recording.
+        kind: its simulator class.
+        other: the other recording.
+        other_kind: its simulator class.
+
+    Raises:
+        InputError: System, model file, channels or inputs of the recordings differ.
+    """
+    robots = kind.has_model and other_kind.has_model
+    if (kind.has_model or other_kind.has_model) != robots or other_kind.name != kind.name:
+        raise InputError(
+            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of "
+            f"{other_kind.name}; explain it by itself"
+        )
+    if robots and vars(other_kind)["source_digest"] != vars(kind)["source_digest"]:
+        raise InputError(
+            f"{other.path}: expected the model file, the actuators and the free numbers of "
+            f"{first.path}, found others; state the same, or give --model and --free"
+        )
+    first_run, other_run = first.runs[0], other.runs[0]
+    for signal_type, first_names, other_names in (
+        ("channels", set(first_run.channels), set(other_run.channels)),
+        ("inputs", set(first_run.inputs), set(other_run.inputs)),
+    ):
+        if first_names != other_names:
+            raise InputError(
+                f"{other.path}: expected the {signal_type} of {first.path}, "
+                f"{', '.join(sorted(first_names))}, found "
+                f"{', '.join(sorted(other_names)) or 'none'}"
+            )
+
+
+def make_log_names(paths: Sequence[Path]) -> list[str]:
+    """Return a short name for each log: its stem, with its folder if stems repeat."""
+    stems = [path.stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    qualified_names = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(qualified_names)) == len(qualified_names):
+        return qualified_names
+    return [f"{number}/{name}" for number, name in enumerate(qualified_names, start=1)]
+
+
+def _compute_rms_noise(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Return the root mean square noise of each channel, if all recordings state it."""
+    shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
+    return {
+        name: float(np.sqrt(np.mean([recording.noise[name] ** 2 for recording in recordings])))
+        for name in recordings[0].noise
+        if name in shared
+    }

@@ -16,7 +16,7 @@ import pandas as pd
 
 from bench.benchmark.comparison_report import format_failures
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.statistics.comparison_tables import add_trust_column, build_tables
+from bench.benchmark.statistics.comparison_statistics import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
     FolderConfiguration,
     read_comparison,

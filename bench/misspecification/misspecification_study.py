@@ -39,7 +39,7 @@ from sims.extended_simulator import list_effect_coefficients
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
-    from bench.benchmark.runner.study_creation import PreparedStudy
+    from bench.benchmark.runner.stored_study import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 CALIBRATION_FILE = "calibration.csv"
@@ -182,7 +182,7 @@ class MisspecificationStudy(Study):
             # A public salt is already part of the experiment.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
-            from bench.benchmark.runner.study_creation import prepare_study
+            from bench.benchmark.runner.stored_study import prepare_study
 
             comparison = Comparison.begin(prepare_study(plan, self.plugins, folder, jobs, secret))
         if comparison.results is not None:

@@ -13,11 +13,11 @@ import numpy as np
 from bench.figures.style import (
     CAPTION_GREY,
     NOISE_BAND_GREY,
+    break_name,
     make_panel_grid,
     set_title,
     style_axis,
 )
-from bench.figures.text_layout import break_name
 from bench.pages.chart import Axis, AxisSpan, Panel, ReferenceLine, Series
 from sims.core.simulator import Array
 

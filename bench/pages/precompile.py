@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.pages.page_template import TEMPLATES, load_template
+from bench.pages.html_page import TEMPLATES, load_template
 
 BENCH = Path(__file__).parents[1]
 """Folder of all packages that have templates."""

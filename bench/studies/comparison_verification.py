@@ -18,7 +18,7 @@ from bench.benchmark.problem.targets import Target
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator
-from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.comparison_statistics import build_tables
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     StoredComparison,

@@ -46,7 +46,7 @@ def begin_studies(
             behind.
     """
     from bench.benchmark.problem.experiment import expand_sweep
-    from bench.benchmark.runner.study_creation import prepare_study
+    from bench.benchmark.runner.stored_study import prepare_study
 
     def begin(part: Experiment, place: Path | None) -> Study:
         return get_study_class(part).begin(prepare_study(part, plugins, place, jobs, salt))

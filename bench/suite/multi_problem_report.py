@@ -19,8 +19,7 @@ from bench.benchmark.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.comparison_tables import add_trust_column
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
 from bench.benchmark.statistics.error_curves import RunCurves, select_checkpoints
 from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,

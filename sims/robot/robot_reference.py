@@ -20,7 +20,7 @@ from sims.core.toml_validation import (
     check_text,
     make_error,
 )
-from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
+from sims.robot.robot_model import FRICTION_FORMS, FrictionForm
 
 if TYPE_CHECKING:
     from sims.robot.robot_simulator import RobotSimulator
@@ -41,7 +41,7 @@ class RobotReference:
         actuators: actuators that a recording added, by name.
         engine: time step and integrator of the recording that replace those of the model file.
         numerics: options that differ from those, such as ``timestep``; found by explain.
-        friction_form: form of the dry friction that effects add (`sims.robot.friction_form`).
+        friction_form: form of the dry friction that effects add (`sims.robot.robot_model`).
     """
 
     path: Path

@@ -24,7 +24,7 @@ from time import perf_counter, process_time
 import numpy as np
 import psutil
 
-from bench.benchmark.isolation.tuner_proxy import IsolatedRun, IsolatedTuner
+from bench.benchmark.isolation.tuner_processes import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner import tuner_process_reuse

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis.evaluation import run_subsampling
 from bench.diagnosis.explain import explain
+from bench.diagnosis.search import subsampled_search
 from tests.simulation_arguments import simulation_spec, write
 
 SLIDER = {"system": "slider", "observe": ["x"], "inputs": ["u=steps:2:0.5"]}
@@ -40,13 +40,13 @@ RECORDING_OPTIONS = {
 
 def explain_thinned(path, long):
     """Return processor seconds and the answer, if recordings are thinned from `long` samples."""
-    usual = run_subsampling.MIN_SAMPLES_TO_THIN
-    run_subsampling.MIN_SAMPLES_TO_THIN = long
+    usual = subsampled_search.MIN_SAMPLES_TO_THIN
+    subsampled_search.MIN_SAMPLES_TO_THIN = long
     begin = time.process_time()
     try:
         verdict = explain(path).answer
     finally:
-        run_subsampling.MIN_SAMPLES_TO_THIN = usual
+        subsampled_search.MIN_SAMPLES_TO_THIN = usual
     names = ", ".join(
         " or ".join([f"`{cause.effect}`", *map("`{}`".format, cause.alternatives)])
         for cause in verdict.causes
@@ -57,7 +57,7 @@ def explain_thinned(path, long):
 def row(name, path):
     """Return a row of the table."""
     whole, said = explain_thinned(path, np.inf)
-    few, also = explain_thinned(path, run_subsampling.MIN_SAMPLES_TO_THIN)
+    few, also = explain_thinned(path, subsampled_search.MIN_SAMPLES_TO_THIN)
     same = "the same" if also == said else also
     return f"| {name} | {whole:.1f} | {few:.1f} | {whole / few:.1f} | {said} | {same} |"
 

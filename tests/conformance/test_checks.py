@@ -18,8 +18,7 @@ from bench.conformance import (
     simulator_checks,
     tuner_checks,
 )
-from bench.conformance.check_suites import SUITES, failed_need
-from bench.conformance.run_checks import run_check
+from bench.conformance.check_suites import SUITES, failed_need, run_check
 from methods.tuner import Proposal, Tuner
 from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Channel, Constant, Parameter, Simulator

@@ -55,7 +55,7 @@ SHORT = {
     "bench.suite.multi_problem_report.ComparisonCollection.build_tables": _cut,
     "bench.benchmark.storage.provenance.distributions": _nothing,
     "bench.diagnosis.explain._ExplainRun.run": _cut,
-    "bench.conformance.run_checks._run_all_checks": _cut,
+    "bench.conformance.check_suites._run_all_checks": _cut,
     "bench.logs.film_tracking.write_video": _cut,
     "bench.figures.recording_figure.write_recording_figure": _nothing,
     "bench.figures.recording_figure.render_track_figure": lambda *_: (b"", b""),

@@ -56,7 +56,7 @@ class Message(NamedTuple):
     """Message received through the pipe.
 
     Attributes:
-        kind: one byte; see `isolation.tuner_server` and `isolation.tuner_proxy`.
+        kind: one byte; see `isolation.tuner_server` and `isolation.tuner_processes`.
         flags: number whose meaning depends on the kind.
         size: number whose meaning depends on the kind.
         body: content; valid until the next message is read.

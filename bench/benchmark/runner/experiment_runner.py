@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError, import_resource_module
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.process_limits import import_resource_module
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws

@@ -13,8 +13,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError, with_isolation
-from bench.benchmark.isolation.isolation_layers import AccessPolicy
+from bench.benchmark.isolation.isolation_layers import AccessPolicy, RunEndedError, with_isolation
 from bench.benchmark.isolation.message_channel import MessageChannel, to_printable
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.runner.code_digest import compute_digest, find_named_effects, hash_class_source

@@ -17,10 +17,14 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
-from bench.benchmark.isolation.process_limits import limited_memory
-from bench.benchmark.isolation.tuner_processes import NOTHING_WRITTEN, Written
-from bench.benchmark.isolation.tuner_proxy import IsolatedRun, TunerSpec, relocate
+from bench.benchmark.isolation.isolation_layers import RunEndedError, limited_memory
+from bench.benchmark.isolation.tuner_processes import (
+    NOTHING_WRITTEN,
+    IsolatedRun,
+    TunerSpec,
+    Written,
+    relocate,
+)
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.problem.tuning_problem import TuningProblem

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_errors import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.message_channel import to_points
 from methods.tuner import Array, Evaluation, Proposal, Task
 

@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.isolation_errors import KilledExternallyError, RunEndedError
-from bench.benchmark.isolation.tuner_processes import ForkServerClient
-from bench.benchmark.isolation.tuner_proxy import IsolatedTuner, TunerSpec
+from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.tuner_processes import ForkServerClient, IsolatedTuner, TunerSpec
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     Message,
@@ -32,8 +32,7 @@ from bench.benchmark.isolation.message_channel import (
     to_printable,
     unpack_arrays,
 )
-from bench.benchmark.isolation.tuner_processes import IsolatedProcess
-from bench.benchmark.isolation.tuner_proxy import TunerSpec, relocate
+from bench.benchmark.isolation.tuner_processes import IsolatedProcess, TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator, RandomisedSimulator

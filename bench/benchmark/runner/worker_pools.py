@@ -29,7 +29,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
-from bench.benchmark.isolation.isolation_errors import describe_exit
+from bench.benchmark.isolation.isolation_layers import describe_exit
 from bench.benchmark.isolation.linux_syscalls import set_not_dumpable
 from sims.core.simulator import InputError
 from sims.engines import describe_stepping

@@ -34,7 +34,7 @@ def _run_check(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a check failed.
     """
-    from bench.conformance.run_checks import run_suite
+    from bench.conformance.check_suites import run_suite
     from bench.core.plugin_registries import load_plugins
 
     load_plugins(options.plugin)

@@ -1,4 +1,12 @@
-"""Alternative options of MuJoCo's solver and integrator, and how well they explain recorded runs.
+"""MuJoCo's time step, integrator and solver: discretisation error, and better options.
+
+A model file specifies a time step and an integrator, and both affect the motion: with a coarse step
+the motion is early by about half a step, or a stiff servo becomes unstable. With the motion q(h) at
+step size h, a scheme is accepted as the reference if halving its step hardly changes the motion. If
+no scheme qualifies, the first-order error of an implicit scheme is extrapolated (L. F. Richardson,
+1911, doi:10.1098/rsta.1911.0009):
+
+    q = 2 q(h / 2) - q(h)                                                                      (1)
 
 Two simulators of one model file can differ in options that change the motion where geoms touch: the
 friction cone, the ratio of the friction's impedance to that of the normal force (`impratio`), the
@@ -8,11 +16,11 @@ iterations that prevent slip, the constraint solver and its iterations, and the 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.integrator_check import simulate_with_settings
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.simulator import Array
@@ -25,6 +33,213 @@ from sims.robot.integrator_settings import (
     read_option,
 )
 from sims.robot.robot_simulator import RobotSimulator
+
+MIN_DISCRETISATION_ERROR = 0.2
+"""Minimum RMS discretisation error, in units of the noise, at which finer steps are considered."""
+MAX_CORRECTED_ERROR = 0.1
+"""Maximum RMS error, in units of the noise, of a setting that corrects the discretisation error."""
+MAX_CORRECTED_ERROR_FAR_FIT = 0.7
+"""Maximum RMS error of a setting, in units of the noise, if the residual is much larger.
+
+The rest of the error is corrected after the fit (`bench.diagnosis.fitting.linearised_runs`).
+"""
+MIN_ERROR_REDUCTION = 4.0
+"""Minimum factor by which a setting must reduce an error above `MAX_CORRECTED_ERROR`.
+
+The reference is the error of the step of the model file.
+"""
+MAX_ERROR_TO_RESIDUAL_RATIO = 0.05
+"""Maximum error of a setting above `MAX_CORRECTED_ERROR`, as a share of the model's residual."""
+CONVERGENCE_TOLERANCE = 0.03
+"""Maximum RMS change by halving the step, in units of the noise, of a reference scheme."""
+MAX_STEP_DIVISIONS = 10
+"""Maximum number of divisions of the step of the model file."""
+STIFF_INTEGRATOR = "implicitfast"
+"""Integrator that remains stable with stiff servos."""
+CHECKED_RUN_COUNT = 2
+"""Number of runs that are checked; a step that is too coarse is so in all runs."""
+RELATIVE_RK4_COST = 3.3
+"""Time of a step of RK4, relative to one of the other integrators."""
+
+
+class StepRefinement(NamedTuple):
+    """A finer step or better integrator for a robot.
+
+    Attributes:
+        kind: its simulator with these settings.
+        file_settings: step and integrator of the model file.
+        numerics: step and integrator that correct the error.
+        error: RMS discretisation error of `file_settings`, in units of the noise.
+        corrected_error: RMS discretisation error of `numerics`, in units of the noise.
+    """
+
+    kind: type[RobotSimulator]
+    file_settings: IntegratorSettings
+    numerics: IntegratorSettings
+    error: float
+    corrected_error: float
+
+    def is_accurate_enough(self, residual_rms: float) -> bool:
+        """Return whether the step is fine enough for a model with the given residual.
+
+        Args:
+            residual_rms: RMS residual of the model, in units of the noise.
+        """
+        return self.corrected_error < max(
+            MAX_CORRECTED_ERROR, MAX_ERROR_TO_RESIDUAL_RATIO * residual_rms
+        )
+
+
+def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
+    """Yield settings that reproduce the converged motion of the robot, the cheapest first.
+
+    Nothing is generated if the settings of the model file are accurate, or if no reference
+    converges.
+
+    Args:
+        evaluator: the runs of a robot.
+        noise: noise of each channel.
+    """
+    kind = evaluator.kind
+    assert issubclass(kind, RobotSimulator)
+    motions = _ReferenceMotions(evaluator, noise)
+    model_settings = kind.numerics
+    reference = motions.reference(model_settings)
+    if reference is None:
+        return
+    error = motions.compute_rms_difference(motions.of(model_settings), reference)
+    if not error > MIN_DISCRETISATION_ERROR:
+        return
+    for numerics in _iterate_settings(model_settings):
+        corrected_error = motions.compute_rms_difference(motions.of(numerics), reference)
+        if corrected_error < max(
+            MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
+        ):
+            yield StepRefinement(
+                kind.with_integrator_settings(numerics),
+                model_settings,
+                numerics,
+                error,
+                corrected_error,
+            )
+
+
+def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings]:
+    """Yield finer time steps and other integrators than the robot's own, the cheapest first.
+
+    The cost of a step depends on the integrator (`RELATIVE_RK4_COST`).
+    """
+    step, integrator, *_ = model_settings
+    cost = {"RK4": RELATIVE_RK4_COST}
+    settings_by_cost = []
+    for parts in (1, 2, 5, MAX_STEP_DIVISIONS):
+        for name in dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4")):
+            if (parts, name) != (1, integrator):
+                settings_by_cost.append((parts * cost.get(name, 1.0), parts, name))
+    for _, parts, name in sorted(settings_by_cost, key=lambda entry: entry[0]):
+        yield model_settings._replace(timestep=step / parts, integrator=name)
+
+
+def simulate_with_settings(
+    evaluator: RunEvaluator, numerics: IntegratorSettings, theta: Array, initial_states: Array
+) -> Array:
+    """Simulate the first runs of a robot with other settings, without effects.
+
+    Args:
+        evaluator: the runs.
+        numerics: settings of the integrator and the solver.
+        theta: (P,) parameters.
+        initial_states: (R, s) initial states of the first R runs.
+
+    Returns:
+        Readings (R, T, C), NaN after the end of a run.
+    """
+    kind = evaluator.kind
+    assert issubclass(kind, RobotSimulator)
+    count = len(initial_states)
+    parameters = np.tile(theta[: evaluator.system_parameter_count], (count, 1))
+    states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
+    scenarios = [run.scenario for run in evaluator.prepared_runs[:count]]
+    evaluator.simulation_count += count
+    other_kind = kind.with_integrator_settings(numerics)
+    with closing(other_kind(evaluator.recording.constants, evaluator.channels)) as simulator:
+        return simulator.simulate_batch(parameters, scenarios, states)
+
+
+class _ReferenceMotions:
+    """Motions of the first runs with any step and integrator, each simulated once."""
+
+    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
+        self._evaluator, self._noise = evaluator, noise
+        self._checked_runs = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
+        self._motions: dict[IntegratorSettings, Array] = {}
+
+    def of(self, numerics: IntegratorSettings) -> Array:
+        """Return the motion (R, T, C) with a step and integrator, NaN after the end of a run."""
+        if numerics not in self._motions:
+            self._motions[numerics] = self._simulate_with(numerics)
+        return self._motions[numerics]
+
+    def _simulate_with(self, numerics: IntegratorSettings) -> Array:
+        """Simulate the first runs with a given time step and integrator, at nominal parameters.
+
+        No effects are active. The result is (R, T, C).
+        """
+        evaluator = self._evaluator
+        states = evaluator.initial_state_guesses[: len(self._checked_runs)]
+        return simulate_with_settings(evaluator, numerics, evaluator.get_nominal_theta(), states)
+
+    def reference(self, model_settings: IntegratorSettings) -> Array | None:
+        """Return the converged motion of the robot (R, T, C); None if no integrator converges.
+
+        A motion has converged if halving the time step hardly changes it. RK4 is tried first; for
+        stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
+        """
+        for division in (1, 2, 5):
+            coarse, refined = (
+                self.of(
+                    model_settings._replace(
+                        timestep=model_settings.timestep / divisor, integrator="RK4"
+                    )
+                )
+                for divisor in (division, 2 * division)
+            )
+            if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
+                return refined
+        for division in (2, 5):
+            extrapolated = []
+            for divisor in (division, 2 * division):
+                coarse, refined = (
+                    self.of(
+                        model_settings._replace(
+                            timestep=model_settings.timestep / k, integrator=STIFF_INTEGRATOR
+                        )
+                    )
+                    for k in (divisor, 2 * divisor)
+                )
+                extrapolated.append(2.0 * refined - coarse)  # (1)
+            if self.compute_rms_difference(*extrapolated) < CONVERGENCE_TOLERANCE:
+                return extrapolated[1]
+        return None
+
+    def compute_rms_difference(self, first: Array, second: Array) -> float:
+        """Return the RMS difference in units of the noise; infinite if a simulation fails.
+
+        Only available samples of the recording are compared.
+
+        Args:
+            first: (R, T, C) simulated channels of the checked runs.
+            second: (R, T, C) the same channels, simulated with other settings.
+        """
+        observed_masks = [np.isfinite(run_data.observed) for run_data in self._checked_runs]
+        squares = []
+        for run, observed_mask in enumerate(observed_masks):
+            samples = slice(len(observed_mask))
+            difference = (first[run, samples] - second[run, samples]) / self._noise.sigma
+            squares.append(np.square(difference[observed_mask]))
+        size = float(np.sqrt(np.concatenate(squares).mean()))
+        return size if np.isfinite(size) else float("inf")
+
 
 IMPEDANCE_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Values of `impratio` that are tried; model files state numbers between 1 and 100."""

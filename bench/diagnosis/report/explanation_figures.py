@@ -61,9 +61,11 @@ from bench.figures.style import (
     SKY_BLUE,
     ZERO_LINE_GREY,
     apply_settings,
+    break_name,
+    count_max_lines,
     make_panel_grid,
+    measure_text_width,
 )
-from bench.figures.text_layout import break_name, count_max_lines, measure_text_width
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:

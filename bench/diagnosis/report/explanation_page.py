@@ -76,7 +76,7 @@ from bench.diagnosis.report.summary_text import (
     has_gap_closed,
 )
 from bench.diagnosis.verdict import Cause
-from bench.figures.text_layout import shorten_name
+from bench.figures.style import shorten_name
 from bench.pages.chart import Axis, Panel, PrintedFigure, Series
 from bench.pages.html_page import HtmlPage
 from bench.pages.page_table import IntervalDrawing, Table, draw_intervals

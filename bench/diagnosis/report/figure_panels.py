@@ -23,8 +23,8 @@ from bench.figures.style import (
     NULL_LEVEL_GREY,
     VERMILION,
     ZERO_LINE_GREY,
+    break_name,
 )
-from bench.figures.text_layout import break_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -32,9 +32,10 @@ from bench.figures.style import (
     NEUTRAL_MARK,
     NOISE_BAND_GREY,
     ZERO_LINE_GREY,
+    break_name,
     make_panel_grid,
+    measure_text_width,
 )
-from bench.figures.text_layout import break_name, measure_text_width
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:

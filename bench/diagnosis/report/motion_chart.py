@@ -19,8 +19,7 @@ from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.report.summary_text import list_data_splits
 from bench.figures.signal_thinning import select_extreme_samples
-from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
-from bench.figures.text_layout import shorten_name
+from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style, shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
 from bench.pages.page_table import Table
 from sims.core.simulator import Array

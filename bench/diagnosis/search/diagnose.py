@@ -17,8 +17,9 @@ import numpy as np
 from bench.diagnosis.evaluation.search_control import EarlyStop, SearchStoppedError
 from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.search import verdict_rules
-from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
-from bench.diagnosis.search.competing_refits import (
+from bench.diagnosis.search.alternative_causes import (
+    AlternativeFinder,
+    CauseEvidence,
     list_competing_models,
     refine_best_model,
     select_decisive,

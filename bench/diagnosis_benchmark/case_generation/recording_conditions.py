@@ -377,7 +377,7 @@ class BenchmarkCase:
 
     Attributes:
         name: composed of kind, system, requested values and seed.
-        system: one of `bench.diagnosis_benchmark.case_catalogue.ALL_SYSTEMS`.
+        system: one of `bench.diagnosis_benchmark.case_set.ALL_SYSTEMS`.
         kind: one of `CASE_KINDS`.
         effects: coefficients of the hidden effects, by name; for an unmodelled cause, its own
             numbers.

@@ -26,7 +26,7 @@ from bench.logs.importing.normalised_positions import (
     is_lerobot,
 )
 from bench.logs.importing.run_logs import MAX_RUNS, RunLogs
-from bench.logs.quality.velocity_consistency import MIN_CORRELATION, VelocityComparison
+from bench.logs.quality.signal_checks import MIN_CORRELATION, VelocityComparison
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import Run
 from sims.recording.unit_conversion import compute_unit_scale

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bench.logs.quality import clock_checks, pose_check, signal_checks, velocity_consistency
+from bench.logs.quality import clock_checks, pose_check, signal_checks
 from bench.logs.quality.quality_finding import QualityFinding
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording
@@ -29,5 +29,5 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     yield from signal_checks.check_quantisation(recording, kind)
     yield from signal_checks.check_saturation(recording, kind)
     yield from signal_checks.check_standstill(recording, kind)
-    yield from velocity_consistency.check_velocities(recording, kind)
+    yield from signal_checks.check_velocities(recording, kind)
     yield from pose_check.find_overlaps(recording, kind)

@@ -22,7 +22,7 @@ import numpy as np
 
 from sims.core.simulator import InputError
 from sims.engines.compiled import intrinsics, machine_code
-from sims.engines.compiled.array_shapes import INTEGERS, Array, measure_arrays
+from sims.engines.compiled.data_layout import INTEGERS, Array, measure_arrays
 
 HAS_LLVMLITE = importlib.util.find_spec("llvmlite") is not None
 """True if machine code can be loaded; numba may not support this Python version yet."""
@@ -39,7 +39,7 @@ class ArrayFunctions:
     Args:
         module: name of the module, which holds this object under the name ``COMPILED``.
         description: what is compiled, for messages to the user.
-        shapes: shapes of the arguments of each function (`array_shapes`). A function with one
+        shapes: shapes of the arguments of each function (`data_layout`). A function with one
             parameter receives them as one tuple, whose class is its annotation.
         can_run_uncompiled: whether the functions run as Python where llvmlite is not installed, a
             hundred times slower.

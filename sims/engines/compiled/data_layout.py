@@ -3,15 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.effect import Effect, Force, Friction
 from sims.core.system import System
-from sims.engines.compiled.array_shapes import measure_arrays
 from sims.engines.compiled.traced_array import EXTERNAL
+
+Array = NDArray[Any]
+INTEGERS = "#"
+"""Prefix of the shapes of integer arrays, and the shape of an integer argument."""
+
+
+def measure_arrays(shapes: Sequence[str], arguments: Sequence[Any]) -> dict[str, int]:
+    """Return the sizes of arrays by the letters of their shapes.
+
+    Args:
+        shapes: shapes of the arrays.
+        arguments: arrays, and integers where the shape is `INTEGERS`.
+
+    Raises:
+        ValueError: an array has another shape, type or memory layout than declared.
+    """
+    sizes: dict[str, int] = {}
+    for shape, array in zip(shapes, arguments, strict=True):
+        if shape == INTEGERS:
+            continue
+        letters = shape.removeprefix(INTEGERS)
+        kind = np.int64 if shape.startswith(INTEGERS) else np.float64
+        expected = tuple(
+            int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
+            for letter, size in zip(letters, array.shape, strict=False)
+        )
+        if (
+            array.shape != expected
+            or array.ndim != len(letters)
+            or array.dtype != kind
+            or not array.flags.c_contiguous
+        ):
+            raise ValueError(
+                f"expected a contiguous array of shape {expected} of {kind.__name__}, got"
+                f" {array.dtype} of shape {array.shape}"
+            )
+    return sizes
+
+
+def make_example(shape: str) -> Any:
+    """Return an example of an argument with this shape."""
+    if shape == INTEGERS:
+        return 1
+    kind = np.int64 if shape.startswith(INTEGERS) else np.float64
+    return np.zeros((1,) * len(shape.removeprefix(INTEGERS)), dtype=kind)
+
 
 FloatArray = NDArray[np.float64]
 Row = NDArray[np.float64]
@@ -139,7 +184,7 @@ BLOCK_SHAPES = (
     *("#i5", "#4", "#q", "#d", "#6", "#s", "#s", "sp", "l", "ld", "ld", "kt", "ujt"),
     *("l", "l", "l", "4l", "2", "lyz", "rw", "aw", "#nw", "#", "#"),
 )
-"""Shapes of the arrays of `Block`, see `array_shapes`.
+"""Shapes of the arrays of `Block`, see `measure_arrays`.
 
 d coordinates, s of l elements, t steps, u inputs, p parameters, w slots; k and j are 1 or l.
 """

@@ -16,8 +16,7 @@ from types import FunctionType
 from typing import Any
 
 from sims.engines.compiled import intrinsics, machine_code
-from sims.engines.compiled.array_shapes import make_example
-from sims.engines.compiled.data_layout import BLOCK_SHAPES, Block
+from sims.engines.compiled.data_layout import BLOCK_SHAPES, Block, make_example
 
 _INLINED_FUNCTIONS = frozenset(
     {

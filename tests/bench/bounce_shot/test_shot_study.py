@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from bench.api.compare import ComparisonResult
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
-from bench.benchmark.runner.study_creation import prepare_study
+from bench.benchmark.runner.stored_study import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.benchmark.statistics.paired_tests import compute_proportion_interval

@@ -56,7 +56,7 @@ def test_the_tuner_of_the_page_passes_every_check(tmp_path, capsys):
 def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(
     name, expected, capsys, monkeypatch
 ):
-    monkeypatch.setattr("bench.conformance.run_checks.CALL_TIMEOUT_SECONDS", 2.0)
+    monkeypatch.setattr("bench.conformance.check_suites.CALL_TIMEOUT_SECONDS", 2.0)
     monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.0)
     code, said = checked(capsys, name, *CHAOS)
     assert code == 1

@@ -13,7 +13,7 @@ import pytest
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.score_extended import score_model
 from bench.logs.importing.sample_selection import leave_out_settling
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 
 NOISE = 5e-4
 ARM = """

@@ -27,7 +27,7 @@ from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 from sims.extended_simulator import read_extended
 from tests.bench.diagnosis.verdict_schema import check
 from tests.sims.robot.test_friction_form import ARM

@@ -8,11 +8,13 @@ from scipy.stats import beta
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.diagnosis_benchmark.diagnoser_figures import draw_chart_figures, draw_confusion_matrices
+from bench.diagnosis_benchmark.diagnoser_page import DiagnoserReportData, render_page
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
-from bench.diagnosis_benchmark.report_page.diagnoser_charts import DiagnoserReportData
-from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page
-from bench.diagnosis_benchmark.result_tables import build_all_tables, build_failure_table
-from bench.diagnosis_benchmark.table_columns import read_table
+from bench.diagnosis_benchmark.result_tables import (
+    build_all_tables,
+    build_failure_table,
+    read_table,
+)
 from bench.figures.figure_output import render_all_formats
 from bench.figures.style import make_panel_grid
 from bench.pages.text_format import format_percent

@@ -6,8 +6,7 @@ import re
 import pandas as pd
 
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
-from bench.diagnosis_benchmark.result_tables import build_all_tables
-from bench.diagnosis_benchmark.table_columns import read_table
+from bench.diagnosis_benchmark.result_tables import build_all_tables, read_table
 from tests.docs.documentation_pages import ROOT, section
 
 FOLDER = ROOT / "results/reference/diagnosis"

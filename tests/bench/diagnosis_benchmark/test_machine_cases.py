@@ -12,25 +12,23 @@ import pytest
 
 from bench.core.diagnoser import DiagnosisCase, list_observable_effects
 from bench.core.plugin_registries import make_robot_simulator
-from bench.diagnosis_benchmark.case_catalogue import list_coefficient_names, render_recording
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     BenchmarkCase,
     RequestedConditions,
 )
+from bench.diagnosis_benchmark.case_set import list_coefficient_names, render_recording
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import RegressionEvidence
 from bench.diagnosis_benchmark.grading import _count_classes, grade_answer
 from bench.diagnosis_benchmark.machine_cases.hidden_causes import (
     EFFECTS_BY_MACHINE,
     list_effect_places,
 )
-from bench.diagnosis_benchmark.machine_cases.machine_case_files import (
-    MODEL_FILE_NAME,
-    render_arm_mjcf,
-    write_case,
-)
 from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import (
+    MODEL_FILE_NAME,
     draw_case,
+    render_arm_mjcf,
     restore_conditions,
+    write_case,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     MACHINES,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.diagnosis_benchmark.case_catalogue import draw_case, render_recording
+from bench.diagnosis_benchmark.case_set import draw_case, render_recording
 
 PUBLISHED = json.loads(Path(__file__).with_name("published_cases.json").read_text())
 

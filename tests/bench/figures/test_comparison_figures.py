@@ -13,8 +13,7 @@ from bench.benchmark.comparison_figures import (
     draw_figure,
     list_figure_names,
 )
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.error_curves import build_error_table
 from sims.core.simulator import InputError
 from tests.bench.figures.sample_comparisons import LABELS, stored

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
-from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
@@ -35,7 +35,7 @@ def run_isolated(code, files=(), memory=0):
 def _run(child, tuned):
     import numpy as np
 
-    from bench.benchmark.isolation.tuner_proxy import IsolatedRun, IsolatedTuner
+    from bench.benchmark.isolation.tuner_processes import IsolatedRun, IsolatedTuner
     from bench.benchmark.runner.tuner_loop import drive_tuner
     from methods.tuner import Task
 

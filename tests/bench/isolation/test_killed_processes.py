@@ -12,7 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.isolation.isolation_errors import KilledExternallyError
+from bench.benchmark.isolation.isolation_layers import KilledExternallyError
 from bench.benchmark.isolation.tuner_processes import create_locked_folder, remove_stale_folders
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import tuner_process_reuse

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
@@ -163,7 +163,7 @@ def test_weights_of_a_trusted_tuner_are_not_those_of_an_isolated_one(experiment)
 
 
 def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experiment, monkeypatch):
-    from bench.benchmark.isolation.isolation_errors import KilledExternallyError
+    from bench.benchmark.isolation.isolation_layers import KilledExternallyError
     from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 
     asked = []

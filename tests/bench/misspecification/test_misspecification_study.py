@@ -21,7 +21,7 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.problem.recording_observations import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.study_creation import prepare_study
+from bench.benchmark.runner.stored_study import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores

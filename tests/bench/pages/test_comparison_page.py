@@ -20,8 +20,7 @@ from bench.benchmark.comparison_page import (
     write_provenance_notes,
     write_running_times,
 )
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.training_amortisation import build_time_per_target_table
 from bench.figures.figure_output import render_all_formats
 from bench.pages.text_format import format_number

@@ -5,7 +5,7 @@ import csv
 import pytest
 import tomli_w
 
-from bench.benchmark.isolation.isolation_errors import ISOLATION_NOTE
+from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner.run_scoring import Notes
 from bench.cli.main import main

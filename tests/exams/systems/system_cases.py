@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_catalogue import find_equivalent_effects
 from bench.diagnosis_benchmark.case_generation import effect_sizing
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     SUBTHRESHOLD_SIZES,
@@ -23,6 +22,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
 )
+from bench.diagnosis_benchmark.case_set import find_equivalent_effects
 from bench.diagnosis_benchmark.grading import MAX_SET_SIZE, grade_answer
 from sims import effects as library
 from tests.exams.exam import (

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation import run_subsampling
-from bench.diagnosis.evaluation.run_subsampling import thin_runs
+from bench.diagnosis.search import subsampled_search
+from bench.diagnosis.search.subsampled_search import thin_runs
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recorded, with_runs
 
@@ -17,8 +17,8 @@ PUSHED = np.sin(40.0 * TIMES)
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
     """Lower the sample limits so that short runs are thinned."""
-    monkeypatch.setattr(run_subsampling, "MIN_SAMPLES_TO_THIN", 3000)
-    monkeypatch.setattr(run_subsampling, "MIN_THINNED_SAMPLES", 100)
+    monkeypatch.setattr(subsampled_search, "MIN_SAMPLES_TO_THIN", 3000)
+    monkeypatch.setattr(subsampled_search, "MIN_THINNED_SAMPLES", 100)
 
 
 @pytest.fixture(scope="module")
@@ -70,5 +70,5 @@ def test_few_samples_or_far_apart_or_seldom_recorded_are_left_alone(log, monkeyp
     assert thin_runs(evaluator(with_runs(log, holes))) is None, (
         "of the samples kept none is recorded"
     )
-    monkeypatch.setattr(run_subsampling, "MIN_THINNED_SAMPLES", 1000)
+    monkeypatch.setattr(subsampled_search, "MIN_THINNED_SAMPLES", 1000)
     assert thin_runs(evaluator(log)).lengths.tolist() == [500, 500], "as many as must be left"

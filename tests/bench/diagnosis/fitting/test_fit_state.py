@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.integrator_check import MAX_CORRECTED_ERROR, StepRefinement
+from bench.diagnosis.evaluation.solver_options import MAX_CORRECTED_ERROR, StepRefinement
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
     FitPoint,
     FitStart,

@@ -13,7 +13,7 @@ from bench.diagnosis.fitting.multiple_shooting import (
 )
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search import effect_search, model_moves
-from bench.diagnosis.search.competing_refits import refine_best_model
+from bench.diagnosis.search.alternative_causes import refine_best_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo

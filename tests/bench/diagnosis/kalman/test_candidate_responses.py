@@ -10,7 +10,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns, _linearise_run
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 
 LOG = Path(__file__).parents[4] / "examples/robot/log.csv"
 

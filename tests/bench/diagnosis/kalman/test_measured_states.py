@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 from sims.robot.dynamics.linearisation_about_recording import (
     MeasuredLinear,
     Trajectory,

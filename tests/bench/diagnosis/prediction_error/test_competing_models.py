@@ -6,7 +6,7 @@ import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.prediction_error.filters_with_effects import list_joint_model_effects
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")

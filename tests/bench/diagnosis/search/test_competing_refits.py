@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.search import competing_refits as settling
-from bench.diagnosis.search.competing_refits import (
+from bench.diagnosis.search import alternative_causes as settling
+from bench.diagnosis.search.alternative_causes import (
     FAR_EXCESS,
     MAX_COMPETITOR_DISTANCE,
     MAX_COMPETITOR_EXCESS_RATIO,

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation import run_subsampling
 from bench.diagnosis.evaluation.search_control import SearchControl, SearchStoppedError
-from bench.diagnosis.search import competing_refits, subsampled_search
-from bench.diagnosis.search.competing_refits import refine_best_model
+from bench.diagnosis.search import alternative_causes, subsampled_search
+from bench.diagnosis.search.alternative_causes import refine_best_model
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.subsampled_search import search_with_subsampling
 from tests.bench.diagnosis.explained_samples import recording, searched
@@ -18,8 +17,8 @@ WITH_FRICTION = {"effects": ["friction.coulomb=0.3"], "observe": ["x"], "noise":
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
     """Lower the sample limits so that short runs are thinned."""
-    monkeypatch.setattr(run_subsampling, "MIN_SAMPLES_TO_THIN", 600)
-    monkeypatch.setattr(run_subsampling, "MIN_THINNED_SAMPLES", 100)
+    monkeypatch.setattr(subsampled_search, "MIN_SAMPLES_TO_THIN", 600)
+    monkeypatch.setattr(subsampled_search, "MIN_THINNED_SAMPLES", 100)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch
     assert found.effects == ("friction.coulomb",)
     assert found.fit.simulated.shape == search.evaluator.observed.shape
     assert search.settled_effects == {"friction.coulomb"}
-    monkeypatch.setattr(run_subsampling, "MIN_SAMPLES_TO_THIN", 10_000)
+    monkeypatch.setattr(subsampled_search, "MIN_SAMPLES_TO_THIN", 10_000)
     usual = searched(log, SIGMA)[0]
     same = refine_best_model(usual, search_with_subsampling(usual))
     assert same.effects == found.effects
@@ -69,7 +68,7 @@ def test_what_shows_nothing_is_not_searched_with_fewer_samples(monkeypatch):
         "slider", runs=2, seconds=1.5, rate=400.0, seed=3, observe=["x"], noise=["x=0.003"]
     )
     search, base = searched(clean, SIGMA)
-    monkeypatch.setattr(competing_refits, "refine_best_model", None)
+    monkeypatch.setattr(alternative_causes, "refine_best_model", None)
     assert search_with_subsampling(search) is base
 
 

@@ -13,7 +13,7 @@ from bench.diagnosis.report.consistency_section import (
     format_consistency,
     name_missing_physics,
 )
-from bench.logs.joined_recordings import load_joined
+from bench.logs.recording_loading import load_joined
 from sims import effects
 from sims.core.simulator import InputError
 from sims.systems.ball import Ball
