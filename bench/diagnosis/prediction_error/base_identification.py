@@ -12,7 +12,7 @@ filter needs much process noise, and then no forces at all are nearly as likely 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +40,11 @@ MAX_JOINTS = 3
 """Maximum number of joints at which resisting effects are fitted with base parameters."""
 MAX_TRIED_EFFECTS = 6
 """Maximum number of effects from a regression that are tried with base parameters."""
+MIN_GAIN_SHARE = 0.8
+"""Minimum gain of an effect with nominal base parameters.
+
+It is a share of the gain of the best base parameters so far, in log-likelihood.
+"""
 EFFECT_ITERATIONS = 3
 """Maximum number of Gauss-Newton steps of an effect with nominal base parameters."""
 MIN_GAIN = 2.0
@@ -104,9 +109,18 @@ def identify_base(
     limits = {i: compute_range_around(evaluator, i) for i in base_indices}
     best, best_log_likelihood = followed, followed.log_likelihood + MIN_GAIN
     effects: dict[str, Array] = {}
-    for start in _iterate_starts(followed, follow, is_resisted):
-        bounds = limits | get_bounds_by_index(evaluator, start.effects)
+    makers: list[Callable[[], _Start | None]] = [
+        lambda: _Start(followed, _list_resisting_effects(followed))
+    ]
+    if not is_resisted:
+        makers.insert(0, lambda: _Start(followed, ()))
+        makers.append(lambda: _start_with_effect(followed, best, follow))
+    for make_start in makers:
         try:
+            start = make_start()
+            if start is None:
+                continue
+            bounds = limits | get_bounds_by_index(evaluator, start.effects)
             fitted = maximise_innovation_likelihood(start.followed, bounds, MAX_ITERATIONS, follow)
         except SearchStoppedError:
             search_control.record_abandoned_fit(True)
@@ -136,23 +150,6 @@ def identify_base(
     return IdentifiedBase(follow(theta, best), identified, wider_bounds)
 
 
-def _iterate_starts(followed: FollowedRuns, follow: Follow, is_resisted: bool) -> Iterator[_Start]:
-    """Yield starts of fits of base parameters, the simplest first.
-
-    Args:
-        followed: the runs, filtered with the nominal parameters.
-        follow: filters the runs with other parameters.
-        is_resisted: whether only resisting effects are fitted with the base parameters.
-    """
-    if not is_resisted:
-        yield _Start(followed, ())
-    yield _Start(followed, _list_resisting_effects(followed))
-    if not is_resisted:
-        start = _start_with_effect(followed, follow)
-        if start is not None:
-            yield start
-
-
 def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     """Return effects that resist the motion of the joints with the largest missing forces."""
     evaluator = followed.evaluator
@@ -162,16 +159,17 @@ def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     return [name for name in names if name in evaluator.coefficient_slices]
 
 
-def _start_with_effect(followed: FollowedRuns, follow: Follow) -> _Start | None:
+def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follow) -> _Start | None:
     """Return a start with the effect that explains most with nominal base parameters.
 
     Args:
         followed: the runs, filtered with the nominal parameters.
+        best: the runs, filtered with the best parameters so far.
         follow: filters the runs with other parameters.
 
     Returns:
         The start with the likeliest of the proposed effects; None if the regression proposes no
-        effect.
+        effect that nearly reaches the likelihood of the best parameters.
     """
     evaluator = followed.evaluator
     names = [name for name in evaluator.library if not has_many_shapes(name)]
@@ -179,24 +177,28 @@ def _start_with_effect(followed: FollowedRuns, follow: Follow) -> _Start | None:
     columns = followed.columns(list_probes(evaluator, (), names))
     regression = regress(followed, columns)
     gains = regression.compute_net_gains()
-    starts: dict[str, _Start] = {}
+    best_gain = best.log_likelihood - followed.log_likelihood
+    starts, tried = list[_Start](), set[str]()
     for i in np.argsort(-gains, kind="stable").tolist():
         group = regression.groups[i]
-        if len(starts) == MAX_TRIED_EFFECTS or not gains[i] > 0.0:
+        if len(tried) == MAX_TRIED_EFFECTS or not gains[i] > 0.0:
             break
-        if group.effect not in starts:
-            theta = followed.theta.copy()
-            theta[evaluator.coefficient_slices[group.effect]] = group_coefficients(
-                evaluator, columns.probes, group, regression.solve([group])[1][0]
-            )
-            fitted = maximise_innovation_likelihood(
-                follow(theta, followed),
-                get_bounds_by_index(evaluator, [group.effect]),
-                EFFECT_ITERATIONS,
-                follow,
-            )
-            penalty = 0.5 * regression.price(group)
-            starts[group.effect] = _Start(fitted, (group.effect,), penalty, is_cause=True)
-    return max(
-        starts.values(), key=lambda one: one.followed.log_likelihood - one.penalty, default=None
-    )
+        if group.effect in tried:
+            continue
+        tried.add(group.effect)
+        theta = followed.theta.copy()
+        theta[evaluator.coefficient_slices[group.effect]] = group_coefficients(
+            evaluator, columns.probes, group, regression.solve([group])[1][0]
+        )
+        bounds = get_bounds_by_index(evaluator, [group.effect])
+        fitted = follow(theta, followed)
+        if fitted.log_likelihood - followed.log_likelihood < MIN_GAIN_SHARE * best_gain:
+            continue
+        fitted = maximise_innovation_likelihood(fitted, bounds, EFFECT_ITERATIONS, follow)
+        # At a bound other than zero, the effect stands in for something else.
+        values = {i: float(fitted.theta[i]) for i in bounds}
+        if any(value and bound_of(value, *bounds[i]) for i, value in values.items()):
+            continue
+        penalty = 0.5 * regression.price(group)
+        starts.append(_Start(fitted, (group.effect,), penalty, is_cause=True))
+    return max(starts, key=lambda one: one.followed.log_likelihood - one.penalty, default=None)
