@@ -7,19 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.extended_robot_files import make_option_value
-from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.search.verdict_rules import (
     VerdictName,
     improves_held_out,
     is_indistinguishable,
 )
-from bench.diagnosis.validation.held_out_runs import Validation
 from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
 
@@ -95,14 +92,6 @@ def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float])
     return not is_indistinguishable(merits[1] - merits[0]) and improves_held_out(merits, excesses)
 
 
-class RunEvaluators(NamedTuple):
-    """Simulator with one time step, and its run evaluators for fitting and validation."""
-
-    kind: Any
-    fitting: RunEvaluator
-    validation: Validation | None
-
-
 class CoarseStepFinding(NamedTuple):
     """Finding that the model file's own step is too coarse.
 
@@ -125,48 +114,6 @@ class OptionFinding(NamedTuple):
 
     kind: type[RobotSimulator]
     gain: float
-
-
-class RatedOptions(NamedTuple):
-    """Base model with some options of the solver, and how well it explains the recording.
-
-    Attributes:
-        evaluators: Simulator with the options, and its run evaluators.
-        base: The base model.
-        log_likelihood: Twice the log-likelihood.
-        penalised_log_likelihood: Penalised log-likelihood.
-        residual: RMS residual in units of the noise.
-        held_out: Penalised log-likelihood of the held-out runs; 0 without validation.
-        is_noise_like: Whether the residual may be noise.
-    """
-
-    evaluators: RunEvaluators
-    base: BaseFit
-    log_likelihood: float
-    penalised_log_likelihood: float
-    residual: float
-    held_out: float
-    is_noise_like: bool
-
-    def is_better_than(self, other: RatedOptions) -> bool:
-        """Return whether these options explain the recording better than others, on their own.
-
-        They must close half of the gap, and predict the held-out runs better. Only another value of
-        an option that has been changed already needs no part of the gap.
-        """
-        # This import is needed for robots only.
-        from sims.robot.integrator_settings import list_changed_options
-
-        kinds = (rated.evaluators.kind for rated in (self, other))
-        options, other_options = (
-            list_changed_options(kind.robot, kind.numerics).keys() for kind in kinds
-        )
-        gain = self.log_likelihood - other.log_likelihood
-        if options == other_options:
-            return not is_indistinguishable(gain)
-        return self.held_out >= other.held_out and is_finer_step_better(
-            gain, other.residual - 1.0, self.residual - 1.0
-        )
 
 
 def add_numerics_causes(verdict: Verdict, causes: Sequence[Cause]) -> Verdict:

@@ -348,18 +348,14 @@ class VerdictBuilder:
             numbers: fitted values by their index in the parameter vector.
         """
         evaluator = self.fitting_evaluator
-        # The coefficients of an effect are contiguous in the parameter vector, in the effect's
-        # order.
         effect = evaluator.available_effects[evidence.effect]
-        coefficients = effect.on(evaluator.simulator.system)
-        indices = range(
-            *evaluator.coefficient_slices[evidence.effect].indices(len(evaluator.parameters))
-        )
         # A coefficient that cannot be observed is fixed at zero and is not a result.
+        coefficients = effect.on(evaluator.simulator.system)
+        fixed = {c.name for c in coefficients if c.least is not None and c.least == c.most}
         fitted_values = {
-            c.name: numbers[i]
-            for c, i in zip(coefficients, indices, strict=True)
-            if c.least is None or c.least != c.most
+            name: number
+            for name, number in self.select_coefficients(evidence.effect, numbers).items()
+            if name not in fixed
         }
         friction_form = get_friction_form(evaluator, evidence.effect)
         description = effect.says
@@ -375,6 +371,20 @@ class VerdictBuilder:
             evidence.p_value,
             friction_form,
         )
+
+    def select_coefficients(
+        self, name: str, estimates: Mapping[int, FittedValue]
+    ) -> dict[str, FittedValue]:
+        """Return the estimates of an effect by the names of its coefficients.
+
+        Args:
+            name: Name of the effect.
+            estimates: Estimates by index in the parameter vector.
+        """
+        evaluator = self.fitting_evaluator
+        coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
+        indices = evaluator.get_coefficient_indices(name)
+        return {c.name: estimates[i] for c, i in zip(coefficients, indices, strict=True)}
 
     def _list_counted_channels(self) -> list[int]:
         """List the channels with the same unit as the channel that sensor effects act on."""

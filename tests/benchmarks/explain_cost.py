@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis import explain as explaining
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.explain import explain
+from bench.diagnosis.pipeline import simulated_runs
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.score_test import ScoreTest
 from sims import effects
@@ -112,12 +113,12 @@ def memory(samples, candidates):
 
 def explained(samples=SAMPLES, candidates=None, runs=RUNS):
     """Return processor seconds of explain, the minimum of two calls (one if it is long)."""
-    usual, best = explaining.RunEvaluator, np.inf
+    usual, best = simulated_runs.RunEvaluator, np.inf
     if candidates is not None:
         names = [n for n in effects.list_names() if effects.get_effect(n).fits(SliderSystem)]
         names.sort(key=lambda name: name != "friction.coulomb")
         chosen = names[:candidates]
-        explaining.RunEvaluator = lambda *given, **more: RunEvaluator(
+        simulated_runs.RunEvaluator = lambda *given, **more: RunEvaluator(
             *given, **more, candidates=chosen
         )
     try:
@@ -126,10 +127,10 @@ def explained(samples=SAMPLES, candidates=None, runs=RUNS):
             write(replace(DEFAULT_RECORDING, runs=runs, seconds=samples / runs / 100.0), path)
             for _ in range(2 if samples < 10 * SAMPLES else 1):
                 begin = time.process_time()
-                explaining.explain(path)
+                explain(path)
                 best = min(best, time.process_time() - begin)
     finally:
-        explaining.RunEvaluator = usual
+        simulated_runs.RunEvaluator = usual
     return best
 
 

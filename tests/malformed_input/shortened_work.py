@@ -54,7 +54,7 @@ SHORT = {
     "bench.studies.comparison_verification.build_tables": _cut,
     "bench.suite.multi_problem_report.ComparisonCollection.build_tables": _cut,
     "bench.benchmark.storage.provenance.distributions": _nothing,
-    "bench.diagnosis.explain._ExplainRun.run": _cut,
+    "bench.diagnosis.explain._diagnose_runs": _cut,
     "bench.conformance.check_suites._run_all_checks": _cut,
     "bench.logs.film_tracking.write_video": _cut,
     "bench.figures.recording_figure.write_recording_figure": _nothing,

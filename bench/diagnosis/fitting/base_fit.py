@@ -313,9 +313,7 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
     return places
 
 
-def fit_wider(
-    evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit
-) -> tuple[BaseFit, dict[str, Bounds]]:
+def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
     """Widen the ranges of parameters at a bound, and fit the base model again.
 
     Args:
@@ -324,13 +322,13 @@ def fit_wider(
         base: the fitted base model.
 
     Returns:
-        The base model, and the new ranges by name; empty if no parameter is at a bound.
+        The base model; the same if no parameter is at a bound.
     """
-    new_bounds: dict[str, Bounds] = {}
     for _ in range(MAX_WIDENING_ROUNDS):
         places = list_parameters_at_bounds(evaluator, base)
         if not places or evaluator.search_control.is_over():
             break
+        new_bounds = {}
         for i in places:
             parameter = evaluator.parameters[i]
             new_bounds[parameter.name] = widen_range(parameter, get_physical_limits(evaluator, i))
@@ -339,7 +337,7 @@ def fit_wider(
             [base.fit.make_start()], FINAL_ITERATIONS
         )[0]
         base = replace(base, fit=fit)
-    return base, new_bounds
+    return base
 
 
 def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:

@@ -12,7 +12,7 @@ filter needs much process noise, and then no forces at all are nearly as likely 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_b
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
+from bench.diagnosis.fitting.base_fit import compute_range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import (
     Follow,
@@ -57,12 +57,10 @@ class IdentifiedBase(NamedTuple):
     Attributes:
         followed: the runs, filtered with the identified base parameters and without any effect.
         parameters: the identified parameters; None if they are the nominal ones.
-        wider_bounds: new ranges of base parameters, by name.
     """
 
     followed: FollowedRuns
     parameters: IdentifiedParameters | None
-    wider_bounds: Mapping[str, Bounds]
 
 
 class _Start(NamedTuple):
@@ -124,7 +122,7 @@ def identify_base(
             fitted = maximise_innovation_likelihood(start.followed, bounds, MAX_ITERATIONS, follow)
         except SearchStoppedError:
             search_control.record_abandoned_fit(True)
-            return IdentifiedBase(followed, None, {})
+            return IdentifiedBase(followed, None)
         is_at_bound = any(bound_of(float(fitted.theta[i]), *limits[i]) for i in base_indices)
         log_likelihood = fitted.log_likelihood - start.penalty
         if not fitted.has_expected_innovations or is_at_bound:
@@ -137,7 +135,7 @@ def identify_base(
         if is_complete:
             break
     if best is followed:
-        return IdentifiedBase(followed, None, {})
+        return IdentifiedBase(followed, None)
     wider_bounds = {}
     for i in base_indices:
         value, (low, high) = float(best.theta[i]), evaluator.parameters[i].bounds
@@ -147,7 +145,7 @@ def identify_base(
     theta = followed.theta.copy()
     theta[base_indices] = best.theta[base_indices]
     identified = IdentifiedParameters(theta[evaluator.base_indices], effects)
-    return IdentifiedBase(follow(theta, best), identified, wider_bounds)
+    return IdentifiedBase(follow(theta, best), identified)
 
 
 def _list_resisting_effects(followed: FollowedRuns) -> list[str]:

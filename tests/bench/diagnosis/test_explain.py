@@ -10,8 +10,8 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from bench.core.plugin_registries import load_plugins, simulators
-from bench.diagnosis import explain as explaining
 from bench.diagnosis.explain import explain
+from bench.diagnosis.pipeline import base_model
 from bench.diagnosis.verdict import Verdict
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import InputError, Scenario
@@ -346,7 +346,7 @@ def test_arithmetic_has_one_thread_meanwhile_and_what_it_had_afterwards(tmp_path
         threads.extend(pool["num_threads"] for pool in threadpool_info())
         raise InputError("enough")
 
-    monkeypatch.setattr(explaining, "fit_base_model", count)
+    monkeypatch.setattr(base_model, "fit_base_model", count)
     path = table(tmp_path, swings(), noise=NOISE)
     with threadpool_limits(2):
         pools = threadpool_info()

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis import explain as explaining
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.fitting.fitted_models import ModelSet
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
@@ -22,6 +22,7 @@ from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
     make_soft_kind,
 )
+from bench.diagnosis.pipeline import cause_search
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
@@ -142,9 +143,9 @@ def names_friction_alone(search, held_out):
 @pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_explain_says_the_form_and_its_files_reproduce_it(tmp_path, monkeypatch, form):
-    monkeypatch.setattr(explaining, "diagnose", names_friction_alone)
+    monkeypatch.setattr(cause_search, "diagnose", names_friction_alone)
     path = recorded(tmp_path, form)
-    found = explaining.explain(path)
+    found = explain(path)
     (cause,) = found.causes
     assert cause.effect == "friction.coulomb@elbow"
     assert cause.coefficients["coefficient"].value == pytest.approx(PLANTED, rel=0.03)
@@ -175,13 +176,13 @@ def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
             assess_lack_of_fit(search, search.base_model),
         )
 
-    monkeypatch.setattr(explaining, "diagnose", names_nothing)
+    monkeypatch.setattr(cause_search, "diagnose", names_nothing)
     said = []
     path = recorded(tmp_path, "soft")
-    found = explaining.explain(path, free=["frictionloss@elbow"], say=said.append)
+    found = explain(path, free=["frictionloss@elbow"], say=said.append)
     number = found.answer.parameters["friction.coulomb@elbow"]
     assert number.value == pytest.approx(PLANTED, rel=0.03)
-    assert explaining.SOFT_FRICTION in said
+    assert cause_search.SOFT_FRICTION in said
     paths = {one.name: one for one in found.write(tmp_path / "out")}
     assert read_extended(paths["extended.toml"]).robot.friction_form == "soft"
     assert "solreffriction=" not in paths["extended.xml"].read_text()

@@ -1,5 +1,6 @@
 """Tests that a time step or integrator is a cause only if that of the model file is worse."""
 
+from contextlib import closing
 from types import SimpleNamespace
 
 import mujoco
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
-from bench.diagnosis.explain import _ExplainRun, explain
+from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.numerics_cause import (
@@ -16,6 +17,10 @@ from bench.diagnosis.numerics_cause import (
     is_finer_model_better,
     is_finer_step_better,
 )
+from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.recording_preparation import prepare_runs
+from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
+from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
 from tests.bench.diagnosis.arm_model import ARM
 
 HEAVY = ('mass="0.8"', 'mass="1.2"')
@@ -82,37 +87,37 @@ def describe_by_urdf(path):
 
 
 def chosen(path):
-    """Return the explainer of a log after the base fit and the choice of the step."""
-    explainer = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
-    try:
-        explainer._choose_base_step(fit_base_model(explainer.fitting, explainer.noise))
-    finally:
-        explainer.close()
-    return explainer
+    """Return the choice of the step of a log after the base fit, and the runs with this step."""
+    context = DiagnosisContext(ExplainOptions(), ForkedWorkerPool(1))
+    with closing(context):
+        runs = prepare_runs([path], context)
+        choice = TimeStepChoice()
+        model = choice.choose(BaseModel(runs, fit_base_model(runs.fitting, runs.noise)))
+    return choice, model.runs
 
 
 @pytest.mark.parametrize("noise", [NOISE, 0.0])
 def test_a_missing_mass_does_not_make_the_files_own_step_look_worse(tmp_path, noise):
-    there = chosen(log(tmp_path, HEAVY, noise))
-    assert there.coarse is None
-    assert there.kind.numerics.integrator == "Euler"
+    choice, runs = chosen(log(tmp_path, HEAVY, noise))
+    assert choice.finding is None
+    assert runs.kind.numerics.integrator == "Euler"
     # The alternative step remains available for the comparison with other causes.
-    assert next(iter(there.finer)).error > 5.0
+    assert next(iter(choice._refinements)).error > 5.0
 
 
 def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path):
-    there = chosen(log(tmp_path, divide=4, integrator="RK4"))
-    assert there.coarse is not None
-    assert there.coarse.gain > MIN_FINER_STEP_GAIN
-    assert there.kind.numerics.integrator == "RK4"
+    choice, runs = chosen(log(tmp_path, divide=4, integrator="RK4"))
+    assert choice.finding is not None
+    assert choice.finding.gain > MIN_FINER_STEP_GAIN
+    assert runs.kind.numerics.integrator == "RK4"
 
 
 def test_a_urdf_has_no_step_that_could_be_wrong(tmp_path):
-    there = chosen(describe_by_urdf(log(tmp_path, divide=4, integrator="RK4")))
+    choice, runs = chosen(describe_by_urdf(log(tmp_path, divide=4, integrator="RK4")))
     # The better integrator is used, and is no finding about the model file.
-    assert there.kind.numerics.integrator == "RK4"
-    assert there.coarse is None
-    assert there.assessor.before is None
+    assert runs.kind.numerics.integrator == "RK4"
+    assert choice.finding is None
+    assert runs.before is None
 
 
 @pytest.mark.parametrize(

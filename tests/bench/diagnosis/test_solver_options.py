@@ -1,5 +1,6 @@
 """Tests that options of MuJoCo's solver are causes if the recorded simulator has other ones."""
 
+from contextlib import closing
 from types import SimpleNamespace
 
 import mujoco
@@ -7,9 +8,11 @@ import pytest
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
-from bench.diagnosis.explain import _ExplainRun, explain
+from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
-from bench.diagnosis.numerics_cause import RatedOptions
+from bench.diagnosis.pipeline.recording_preparation import prepare_runs
+from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
+from bench.diagnosis.pipeline.solver_option_choice import RatedOptions
 from bench.diagnosis.report.effect_and_unit_text import format_effect
 from sims.robot.integrator_settings import OPTION_EFFECTS, IntegratorSettings
 from tests.bench.diagnosis.block_recordings import BLOCK, OPTIONS, write_block_recording
@@ -17,14 +20,12 @@ from tests.bench.diagnosis.block_recordings import BLOCK, OPTIONS, write_block_r
 
 def rank(path):
     """Return the ranked alternatives of a recording from its stated initial states."""
-    run = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
-    try:
-        evaluator = run.fitting
+    with closing(DiagnosisContext(ExplainOptions(), ForkedWorkerPool(1))) as context:
+        runs = prepare_runs([path], context)
+        evaluator = runs.fitting
         return rank_option_alternatives(
-            evaluator, run.noise, evaluator.get_nominal_theta(), evaluator.initial_state_guesses
+            evaluator, runs.noise, evaluator.get_nominal_theta(), evaluator.initial_state_guesses
         )
-    finally:
-        run.close()
 
 
 @pytest.mark.parametrize(
@@ -68,8 +69,8 @@ def rate(changes, gain, residual):
     """Return the rating of a base model of the block with changed options of the solver."""
     settings = IntegratorSettings(0.002, "implicitfast").replace_options(changes)
     robot = SimpleNamespace(compiled=mujoco.MjModel.from_xml_string(BLOCK))
-    evaluators = SimpleNamespace(kind=SimpleNamespace(robot=robot, numerics=settings))
-    return RatedOptions(evaluators, None, gain, gain, residual, 0.0, False)
+    runs = SimpleNamespace(kind=SimpleNamespace(robot=robot, numerics=settings))
+    return RatedOptions(SimpleNamespace(runs=runs), gain, gain, residual, 0.0, False)
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,9 @@ def test_within_its_range_nothing_is_widened():
     there = evaluator(recording(runs=2, seconds=1, rate=50), candidates=[])
     noise = NoiseModel(np.full(len(there.channels), 0.002), np.zeros(len(there.channels)))
     base = fit_base_model(there, noise)
-    assert fit_wider(there, noise, base) == (base, {})
+    declared = [parameter.bounds for parameter in there.parameters]
+    assert fit_wider(there, noise, base) is base
+    assert [parameter.bounds for parameter in there.parameters] == declared
 
 
 @pytest.mark.parametrize(

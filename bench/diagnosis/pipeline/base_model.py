@@ -1,0 +1,213 @@
+"""Fit of the base model of a diagnosis: filter, parameters, ranges and discretisation error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.diagnosis.fitting.base_fit import (
+    BaseFit,
+    correct_discretisation,
+    find_start_with_tuner,
+    fit_base_model,
+    fit_wider,
+)
+from bench.diagnosis.identifiability import freeze_unidentified_parameters
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+from sims.core.simulator import Array
+from sims.recording.recorded_poses import ANGLES
+
+if TYPE_CHECKING:
+    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+MAX_ROTATION_ERROR = 0.5
+"""Maximum error in rad of the simulated orientation of a floating body.
+
+Beyond it, the effects of small changes are not linear.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseModel:
+    """Fitted base model of runs.
+
+    Attributes:
+        runs: the runs.
+        fit: its fit.
+    """
+
+    runs: SimulatedRuns
+    fit: BaseFit
+
+    @property
+    def is_simulated(self) -> bool:
+        """Return whether the fitted model simulates all recorded samples."""
+        is_recorded = np.isfinite(self.runs.fitting.observed)
+        return bool(np.isfinite(self.fit.fit.simulated[is_recorded]).all())
+
+    @property
+    def is_usable(self) -> bool:
+        """Return whether the fit succeeded, and the search need not end."""
+        return not self.runs.context.search_control.is_over() and bool(
+            np.isfinite(self.fit.fit.cost)
+        )
+
+    def rate(self) -> tuple[float, float]:
+        """Return twice the log-likelihood and the RMS residual in units of the noise."""
+        search = self.runs.create_search(self.fit)
+        model = search.base_model
+        return float(model.likelihood.value), 1.0 + search.compute_excess_residual(model)
+
+    def predict_held_out(self) -> Array | None:
+        """Predict the held-out runs; None without validation."""
+        validation = self.runs.validation
+        return None if validation is None else validation.validate([self.fit.fit])[0].simulated
+
+    def refit(self, runs: SimulatedRuns) -> BaseModel:
+        """Fit the base model to runs with other numerical settings.
+
+        They change the best parameters only a little, so the fit needs no other starts, unless this
+        fit failed.
+        """
+        is_near = np.isfinite(self.fit.fit.cost) and runs.context.identified is None
+        nearby = self.fit.fit.theta[runs.fitting.base_indices] if is_near else _get_starts(runs)
+        return BaseModel(runs, fit_base_model(runs.fitting, runs.noise, nearby))
+
+    def widen_ranges(self) -> BaseModel:
+        """Widen the ranges of base parameters that the fit leaves at a bound."""
+        with self.runs.record_widened_ranges():
+            return replace(self, fit=fit_wider(self.runs.fitting, self.runs.noise, self.fit))
+
+    def freeze_unidentified(self) -> BaseModel:
+        """Freeze free numbers of a robot that the data cannot identify.
+
+        A system has few parameters, and would have no result without them; there the verdict
+        reports it.
+        """
+        if not self.is_usable:
+            return self
+        runs = self.runs
+        fit = freeze_unidentified_parameters(runs.fitting, runs.noise, self.fit, runs.create_search)
+        if fit.unidentified_parameters:
+            names = ", ".join(
+                runs.fitting.parameters[i].name for i in sorted(fit.unidentified_parameters)
+            )
+            runs.context.say(
+                "kept at the nominal value, because the recording does not identify it "
+                f"together with the others: {names}"
+            )
+        return replace(self, fit=fit)
+
+    def shows_step_errors(self) -> bool:
+        """Return whether the recording shows the discretisation error of the engine's steps."""
+        runs = self.runs
+        if runs.fitting.filtered_runs is None or not self.is_usable:
+            return True
+        # These imports are needed for robots only.
+        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+        from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
+
+        theta = self.fit.fit.theta
+        return shows_step_errors(FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise))
+
+    def correct_step_errors(self) -> BaseModel:
+        """Return the base model without the discretisation error of the engine's steps.
+
+        The error is corrected if the recording shows it, or if no filter could decide.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
+
+        evaluator = self.runs.fitting
+        if evaluator.filtered_runs is not None and not shows_step_errors(evaluator.filtered_runs):
+            return self
+        return replace(self, fit=correct_discretisation(evaluator, self.runs.noise, self.fit))
+
+    def finish(self) -> BaseModel:
+        """Widen ranges, freeze unidentified numbers and correct the step error of a robot.
+
+        The step is chosen before, because the correction hides the discretisation error.
+        """
+        return self.widen_ranges().freeze_unidentified().correct_step_errors()
+
+    def loses_orientation(self) -> bool:
+        """Return whether the simulated orientation of a recorded floating body is far from it."""
+        names = [
+            f"q.{base_name}.{angle}"
+            for base_name in self.runs.kind.system.base_orientations
+            for angle in ANGLES
+        ]
+        evaluator = self.runs.fitting
+        rows = [c for c, name in enumerate(evaluator.channels) if name in names]
+        errors = (self.fit.fit.simulated - evaluator.observed)[..., rows]
+        return bool(np.nanmax(np.abs(errors), initial=0.0) > MAX_ROTATION_ERROR)
+
+
+def filter_and_fit(runs: SimulatedRuns) -> BaseModel:
+    """Fit the base model; the runs of a robot are filtered before."""
+    if runs.kind.has_model:
+        filter_runs(runs)
+    return BaseModel(runs, fit_base_model(runs.fitting, runs.noise, _get_starts(runs)))
+
+
+def _get_starts(runs: SimulatedRuns) -> Array | None:
+    """Return starting values of the base parameters; None for the default starts.
+
+    They come from a registered tuner, or are those identified by prediction errors.
+    """
+    options = runs.context.options
+    if options.tuner is None:
+        identified = runs.context.identified
+        return None if identified is None else identified.base
+    return find_start_with_tuner(options.tuner, runs.fitting, runs.noise, options.seed)
+
+
+def filter_runs(runs: SimulatedRuns) -> None:
+    """Filter the runs of a robot with the present model (Kalman filter and smoother).
+
+    The filter provides initial states and starting values of free parameters. If the linearised
+    model diverges, nothing is stored, and causes are searched by simulation.
+    """
+    # This import is needed for robots only.
+    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+    context = runs.context
+    context.search_control.begin_stage("computing prediction errors")
+    filtered_runs = runs.nominal_filter
+    is_wrong = runs.contacts.is_linear_model_wrong(filtered_runs)
+    if is_wrong or not filtered_runs.has_expected_innovations:
+        if runs.contacts.has_contacts:
+            # This import is needed for robots only.
+            from bench.diagnosis.kalman.cubature_filter import set_first_states_in_contact
+
+            theta = runs.fitting.get_nominal_theta()
+            set_first_states_in_contact(runs.evaluators, theta, runs.noise.sigma)
+        return
+    if runs.fitting.base_indices.size and context.options.tuner is None:
+        filtered_runs = _filter_with_fitted_parameters(runs)
+    runs.fitting.follow(filtered_runs)
+    if context.search_control.is_over():
+        return
+    for evaluator in runs.evaluators[1:]:
+        # Held-out runs are only simulated; without a filter they begin at their measured values.
+        theta = evaluator.get_nominal_theta()
+        held_out = FollowedRuns.follow(evaluator, theta, runs.noise, max_linearisations=1)
+        if held_out.has_expected_innovations:
+            evaluator.follow(held_out)
+
+
+def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
+    """Return the runs, filtered with base parameters from a prediction-error fit."""
+    # These imports are needed for robots only.
+    from bench.diagnosis.prediction_error.base_identification import identify_base
+    from bench.diagnosis.prediction_error.identification_without_simulation import is_long
+
+    evaluator = runs.fitting
+    with runs.record_widened_ranges():
+        # The joints of a real robot have friction, and long recordings are those of real robots.
+        result = identify_base(evaluator, runs.noise, runs.nominal_filter, is_long(evaluator))
+    if result.parameters is not None:
+        runs.context.identified = evaluator.identified = result.parameters
+    return result.followed

@@ -1,0 +1,189 @@
+"""Search for the causes of a gap, with the form of dry friction that the recording supports."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from bench.diagnosis.evaluation.search_control import SearchStoppedError
+from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.friction_form_verdict import (
+    has_dry_friction,
+    is_likelier_soft,
+    make_soft_kind,
+)
+from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.recording_errors import RecordingErrorCheck
+from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+
+SOFT_FRICTION = (
+    "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
+    "it fits better than stiff friction"
+)
+"""Message to the user when dry friction changes to the soft form."""
+STIFF_FRICTION = "soft dry friction does not close the gap either: stiff friction is used"
+"""Message to the user when dry friction changes back to the stiff form."""
+
+
+class CauseSearch:
+    """Search for causes, in the form of dry friction that the recording supports.
+
+    Dry friction of a robot is either a stiff limit (the search's own effects) or MuJoCo's soft
+    constraint.
+
+    Args:
+        error_check: check for wrong units and signs, which causes would imitate.
+    """
+
+    def __init__(self, error_check: RecordingErrorCheck) -> None:
+        self._error_check = error_check
+
+    def search(self, base: BaseModel) -> SearchResult:
+        """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
+
+        A search ends with `SoftFrictionError` if it finds the soft form likelier.
+
+        Args:
+            base: the fitted base model.
+        """
+        runs = base.runs
+        # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
+        rng = runs.make_rng()
+        search = runs.create_search(base.fit, rng)
+        if not runs.kind.has_model:
+            return self._find_causes(base, search, rng)
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
+
+        try:
+            result = self._find_causes(base, search, rng)
+            # The search itself compares the forms of friction that it selects, but not of friction
+            # that is a free number.
+            is_comparison_needed = (
+                has_dry_friction(runs.fitting, ())
+                and not result.errors
+                and not runs.context.search_control.is_over()
+            )
+            if not is_comparison_needed or not is_likelier_soft(
+                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            ):
+                return result
+            return self._search_with_soft_friction(base, search)
+        except SoftFrictionError as error:
+            soft_result = self._search_with_soft_friction(base, search, error.start)
+            if (
+                not error.is_preliminary
+                or soft_result.is_explained
+                or runs.context.search_control.is_over()
+            ):
+                return soft_result
+        runs.context.say(STIFF_FRICTION)
+        stiff_search = runs.create_search(base.fit, rng, is_form_given=True)
+        _take_over(stiff_search, search)
+        try:
+            return self._find_causes(base, stiff_search, rng)
+        except SoftFrictionError as error:
+            return self._search_with_soft_friction(base, search, error.start)
+
+    def _search_with_soft_friction(
+        self, base: BaseModel, stiff_search: EffectSearch, likely: FitStart | None = None
+    ) -> SearchResult:
+        """Refit the base model with MuJoCo's soft dry friction, and search for causes again.
+
+        Args:
+            base: Base model, fitted with stiff friction.
+            stiff_search: Search with stiff friction; its results are reused where they are valid.
+            likely: Model that may explain the runs.
+        """
+        stiff_runs, context = base.runs, base.runs.context
+        context.say(SOFT_FRICTION)
+        runs = replace(
+            stiff_runs.with_kind(make_soft_kind(stiff_runs.kind)), before=stiff_runs.before
+        )
+        evaluator, fit = runs.fitting, base.fit
+        fitter = TrajectoryFitter(evaluator, runs.noise, fit.fixed_parameters)
+        start = replace(fit.fit.make_start(), initial_states=evaluator.initial_state_guesses)
+        (soft_fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
+        soft_base = BaseModel(runs, replace(fit, fit=soft_fit)).correct_step_errors()
+        rng = runs.make_rng()
+        search = runs.create_search(soft_base.fit, rng)
+        # Friction of the file keeps its form unless it is a free number.
+        _take_over(search, stiff_search, likely, not has_dry_friction(evaluator, ()))
+        return self._find_causes(soft_base, search, rng)
+
+    def _find_causes(
+        self, base: BaseModel, search: EffectSearch, rng: np.random.Generator
+    ) -> SearchResult:
+        """Return the finding; without causes if the recording has a wrong unit or sign.
+
+        Every cause would only imitate the wrong unit or sign.
+
+        Args:
+            base: the fitted base model.
+            search: search from this model.
+            rng: random generator of the search.
+        """
+        check = self._error_check
+        if not check.errors:
+            finding = _search_and_decide(search, base.runs)
+            finding = base.runs.verdict_builder.restrict_verdict(search, finding)
+            result = SearchResult(base, search, finding, rng)
+            check.check_result(result)
+            if not check.errors:
+                return result
+        model = search.base_model
+        finding = DiagnosisResult("unknown", model, model, (), assess_lack_of_fit(search, model))
+        return SearchResult(base, search, finding, rng, check.errors)
+
+
+def _search_and_decide(search: EffectSearch, runs: SimulatedRuns) -> DiagnosisResult:
+    """Run a search and select a verdict.
+
+    For a robot whose runs could be filtered, the search uses prediction errors.
+    """
+    if runs.fitting.filtered_runs is None:
+        if runs.fitting.is_in_contact:
+            # This import is needed for robots only.
+            from bench.diagnosis.search.contact_search import propose_contact_effects
+
+            # A search that has to end early still gives its best model.
+            with suppress(SearchStoppedError):
+                propose_contact_effects(search, runs.evaluators)
+        return diagnose(search, runs.validation)
+    # This import is needed for robots only.
+    from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
+
+    with runs.record_widened_ranges():
+        return answer(Confirmation(search, runs.validation))
+
+
+def _take_over(
+    search: EffectSearch,
+    other: EffectSearch,
+    likely: FitStart | None = None,
+    is_reusable: bool = True,
+) -> None:
+    """Reuse the filters of another search of the same base model, if both have any.
+
+    Args:
+        search: search that has not begun.
+        other: search with another form of dry friction.
+        likely: model that may explain the runs.
+        is_reusable: whether the base model has no dry friction, so that the filters are valid.
+    """
+    # This import is needed for robots only.
+    from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+
+    if isinstance(search, PredictionErrorSearch) and isinstance(other, PredictionErrorSearch):
+        search.likely = likely
+        if is_reusable:
+            search.take_over(other)

@@ -1,0 +1,46 @@
+"""Extended simulator: the base simulator with fitted values and found effects."""
+
+from __future__ import annotations
+
+from bench.diagnosis.pipeline.search_result import SearchResult
+from sims import extended_simulator as extend
+from sims.extended_simulator import ExtendedSimulator
+
+
+def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
+    """Build the extended simulator from the model of the found effects.
+
+    Args:
+        result: result of the search.
+    """
+    runs, model = result.runs, result.finding.model
+    evaluator, recording = runs.fitting, runs.recording
+    builder = runs.verdict_builder
+    estimates = builder.collect_parameter_estimates(result.search, model)
+    base_values = {
+        p.name: estimates[i]
+        for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
+    }
+    # A freed constant becomes a constant of the extended simulator, with its fitted value.
+    freed_constants = {
+        p.name: estimates[evaluator.system_parameter_count + i].value
+        for i, p in enumerate(evaluator.freed_constants)
+    }
+    # The simulator's order keeps the file independent of the order of the search.
+    added_effects = {
+        effect: builder.select_coefficients(effect, estimates)
+        for effect in evaluator.coefficient_slices
+        if effect in model.effects
+    }
+    return ExtendedSimulator(
+        extend.make_extended_name(recording.system),
+        recording.system,
+        runs.engine,
+        recording.title,
+        base_values,
+        added_effects,
+        {**recording.constants, **freed_constants},
+        evaluator.channels,
+        runs.kind,
+        extend.get_robot_reference(runs.kind),
+    )

@@ -1,0 +1,131 @@
+"""Checks of a recording for conventions, units and signs that differ from those of the model."""
+
+from __future__ import annotations
+
+from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, find_wrong_units
+from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns, list_free
+from bench.diagnosis.verdict import RecordingFault
+from sims.core.simulator import InputError
+from sims.recording.recording_description import read_meta
+
+MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
+"""Maximum excess over the noise, as a share of that of the base model, with right units."""
+MAX_EXCESS_SHARE_OF_INCOMPLETE = 0.5
+"""Maximum excess, likewise, of a model that stays incomplete with right units, too."""
+
+
+class RecordingErrorCheck:
+    """Checks for wrong units and signs, which effects would only imitate.
+
+    Units of a robot are checked only after no effect has explained the gap, unless its free numbers
+    could not be identified.
+
+    Attributes:
+        errors: the wrong units and signs; once there are some, causes are no longer searched.
+    """
+
+    def __init__(self) -> None:
+        """Begin without errors."""
+        self.errors: tuple[RecordingFault, ...] = ()
+
+    def check_base(self, base: BaseModel) -> None:
+        """Check the units by the fit of the base model, unless they are checked later."""
+        if not (_is_checked_late(base.runs) or base.runs.context.search_control.is_over()):
+            self.errors = _find_wrong_units(base)
+
+    def check_result(self, result: SearchResult) -> None:
+        """Check whether causes imitate a wrong unit, or whether one explains an open gap."""
+        self.errors = _find_imitated_units(result) or self._find_in_unexplained(result)
+
+    def _find_in_unexplained(self, result: SearchResult) -> tuple[RecordingFault, ...]:
+        """Test for a wrong unit or sign of a robot's recording, if no effect explains the residual.
+
+        Args:
+            result: result of the search.
+        """
+        is_over = result.runs.context.search_control.is_over()
+        if not _is_checked_late(result.runs) or result.is_explained or is_over:
+            return ()
+        search, finding = result.search, result.finding
+        # With a wrong unit or sign, effects would leave more of the discrepancy.
+        max_share = (
+            MAX_EXCESS_SHARE_OF_INCOMPLETE
+            if finding.is_incomplete
+            else MAX_EXCESS_SHARE_WITH_RIGHT_UNITS
+        )
+        base_excess = search.compute_excess_residual(search.base_model)
+        if search.compute_excess_residual(finding.model) < max_share * base_excess:
+            return ()
+        return _find_wrong_units(result.searched_base)
+
+
+def refuse_broken_conventions(runs: SimulatedRuns) -> None:
+    """Refuse a robot's recording whose conventions differ from those of its model file.
+
+    Raises:
+        InputError: The conventions differ; the message names the change to make.
+    """
+    context, contacts, path = runs.context, runs.contacts, runs.recording.path
+    if not runs.kind.has_model or context.options.force:
+        return
+    # These imports are needed for robots only.
+    from bench.diagnosis.conventions.convention_comparison import ConventionComparison
+    from bench.diagnosis.conventions.corrected_description import list_changed_tables
+
+    context.search_control.begin_stage("comparing conventions of log and model")
+    if contacts.is_on_ground:
+        return
+    if contacts.has_contacts and contacts.is_linear_model_wrong(runs.nominal_filter):
+        return
+    subject = _make_subject(runs)
+    differences = ConventionComparison(subject).differences()
+    if not differences:
+        return
+    remedy = "correct these signals"
+    if path.with_suffix(".toml").exists():
+        _, meta = read_meta(path)
+        lines = "; ".join(list_changed_tables(meta, runs.kind, differences))
+        remedy = (
+            f"set {lines} in {subject.file}, or write a corrected description: "
+            f"simgap inspect {path.name} --fix NAME.toml"
+        )
+    description = "; ".join(difference.description for difference in differences)
+    raise InputError(
+        f"{path}: {description}; expected the conventions of the model file: {remedy} "
+        "(--force explains the log as it is)"
+    )
+
+
+def _is_checked_late(runs: SimulatedRuns) -> bool:
+    """Return whether units are checked only after no effect has explained the gap."""
+    has_unidentified_base = (
+        bool(runs.fitting.base_indices.size)
+        and runs.context.identified is None
+        and runs.fitting.filtered_runs is not None
+    )
+    return runs.kind.has_model and not has_unidentified_base
+
+
+def _make_subject(runs: SimulatedRuns) -> Subject:
+    """Return the input of the unit check."""
+    free = list_free(runs.kind, runs.context.options)
+    return Subject(runs.kind, runs.recording, runs.engine, free)
+
+
+def _find_wrong_units(base: BaseModel) -> tuple[RecordingFault, ...]:
+    """Find a wrong unit or sign with which the base model explains the recording better."""
+    runs = base.runs
+    error = find_wrong_units(_make_subject(runs), runs.fitting, runs.noise, base.fit)
+    return () if error is None else (error,)
+
+
+def _find_imitated_units(result: SearchResult) -> tuple[RecordingFault, ...]:
+    """Return wrong units and signs that the diagnosed causes imitate."""
+    runs, search = result.runs, result.search
+    errors = [
+        find_imitated_unit(_make_subject(runs), runs.fitting, cause, search.base_model.fit)
+        for cause in runs.verdict_builder.build_causes(search, result.finding)
+    ]
+    return tuple(error for error in errors if error is not None)

@@ -1,0 +1,76 @@
+"""Result of a search for causes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.diagnosis.fitting.base_fit import BaseFit
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.verdict import RecordingFault
+
+EXPLAINED_VERDICTS = ("adequate", "named", "ambiguous")
+"""Verdicts for which the model explains the data down to the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Result of a search for causes.
+
+    Attributes:
+        base: base model from which it started.
+        search: the search, with its fitted models.
+        finding: outcome of the search.
+        rng: random generator of the search.
+        errors: wrong units and signs of the recording.
+    """
+
+    base: BaseModel
+    search: EffectSearch
+    finding: DiagnosisResult
+    rng: np.random.Generator
+    errors: tuple[RecordingFault, ...] = ()
+
+    @property
+    def runs(self) -> SimulatedRuns:
+        """Runs that were explained."""
+        return self.base.runs
+
+    @property
+    def searched_base(self) -> BaseModel:
+        """The best fit of the base model, which the search may have improved."""
+        search = self.search
+        return BaseModel(self.runs, BaseFit(search.base_model.fit, search.fixed_parameters))
+
+    @property
+    def is_explained(self) -> bool:
+        """Return whether the result explains the data down to the noise."""
+        return self.finding.verdict in EXPLAINED_VERDICTS
+
+    @property
+    def has_ended(self) -> bool:
+        """Return whether no other numerical settings are tried.
+
+        This is so if the recording has errors, or if the search has to end.
+        """
+        is_stopped = self.finding.early_stop is not None
+        return bool(self.errors) or is_stopped or self.runs.context.search_control.is_over()
+
+    def rate(self) -> tuple[float, float]:
+        """Return the penalised log-likelihood and the excess RMS residual of the found model."""
+        return rate_model(self.search, self.finding.model)
+
+
+def rate_model(search: EffectSearch, model: FittedModel) -> tuple[float, float]:
+    """Return the penalised log-likelihood and the excess RMS residual of a fitted model.
+
+    Args:
+        search: search with the noise that defines the excess.
+        model: the fitted model.
+    """
+    return model.penalised_log_likelihood, search.compute_excess_residual(model)

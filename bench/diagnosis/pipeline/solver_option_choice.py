@@ -1,0 +1,230 @@
+"""Choice of MuJoCo's solver options for a robot with contacts: those of the file or others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.numerics_cause import (
+    OptionFinding,
+    is_finer_model_better,
+    is_finer_step_better,
+)
+from bench.diagnosis.pipeline.base_model import BaseModel, filter_runs
+from bench.diagnosis.pipeline.cause_search import CauseSearch
+from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.search.verdict_rules import is_indistinguishable
+
+MAX_LINEAR_RESIDUAL = 3.0
+"""Maximum residual of the base model, in units of the noise, at which effects act linearly."""
+MAX_COMPETING_SQUARES_RATIO = 2.0
+"""Maximum sum of squares of an effect that competes with other options, relative to theirs."""
+MIN_COMPETING_GAIN_SHARE = 0.7
+"""Minimum gain of an effect that competes with other options, relative to theirs, near the noise.
+
+Gains are in twice the log-likelihood, and those of effects to first order.
+"""
+MAX_OPTION_ROUNDS = 3
+"""Maximum number of options of the solver that are changed."""
+MAX_FITTED_OPTIONS = 3
+"""Maximum number of alternative options that are fitted in a round."""
+
+
+class RatedOptions(NamedTuple):
+    """Base model with some options of the solver, and how well it explains the recording.
+
+    Attributes:
+        model: The base model.
+        log_likelihood: Twice the log-likelihood.
+        penalised_log_likelihood: Penalised log-likelihood.
+        residual: RMS residual in units of the noise.
+        held_out: Penalised log-likelihood of the held-out runs; 0 without validation.
+        is_noise_like: Whether the residual may be noise.
+    """
+
+    model: BaseModel
+    log_likelihood: float
+    penalised_log_likelihood: float
+    residual: float
+    held_out: float
+    is_noise_like: bool
+
+    @classmethod
+    def rate(cls, model: BaseModel) -> RatedOptions:
+        """Rate a base model."""
+        search = model.runs.create_search(model.fit)
+        rated = search.base_model
+        held_out = 0.0
+        if model.runs.validation is not None:
+            (prediction,) = model.runs.validation.validate([model.fit.fit])
+            held_out = prediction.penalised_log_likelihood
+        return cls(
+            model,
+            float(rated.likelihood.value),
+            rated.penalised_log_likelihood,
+            1.0 + search.compute_excess_residual(rated),
+            held_out,
+            search.is_noise_like(rated),
+        )
+
+    def is_better_than(self, other: RatedOptions) -> bool:
+        """Return whether these options explain the recording better than others, on their own.
+
+        They must close half of the gap, and predict the held-out runs better. Only another value of
+        an option that has been changed already needs no part of the gap.
+        """
+        # This import is needed for robots only.
+        from sims.robot.integrator_settings import list_changed_options
+
+        kinds: list[Any] = [rated.model.runs.kind for rated in (self, other)]
+        options, other_options = (
+            list_changed_options(kind.robot, kind.numerics).keys() for kind in kinds
+        )
+        gain = self.log_likelihood - other.log_likelihood
+        if options == other_options:
+            return not is_indistinguishable(gain)
+        return self.held_out >= other.held_out and is_finer_step_better(
+            gain, other.residual - 1.0, self.residual - 1.0
+        )
+
+
+class SolverOptionChoice:
+    """Choice of the options of MuJoCo's solver, before and after the search for causes.
+
+    Attributes:
+        finding: finding that other options than the file's are used; None while the file's are.
+    """
+
+    def __init__(self) -> None:
+        """Begin with the options of the model file."""
+        self.finding: OptionFinding | None = None
+        self._possible_options: RatedOptions | None = None
+
+    def choose(self, model: BaseModel) -> BaseModel:
+        """Choose the options of the base model: those of the file, or others.
+
+        Other options are used before the search if they alone close the gap down to the noise, and
+        if no effect comes near with the file's options. Other options that are better than the
+        file's are compared with the result of the search.
+
+        Args:
+            model: base model with the options of the file.
+        """
+        runs = model.runs
+        if (
+            not runs.contacts.has_contacts_off_ground
+            or runs.context.options.tuner is not None
+            or not model.is_usable
+        ):
+            return model
+        file_options = RatedOptions.rate(model)
+        if file_options.is_noise_like:
+            return model
+        options = _improve_options(file_options)
+        if options is file_options:
+            return model
+        if options.is_noise_like and not _has_competing_effect(options, file_options):
+            return self._use(options, file_options)
+        self._possible_options = options
+        return model
+
+    def reconsider(self, result: SearchResult, cause_search: CauseSearch) -> SearchResult:
+        """Return the result with other options, if they explain the data better, or this result.
+
+        Args:
+            result: result with the options and the time step of the model file.
+            cause_search: search for causes from another base model.
+        """
+        options = self._possible_options
+        if options is None or result.has_ended:
+            return result
+        merit = result.rate()
+        option_merit = options.penalised_log_likelihood, options.residual - 1.0
+        if not is_finer_model_better(merit, option_merit) and result.is_explained:
+            return result
+        model = self._use(options, RatedOptions.rate(result.base))
+        other = cause_search.search(model.finish())
+        if is_finer_model_better(merit, other.rate()):
+            return other
+        self.finding = None
+        return result
+
+    def _use(self, options: RatedOptions, file_options: RatedOptions) -> BaseModel:
+        """Use other options of the solver than the model file's, and return their base model.
+
+        Args:
+            options: The other options.
+            file_options: The options of the model file, with the base model fitted with them.
+        """
+        model = options.model
+        robot: Any = model.runs.kind
+        gain = options.log_likelihood - file_options.log_likelihood
+        self.finding, self._possible_options = OptionFinding(robot, gain), None
+        model.runs.context.say("simulated with other options of the solver than the model file's")
+        return replace(
+            model, runs=replace(model.runs, before=file_options.model.predict_held_out())
+        )
+
+
+def _improve_options(rated: RatedOptions) -> RatedOptions:
+    """Return the best options, changed one after the other while the base model improves.
+
+    Args:
+        rated: The options of the model file.
+    """
+    # This import is needed for robots only.
+    from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
+
+    runs = rated.model.runs
+    for _ in range(MAX_OPTION_ROUNDS):
+        evaluator = rated.model.runs.fitting
+        tried = []
+        for alternative in rank_option_alternatives(
+            evaluator, runs.noise, rated.model.fit.fit.theta, evaluator.initial_state_guesses
+        )[:MAX_FITTED_OPTIONS]:
+            if runs.context.search_control.is_over():
+                break
+            robot: Any = runs.kind
+            runs = runs.with_kind(robot.with_integrator_settings(alternative.numerics))
+            if runs.fitting.filtered_runs is None:
+                filter_runs(runs)
+            tried.append(RatedOptions.rate(rated.model.refit(runs)))
+        best = max(tried, key=lambda one: one.log_likelihood, default=rated)
+        if best is rated or not best.is_better_than(rated):
+            break
+        rated = best
+    return rated
+
+
+def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> bool:
+    """Return whether an effect may explain the recording as other options of the solver do.
+
+    Far from the noise, only effects at contacts are tried: others would not imitate an option. Laws
+    with many shapes are not tried, because an option is the simpler explanation.
+
+    Args:
+        options: the other solver options, with the base model fitted to them.
+        file_options: options of the model file, with the base model fitted to them.
+    """
+    # This import is needed for robots only.
+    from bench.diagnosis.search.contact_search import (
+        exclude_laws_with_many_shapes,
+        find_lowest_scan,
+    )
+
+    runs = file_options.model.runs
+    search = runs.create_search(file_options.model.fit)
+    lowest_squares = find_lowest_scan(search)
+    if file_options.residual > MAX_LINEAR_RESIDUAL:
+        return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.model.fit.fit.cost
+    exclude_laws_with_many_shapes(search)
+    model = search.base_model
+    squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
+    gains = (
+        float(search.observed_mask.sum()) * float(np.log(squares / lowest_squares)),
+        float(search.score_missing_effects(model).score.max(initial=0.0)),
+    )
+    option_gain = options.log_likelihood - file_options.log_likelihood
+    return max(gains) > MIN_COMPETING_GAIN_SHARE * option_gain

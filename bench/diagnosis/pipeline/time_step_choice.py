@@ -1,0 +1,177 @@
+"""Choice of the integrator step of a robot: that of the model file or a finer one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.numerics_cause import (
+    CoarseStepFinding,
+    Reusable,
+    is_finer_model_better,
+    is_finer_step_better,
+)
+from bench.diagnosis.pipeline.base_model import BaseModel, filter_runs
+from bench.diagnosis.pipeline.cause_search import CauseSearch
+from bench.diagnosis.pipeline.search_result import SearchResult, rate_model
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+
+if TYPE_CHECKING:
+    from bench.diagnosis.evaluation.solver_options import StepRefinement
+
+MAX_SUBSET_EFFECTS = 3
+"""Maximum number of effects of which all subsets are fitted with another time step."""
+REFIT_ITERATIONS = 8
+"""Maximum number of steps of the fit of more effects with another time step."""
+
+
+class TimeStepChoice:
+    """Choice of the time step and integrator, before and after the search for causes.
+
+    A missing effect can make either step look better, and effects can imitate a step, so the first
+    choice is preliminary.
+
+    Attributes:
+        finding: finding that the file's own step is too coarse; None while the file's is used.
+    """
+
+    def __init__(self) -> None:
+        """Begin with the step of the model file."""
+        self.finding: CoarseStepFinding | None = None
+        self._refinements: Reusable[StepRefinement] | None = None
+        self._file_runs: SimulatedRuns | None = None
+
+    def choose(self, model: BaseModel) -> BaseModel:
+        """Choose the step of the base model: the file's own, or a finer one.
+
+        A finer step is used if it alone closes a large part of the gap.
+
+        Args:
+            model: base model with the file's own step.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.evaluation.solver_options import find_step_refinements
+
+        runs = model.runs
+        self._refinements = Reusable(find_step_refinements(runs.fitting, runs.noise))
+        file_log_likelihood, residual = model.rate()
+        gap = residual - 1.0
+        for refinement in self._refinements:
+            # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
+            if not refinement.is_accurate_enough(residual):
+                continue
+            runs = runs.with_kind(refinement.kind)
+            if runs.fitting.filtered_runs is None:
+                # A model that diverges with the file's step may be filtered with a finer one.
+                filter_runs(runs)
+            finer = model.refit(runs)
+            log_likelihood, residual = finer.rate()
+            gain = log_likelihood - file_log_likelihood
+            if not is_finer_step_better(gain, gap, residual - 1.0):
+                # Another missing effect may affect both models: they are compared again with it.
+                if refinement.is_accurate_enough(0.0):
+                    break
+                residual = 0.0
+            elif refinement.is_accurate_enough(residual):
+                return self._use(refinement, gain, model, finer)
+        return model
+
+    def reconsider(self, result: SearchResult, cause_search: CauseSearch) -> SearchResult:
+        """Return the result with another step, if that explains the data better, or this result.
+
+        The other step is compared with the effects of this result or some of them. Models are
+        compared by penalised log-likelihood and residual, and a finer step must be clearly better:
+        data that MuJoCo made with the file's own step must not be explained by another.
+
+        Args:
+            result: result with the present step.
+            cause_search: search for causes from another base model.
+        """
+        finding, model = result.finding, result.searched_base
+        if self._refinements is None or result.has_ended:
+            return result
+        if not finding.causes and (self.finding is not None or finding.verdict == "adequate"):
+            return result
+        if self._file_runs is not None:
+            file_merit = _rate_best_subset(self._file_runs, result)
+            if is_finer_model_better(file_merit, result.rate()):
+                return result
+            model.runs.context.say(
+                "the time step of the model file explains the data equally well: it is used"
+            )
+            self.finding = None
+            return cause_search.search(model.refit(self._file_runs).finish())
+        refinement = next((one for one in self._refinements if one.is_accurate_enough(0.0)), None)
+        # The residual of a model that stays incomplete is far larger than an error of the step.
+        if refinement is None or finding.is_incomplete:
+            return result
+        runs = model.runs.with_kind(refinement.kind)
+        merit, finer_merit = result.rate(), _rate_best_subset(runs, result)
+        if not is_finer_model_better(merit, finer_merit):
+            return result
+        finer = self._use(refinement, finer_merit[0] - merit[0], model, model.refit(runs))
+        return cause_search.search(finer.finish())
+
+    def _use(
+        self, refinement: StepRefinement, gain: float, file: BaseModel, finer: BaseModel
+    ) -> BaseModel:
+        """Use a finer step, and record that the file's own step is too coarse.
+
+        A URDF specifies no step, so that a finer one corrects nothing in it.
+
+        Args:
+            refinement: the finer step and integrator.
+            gain: gain in penalised log-likelihood over the file's own step.
+            file: base model with the file's own step.
+            finer: base model with the finer step, which is returned.
+        """
+        # This import is needed for robots only.
+        from sims.robot.integrator_settings import specifies_integrator
+
+        numerics = refinement.numerics
+        file.runs.context.say(
+            f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
+        )
+        robot: Any = finer.runs.kind
+        if not specifies_integrator(robot.robot):
+            self._refinements = None
+            return finer
+        self.finding, self._file_runs = CoarseStepFinding(refinement, gain), file.runs
+        return replace(finer, runs=replace(finer.runs, before=file.predict_held_out()))
+
+
+def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float, float]:
+    """Fit subsets of the effects of a result to runs with another step, and rate the best model.
+
+    All subsets are fitted if there are only few effects; otherwise only all together.
+
+    Args:
+        runs: the runs with the other step.
+        result: result of a search, whose fixed parameters stay fixed.
+
+    Returns:
+        Penalised log-likelihood and excess RMS residual of the best model.
+    """
+    names, fit = result.finding.model.effects, result.finding.model.fit
+    evaluator, base = runs.fitting, result.searched_base.fit
+    starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
+    for count in range(0 if has_few_effects else len(names), len(names) + 1):
+        for subset in combinations(names, count):
+            theta = fit.theta.copy()
+            for omitted in set(names) - set(subset):
+                indices = evaluator.coefficient_slices[omitted]
+                theta[indices] = evaluator.get_nominal_theta()[indices]
+            starts.append(FitStart(subset, theta, fit.initial_states))
+    fits = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters).fit_models(
+        starts, MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS
+    )
+    models = runs.create_search(base)
+    best = max(
+        (models.add_fit(subset_fit) for subset_fit in fits),
+        key=lambda model: model.penalised_log_likelihood,
+    )
+    return rate_model(models, best)
