@@ -339,6 +339,9 @@ class _Forces:
 
         The simulator's own force is estimated from the last step.
 
+        The simulator's own force is P = M (v - v_before) / h_before - F_before (1), the stopping
+        force S = -(M v / h + P + F) (2), and friction is S where |S| <= L, else L S / |S| (3).
+
         Args:
             moment: state of the simulator.
             force: (D,) sum of the other effects' forces.

@@ -167,13 +167,22 @@ class ComparisonChart:
 
 
 def make_error_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the main chart: error against simulations."""
+    """Make the main chart: error against simulations.
+
+    One panel per error measure and range of targets; the median over targets is drawn.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+
+    Returns:
+        The chart, with the tables that it draws.
+    """
     runs = view.statistics.all_runs
     # The true parameters of a recording are unknown, so its error on held-out runs is shown.
     if view.is_recording:
-        metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
+        available_metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
         return _make_median_chart(
-            view, "errors", [(m, "real") for m in metrics], side_by_side="error"
+            view, "errors", [(m, "real") for m in available_metrics], side_by_side="error"
         )
     keys = [(view.statistics.parameter_error_metric, kind) for kind in view.ranges]
     # If the targets come from another simulator, the misfit has its own figure.
@@ -259,7 +268,17 @@ def _make_median_chart(
 
 
 def make_distance_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of the error against the target's distance from the training range."""
+    """Make the chart of the error against the target's distance from the training range.
+
+    One panel per number of simulations; targets are binned by their distance from the range in
+    which learned tuners were trained.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+
+    Returns:
+        The chart, with the table `distance`.
+    """
     table = view.statistics.medians_by_distance
     label = f"{view.format_metric_label(view.statistics.parameter_error_metric)}, median"
     x_axis = Axis(
@@ -287,7 +306,15 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
 
 
 def _make_simulations_axis(budget: int) -> Axis:
-    """Make the axis of the number of simulations, up to a budget."""
+    """Make the axis of the number of simulations, up to a budget.
+
+    Args:
+        budget: Largest number of simulations per run.
+
+    Returns:
+        Axis that is logarithmic above 1 and linear below (`symlog`), with a tick at each
+        checkpoint.
+    """
     ticks = tuple(float(k) for k in select_checkpoints(budget))
     return Axis(
         "simulations used on the target",
@@ -300,7 +327,17 @@ def _make_simulations_axis(budget: int) -> Axis:
 
 
 def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of runtime distributions over all thresholds."""
+    """Make the chart of runtime distributions over all thresholds.
+
+    A runtime distribution is the share of pairs (run, error threshold) that are reached within a
+    number of simulations.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+
+    Returns:
+        The chart, with the table `runtime`.
+    """
     table = view.statistics.runtime_distribution
     budget = int(table["simulations"].max())
     x_axis = _make_simulations_axis(budget)
@@ -319,7 +356,14 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
 
 
 def make_ert_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of the expected running time against the error to be reached."""
+    """Make the chart of the expected running time against the error to be reached.
+
+    The expected running time (ERT) is the mean number of simulations until an error is reached,
+    with failed runs restarted.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+    """
     statistics = view.statistics
     table = statistics.sort_rows(
         build_ert_table(statistics.curves, statistics.levels, view.experiment.budget)
@@ -334,7 +378,18 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
 
 
 def make_cost_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of seconds per target by the cost of a simulation, with the winners."""
+    """Make the chart of seconds per target by the cost of a simulation, with the winners.
+
+    The seconds per target have the training cost of learned tuners in them, divided among
+    `TARGETS_PER_TRAINING` targets. A bar at the foot of a panel names the cheapest tuner at each
+    cost of a simulation.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+
+    Returns:
+        The chart, with a thinned table `seconds`.
+    """
     x_axis, y_axis = (
         Axis("seconds per simulation", "log"),
         Axis("seconds per target", "log"),
@@ -364,7 +419,17 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
 
 
 def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of the number of targets from which on a training pays."""
+    """Make the chart of the number of targets from which on a training pays.
+
+    For each untrained tuner and each learned tuner, the chart shows how many targets have to be
+    tuned until the training has saved as many simulations as it cost.
+
+    Args:
+        view: Comparison with its statistics, experiment and styles of tuners.
+
+    Returns:
+        The chart, with the table `even`.
+    """
     # From a tenth of a target, since a training may pay at once.
     y_axis = Axis("number of targets at which training breaks even", "log", ends=(0.1, 1e5))
     rules = (

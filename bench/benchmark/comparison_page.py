@@ -89,7 +89,14 @@ class RangeResult(NamedTuple):
 
 
 def list_range_results(view: ComparisonView) -> list[RangeResult]:
-    """List the verdicts on the tuners by range of targets."""
+    """List the verdicts on the tuners by range of targets.
+
+    Each result ranks the tuners after 1, 3, 10 and all simulations, with notes on failed runs and
+    on how to read the ranking.
+
+    Args:
+        view: Comparison with its statistics.
+    """
     results = []
     for kind in view.ranges:
         rankings = headline.rank_at_checkpoints(view.statistics, kind)
@@ -239,7 +246,13 @@ class Failure(NamedTuple):
 
 
 def list_failures(view: ComparisonView) -> list[Failure]:
-    """List every kind of failure with its first reason, the most frequent one first."""
+    """List every kind of failure with its first reason, the most frequent one first.
+
+    Runs that failed or were skipped are grouped by tuner, status and reason.
+
+    Args:
+        view: Comparison with the status of every run.
+    """
     statuses = view.stored.statuses
     failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     failures = [
@@ -258,7 +271,13 @@ def list_small_samples(view: ComparisonView) -> list[str]:
 
 
 def format_redraws(results: ComparisonReportData) -> str:
-    """Describe how many targets were drawn again; empty for none."""
+    """Describe how many targets were drawn again; empty for none.
+
+    A target is drawn again if its own simulation diverges, because it then has no observations.
+
+    Args:
+        results: Comparison with the record of its environment.
+    """
     redrawn_count, draws = (
         results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
     )
@@ -272,7 +291,11 @@ def format_redraws(results: ComparisonReportData) -> str:
 
 
 def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
-    """Yield notes on isolation, salt and targets that limit the results."""
+    """Yield notes on isolation, salt and targets that limit the results.
+
+    Args:
+        results: Comparison with its configuration and the record of its environment.
+    """
     experiment = results.view.experiment
     if experiment.trusted:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
@@ -296,7 +319,16 @@ _DIGITS = 7
 
 
 def render_page(results: ComparisonReportData) -> str:
-    """Render the page as HTML."""
+    """Render the page as HTML.
+
+    Tables and chart data are written into the page, from which its script draws the charts.
+
+    Args:
+        results: Comparison with its view, tables and the pictures that exist.
+
+    Returns:
+        The page, which needs no other file.
+    """
     view, page = results.view, HtmlPage()
     for name, table in results.tables.items():
         if len(table):

@@ -171,7 +171,14 @@ def _list_limitations(experiment: Experiment) -> list[str]:
 
 
 def _describe_best_tuners(view: ComparisonView) -> list[str]:
-    """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range."""
+    """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range.
+
+    Args:
+        view: Comparison with its statistics.
+
+    Returns:
+        Paragraphs of several lines, for the terminal.
+    """
     statistics, texts = view.statistics, []
     label = view.format_metric_label(view.shown_metric)
     for kind in view.ranges:
@@ -193,7 +200,15 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
 
 
 def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
-    """Format the lines of one number of simulations; verdicts without tuners are left out."""
+    """Format the lines of one number of simulations; verdicts without tuners are left out.
+
+    Args:
+        ranking: Verdicts on all tuners after one number of simulations.
+
+    Returns:
+        Lines for best, worse, undecided and failed tuners; the first one begins with the number of
+        simulations.
+    """
     best = (
         f"{', '.join(ranking.best)} ({ranking.error})" if ranking.best else "none: every run failed"
     )

@@ -70,7 +70,10 @@ class BallKind:
     source: str
 
     def compute_restitution(self, speed: float) -> float:
-        """Return the restitution at an impact speed in m/s; at most 1."""
+        """Return the restitution at an impact speed in m/s; at most 1.
+
+        With the restitution e at the speed v of the rules' drop, e(u) = e (u / v)^p (2).
+        """
         ratio = max(speed, _MIN_IMPACT_SPEED) / self.speed
         return min(1.0, self.restitution * float(ratio**self.exponent))  # (2)
 

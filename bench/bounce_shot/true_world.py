@@ -190,6 +190,9 @@ class _Flight:
     def _apply_forces(self, velocity: list[float]) -> None:
         """Apply drag (1), lift (2) and friction (5) as force and torque of the next step.
 
+        Drag is -1/2 rho Cd A |v| v (1), and lift 1/2 rho A r omega x v (2), with the density rho of
+        air, the cross section A and radius r of the ball, its velocity v and its spin omega.
+
         Args:
             velocity: velocity of the centre in m/s, and angular velocity in rad/s, (6,).
         """
@@ -216,6 +219,9 @@ class _Flight:
 
         It is limited to the force that stops the slip within the step, so that it does not reverse
         it.
+
+        The force is at most the friction cone mu N and the force that stops the slip within a step
+        h, |f| = min(mu N, k / (1 + k) m |slip| / h) (5), with the moment of inertia k m r^2.
 
         Args:
             vx: velocity along x, m/s.

@@ -42,7 +42,15 @@ def build_catalogue(parser: argparse.ArgumentParser) -> JsonDocument:
 
 
 def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
-    """List every command with its options, as `simgap --help` does."""
+    """List every command with its options, as `simgap --help` does.
+
+    Args:
+        parser: Parser of the whole command line, with a subparser for each command.
+
+    Returns:
+        One JSON document per command: name, help text, schema of its output, exit codes and
+        options.
+    """
     # argparse has no public way to list the arguments of a parser.
     (choices,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     summaries = {action.dest: action.help for action in choices._choices_actions}
@@ -63,7 +71,14 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
 
 
 def _describe_option(action: argparse.Action) -> JsonDocument:
-    """Describe an argument or option of a command by plain values, for `simgap list commands`."""
+    """Describe an argument or option of a command by plain values, for `simgap list commands`.
+
+    Args:
+        action: Argument or option as argparse stores it.
+
+    Returns:
+        Its flags, type, choices, default value and help text, by name.
+    """
     default = None if action.default in ([], "") else action.default
     type_name = getattr(action.type, "__name__", "")
     flag = _OPTION_TYPES.get(type(action).__name__)
@@ -195,7 +210,12 @@ def list_diagnosers() -> list[JsonDocument]:
 
 
 def list_experiments() -> list[JsonDocument]:
-    """List every experiment of the project, and what is missing for it on this machine."""
+    """List every experiment of the project, and what is missing for it on this machine.
+
+    Returns:
+        One document per experiment; `skipped` and `needs` say what is missing here,
+        `tuners_skipped` which tuners cannot run.
+    """
     from bench.benchmark.problem import experiment
     from bench.benchmark.problem.missing_requirements import availability
 
@@ -219,7 +239,10 @@ def list_experiments() -> list[JsonDocument]:
 
 
 def list_references() -> list[JsonDocument]:
-    """List every reference result that `simgap plot --behind NAME` draws."""
+    """List every reference result that `simgap plot --behind NAME` draws.
+
+    A reference result is a stored comparison that figures draw in grey behind a new one.
+    """
     from bench.benchmark.storage.reference_results import find_reference, list_reference_names
 
     return [
@@ -305,7 +328,11 @@ def _format_sentence(entry: JsonDocument) -> str:
 
 
 def _format_experiment(experiment: JsonDocument) -> list[str]:
-    """Format an experiment: what is missing on this machine, its description, its tags."""
+    """Format an experiment: what is missing on this machine, its description, its tags.
+
+    Args:
+        experiment: Document of `list_experiments`.
+    """
     missing = []
     if experiment["skipped"]:
         missing.append(f"skipped: {experiment['skipped']}")
@@ -319,7 +346,11 @@ def _format_experiment(experiment: JsonDocument) -> list[str]:
 
 
 def _format_system(system: JsonDocument) -> list[str]:
-    """Format a system: its description, then a line for each of its declared quantities."""
+    """Format a system: its description, then a line for each of its declared quantities.
+
+    Args:
+        system: Document of one simulator, with parameters, constants, inputs, states and channels.
+    """
     lines = [f"{system['name']}: {_format_sentence(system)}"]
     if system["skipped"]:
         return lines
@@ -345,7 +376,12 @@ def _format_channels(role: str, channels: list[JsonDocument]) -> list[str]:
 
 
 def _format_effect(effect: JsonDocument) -> list[str]:
-    """Format an effect, with its coefficients' units and plausible ranges by kind of system."""
+    """Format an effect, with its coefficients' units and plausible ranges by kind of system.
+
+    Args:
+        effect: Document of one effect, with its coefficients and the kinds of systems that they
+            apply to.
+    """
     if effect["skipped"]:
         return [f"{effect['name']}: {_format_sentence(effect)}"]
     result = [f"{effect['name']} ({effect['hook']}): {effect['says']}"]
@@ -377,7 +413,13 @@ _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {
 
 
 def format_places(model: Path) -> Iterator[str]:
-    """Yield lines about a model file's places and signals, and the effects that can act there."""
+    """Yield lines about a model file's places and signals, and the effects that can act there.
+
+    A place is a joint, actuator, body or sensor at which an effect can act.
+
+    Args:
+        model: MJCF or URDF file of a robot.
+    """
     from bench.core.plugin_registries import make_robot_simulator
     from bench.logs.recording_summary import format_robot_summary
 
@@ -397,7 +439,13 @@ def format_places(model: Path) -> Iterator[str]:
 
 
 def list_places(model: Path) -> JsonDocument:
-    """Build the JSON document of the places of a model file."""
+    """Build the JSON document of the places of a model file.
+
+    A place is a joint, actuator, body or sensor at which an effect can act.
+
+    Args:
+        model: MJCF or URDF file of a robot.
+    """
     from bench.core.plugin_registries import make_robot_simulator
     from bench.logs.recording_summary import format_robot_summary
 
@@ -456,7 +504,14 @@ def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
 
 
 def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]]:
-    """Return the names of effects that can act on a robot, by the kind of their places."""
+    """Return the names of effects that can act on a robot, by the kind of their places.
+
+    Args:
+        system: System of a robot.
+
+    Returns:
+        Effect names by kind of place, such as joint or body.
+    """
     from sims import effects
 
     names_by_kind: dict[str, list[str]] = {}

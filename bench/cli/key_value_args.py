@@ -84,7 +84,14 @@ def parse_coefficients(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def parse_noise(texts: Sequence[str]) -> dict[str, float]:
-    """Parse NAME=S texts, and at most one plain S for all channels that are not named."""
+    """Parse NAME=S texts, and at most one plain S for all channels that are not named.
+
+    Args:
+        texts: Words after `--noise`, such as ["0.01", "x=0.02"].
+
+    Returns:
+        Standard deviation by channel; the key `ALL_CHANNELS` has that of unnamed channels.
+    """
     unnamed_texts = [text for text in texts if "=" not in text]
     if len(unnamed_texts) > 1:
         raise InputError(
@@ -100,7 +107,14 @@ def parse_noise(texts: Sequence[str]) -> dict[str, float]:
 
 
 def parse_initial_states(texts: Sequence[str]) -> dict[str, float | tuple[float, float]]:
-    """Parse NAME=VALUE and NAME=LOW:HIGH texts of initial states."""
+    """Parse NAME=VALUE and NAME=LOW:HIGH texts of initial states.
+
+    Args:
+        texts: Words after `--initial`, such as ["angle=0.5", "rate=-1:1"].
+
+    Returns:
+        A value, or the limits between which it is drawn, by name of the state.
+    """
     values: dict[str, float | tuple[float, float]] = {}
     for name, text in parse_key_values("--initial", texts).items():
         low, colon, high = text.partition(":")

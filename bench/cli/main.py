@@ -224,7 +224,17 @@ _MAX_COMPARED_CHARACTERS = 100
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, and return the exit code."""
+    """Run the command line, and return the exit code.
+
+    Results and errors are printed as text, or as JSON with `--json`.
+
+    Args:
+        arguments: Words after `simgap`; None for those of the process. Settings of the whole
+            process are only changed in the latter case.
+
+    Returns:
+        Exit code of the command: 0, 2 for wrong input, others as in the table of exit codes.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     printer: OutputWriter = JsonWriter() if "--json" in words else TextWriter()
     try:

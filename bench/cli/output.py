@@ -184,7 +184,11 @@ _FIGURES_FOLDER = "figures"
 
 
 def summarise_study(study: Study) -> JsonDocument:
-    """Summarise a study: name, folder, files, isolation, kind of salt, and results."""
+    """Summarise a study: name, folder, files, isolation, kind of salt, and results.
+
+    Args:
+        study: Study in its result folder.
+    """
     experiment = study.configuration.experiment
     return {
         "name": experiment.name,

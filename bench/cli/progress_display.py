@@ -139,7 +139,13 @@ class SearchProgress:
         self._redraw_if_due()
 
     def completed(self, share: float) -> None:
-        """Estimate the remaining time from the share done; see `ProgressListener`."""
+        """Estimate the remaining time from the share done; see `ProgressListener`.
+
+        The remaining time is the elapsed time multiplied by (1 - share) / share.
+
+        Args:
+            share: Share of the work that is done, 0 to 1.
+        """
         # A model with more effects makes the share smaller, but a bar must not go back.
         if share > self._share:
             self._share = min(share, 1.0)
@@ -287,7 +293,10 @@ class ProgressDisplay(SearchProgress):
         self._has_timer = False
 
     def __enter__(self) -> ProgressDisplay:
-        """Start the timer that redraws the live line, where signals can be used."""
+        """Start the timer that redraws the live line, where signals can be used.
+
+        The timer is a signal, because the search itself may not return to Python for seconds.
+        """
         if not self._silent and _can_use_timer():
             signal.signal(signal.SIGALRM, lambda *_: self._redraw_if_due())
             # System calls of libraries continue after the signal.
@@ -297,7 +306,10 @@ class ProgressDisplay(SearchProgress):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the timer, erase the live line, print what is waiting, and show nothing any more."""
+        """Stop the timer, erase the live line, print what is waiting, and show nothing any more.
+
+        The original handler of the signal is restored.
+        """
         if self._has_timer:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -329,7 +341,11 @@ class ProgressDisplay(SearchProgress):
             self._busy = False
 
     def _redraw_if_due(self) -> None:
-        """Show the state, unless that was done less than an interval ago."""
+        """Show the state, unless that was done less than an interval ago.
+
+        On a terminal, the live line is drawn again; elsewhere, a new line is written. Once, after
+        `HINT_AFTER` seconds of search, a hint about time limits is added.
+        """
         if self._silent or self._busy or not self._name:
             return
         current_time = self._clock()
@@ -360,7 +376,10 @@ class ProgressDisplay(SearchProgress):
             self._busy = False
 
     def _draw_lines(self) -> None:
-        """Write the waiting lines, then the live line on a terminal."""
+        """Write the waiting lines, then the live line on a terminal.
+
+        The longest form of the line that fits into the terminal is used.
+        """
         if self._waiting:
             self._erase_live_line()
             self._print_waiting()

@@ -54,7 +54,15 @@ def add_options(
 
 
 def collect_options(values: argparse.Namespace, options: type) -> dict[str, Any]:
-    """Return the values of a dataclass's options on the command line, as keyword arguments."""
+    """Return the values of a dataclass's options on the command line, as keyword arguments.
+
+    Args:
+        values: Parsed command line.
+        options: Dataclass whose fields declare the options.
+
+    Returns:
+        Values of the options that were given, by field name.
+    """
     arguments = {}
     for option in fields(options):
         flags = option.metadata.get("flags") or [option.name]
@@ -193,7 +201,11 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_path(text: str) -> Path:
-    """Parse the path of a file or folder, which need not exist."""
+    """Parse the path of a file or folder, which need not exist.
+
+    Args:
+        text: Word of the command line.
+    """
     from sims.core.plain_values import truncate_text
 
     try:

@@ -139,7 +139,12 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
     """
 
     def run_check() -> None:
-        """Run the check as a pytest test; skip it if an earlier check that it needs has failed."""
+        """Run the check as a pytest test; skip it if an earlier check that it needs has failed.
+
+        `check`, `subject` and the set `failed` of checks that have failed are bound by the
+        enclosing function. A failure that the subject announces in `known_failures` does not skip
+        the checks that need it.
+        """
         import pytest
 
         if (failed_check := failed_need(check, failed)) is not None:
@@ -193,7 +198,11 @@ class SuiteResult(NamedTuple):
         return all(_classify_line(line)[0] != "failed" for line in self.lines.values())
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert to a JSON document.
+
+        Each check has its title, its outcome (passed, failed, not tested, not applicable) and the
+        line that was printed.
+        """
         checks = [
             {"check": title, "outcome": _classify_line(line)[0], "says": line.strip()}
             for title, line in self.lines.items()
@@ -287,7 +296,14 @@ def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], Non
 
 
 def _summarise_checks(checked: SuiteResult) -> str:
-    """Summarise how many checks failed and how many were not run."""
+    """Summarise how many checks failed and how many were not run.
+
+    Args:
+        checked: Result of all checks of one subject, with one printed line per check.
+
+    Returns:
+        One line, such as "2 of 14 checks failed, 3 not applicable".
+    """
     outcomes = [_classify_line(line)[0] for line in checked.lines.values()]
     unrun_counts = {
         outcome: outcomes.count(outcome) for outcome in ("not tested", "not applicable")
@@ -345,7 +361,15 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
 
 
 def _format_check_end(end: Any) -> str:
-    """Return the line of a check that ran in a worker process."""
+    """Return the line of a check that ran in a worker process.
+
+    Args:
+        end: Result of the process: the finished line of the check, or the exception that ended it.
+
+    Returns:
+        The line to print: an error line if the check timed out, the input was wrong, or the process
+        died.
+    """
     if isinstance(end, TimeoutError):
         return (
             f"expected an end within {CALL_TIMEOUT_SECONDS:g} s; found none; see what it waits for"

@@ -61,13 +61,21 @@ _SAMPLING_RATE = 50.0
 
 @cache
 def _get_recording(hidden: bool) -> SimulatedRecording:
-    """Simulate a recording of the slider, with strong drag or without a hidden cause."""
+    """Simulate a recording of the slider, with strong drag or without a hidden cause.
+
+    Args:
+        hidden: Whether the true system has a linear drag that the diagnoser's simulator lacks.
+
+    Returns:
+        Three runs of two seconds, with the noisy position as the only channel.
+    """
     return simulate_recording(
         SimulationSpec(
             system=TEST_SYSTEM,
             effects={"drag.linear": (_DRAG,)} if hidden else {},
             noise={"x": _POSITION_NOISE},
             observe=("x",),
+            # Force amplitude 2 N, frequency 0.7 Hz.
             inputs={"u": "sine:2:0.7"},
             runs=3,
             seconds=2.0,
@@ -120,7 +128,10 @@ def _open_case(
 
 
 def _add_gaps(recording: Recording) -> Recording:
-    """Return the recording with every seventh sample missing."""
+    """Return the recording with every seventh sample missing.
+
+    Diagnosers must accept missing samples (NaN), because recordings have them.
+    """
     runs = []
     for run in recording.runs:
         channels = {name: values.copy() for name, values in run.channels.items()}
@@ -272,7 +283,13 @@ def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
 
 
 def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
-    """Check that the diagnoser answers with a tiny budget, or stops with the budget error."""
+    """Check that the diagnoser answers with a tiny budget, or stops with the budget error.
+
+    A diagnoser that counts its simulations wrongly would use more than `TINY_SIMULATION_BUDGET`.
+
+    Args:
+        kind: Diagnoser class under test.
+    """
     with _open_case(kind, budget=TINY_SIMULATION_BUDGET) as case:
         try:
             _run_diagnoser(kind, case)
@@ -294,7 +311,17 @@ def check_takes_missing_samples(kind: type[Diagnoser]) -> None:
 
 
 def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | None:
-    """Check that the training stays within its budget and results in numeric arrays."""
+    """Check that the training stays within its budget and results in numeric arrays.
+
+    The trained state must consist of numeric arrays, because it is sent to isolated processes as
+    plain arrays, not as pickled objects. It is stored for the checks that follow.
+
+    Args:
+        kind: Diagnoser class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     if not kind.learned:
         return NotApplicable("it does not learn")
     arrays, used_simulations = _train_diagnoser(kind)

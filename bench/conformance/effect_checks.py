@@ -90,7 +90,13 @@ def _choose_engine(host: type[SystemSimulator]) -> str | None:
 
 
 def _make_scenario(system: type[System]) -> Scenario:
-    """Make a run with nonzero velocities in all directions and inputs that change."""
+    """Make a run with nonzero velocities in all directions and inputs that change.
+
+    Every effect of the library must have a chance to act on this run.
+
+    Args:
+        system: System whose states and inputs the run has.
+    """
     times = np.arange(_SAMPLES_PER_RUN) / _SAMPLING_RATE
     # Initial values of states that are neither coordinates nor rates, such as levels, are among the
     # rates.
@@ -262,15 +268,26 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
 
 
 def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
-    """Check that observations do not depend on other elements of the batch, bit for bit."""
+    """Check that observations do not depend on other elements of the batch, bit for bit.
+
+    The same three parameter sets are simulated in one batch and one by one.
+
+    Args:
+        effect: Effect class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
         simulator, scenario = _make_simulator_with_effect(host, effect), _make_scenario(host.system)
         # Shares of the ranges of the parameters.
-        lanes = np.concatenate([_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)])
-        batch_result = simulator.simulate(lanes, scenario)
+        parameter_sets = np.concatenate(
+            [_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)]
+        )
+        batch_result = simulator.simulate(parameter_sets, scenario)
         single_results = np.concatenate(
-            [simulator.simulate(lane[None], scenario) for lane in lanes]
+            [simulator.simulate(parameter_set[None], scenario) for parameter_set in parameter_sets]
         )
         check(
             is_bitwise_equal(batch_result, single_results),
@@ -282,7 +299,17 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
 
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | None:
-    """Check that a system that cannot have the effect is rejected by name."""
+    """Check that a system that cannot have the effect is rejected by name.
+
+    A host is a simulator to which the effect is added. `misses` says what a system lacks for the
+    effect. Adding the effect anyway must raise an `InputError` whose message names the effect.
+
+    Args:
+        effect: Effect class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     impossible = [host for host in _iterate_systems() if effect.misses(host.system)]
     for host in impossible:
         try:

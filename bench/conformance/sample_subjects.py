@@ -44,7 +44,11 @@ TRAINING_RANGE_HIGH = 0.75
 
 
 def simulate_toy_problem(points: Array) -> Array:
-    """Simulate the toy problem: (n, 40, 2) from (n, dim) points of the unit cube."""
+    """Simulate the toy problem: (n, 40, 2) from (n, dim) points of the unit cube.
+
+    With r_i = 0.5 + 0.6 p_i, channel 1 is the sum over i of cos(r_i t + 0.3 i) / i (1), channel 2
+    that of exp(-r_i t) (1 + 0.1 i) (2).
+    """
     # index i of (1) and (2)
     phases = np.arange(1, points.shape[1] + 1)
     rates = 0.5 + 0.6 * points

@@ -201,7 +201,15 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
 
 def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
-    """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step."""
+    """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step.
+
+    Args:
+        simulator: Simulator written by a user, which is stepped here one step at a time.
+        force: (D,) generalised force during the first step; None for a run without `apply_force`.
+
+    Returns:
+        (K + 1, 2 D) coordinates and rates before the first and after each of K steps.
+    """
     names = (*simulator.coordinates, *simulator.rates)
     _start_run(simulator)
     observed_samples = []
@@ -215,7 +223,17 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
+    """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged.
+
+    Levels are stored quantities of a user's simulator, such as the height of a liquid; `put` sets
+    them and `observe` returns them.
+
+    Args:
+        kind: Simulator class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
     if kind.put is OwnSimulator.put or not kind.levels:
@@ -266,7 +284,14 @@ def _list_named_parts(kind: type[Simulator]) -> list[Parameter | Channel | Const
 
 
 def check_declaration_is_complete(kind: type[Simulator]) -> None:
-    """Check that the declaration has valid names and a description, and no duplicates."""
+    """Check that the declaration has valid names and a description, and no duplicates.
+
+    The declaration is the class attributes: parameters, channels, constants, inputs, and the
+    sentence `says`.
+
+    Args:
+        kind: Simulator class under test.
+    """
     location = kind.__name__
     check(
         bool(kind.parameters and kind.channels and kind.says),
@@ -286,7 +311,13 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
 
 
 def check_units_are_known(kind: type[Simulator]) -> None:
-    """Check that every parameter, channel, constant and input has a unit that can be converted."""
+    """Check that every parameter, channel, constant and input has a unit that can be converted.
+
+    Recordings in other units can only be converted if the declared units are known.
+
+    Args:
+        kind: Simulator class under test.
+    """
     for part in _list_named_parts(kind):
         check(
             is_unit(part.unit),
@@ -297,7 +328,13 @@ def check_units_are_known(kind: type[Simulator]) -> None:
 
 
 def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
-    """Check that observations are (n, T, C) and finite, for several n and T."""
+    """Check that observations are (n, T, C) and finite, for several n and T.
+
+    n is the number of parameter vectors, T that of samples and C that of channels.
+
+    Args:
+        kind: Simulator class under test.
+    """
     simulator, location = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
         observations = simulator.simulate(_draw_points(simulator, n), _make_scenario(kind, samples))
@@ -308,8 +345,10 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
             observations.shape,
             location,
         )
-        for place, channel in enumerate(simulator.channels):
-            invalid_values = observations[:, :, place][~np.isfinite(observations[:, :, place])]
+        for channel_index, channel in enumerate(simulator.channels):
+            invalid_values = observations[:, :, channel_index][
+                ~np.isfinite(observations[:, :, channel_index])
+            ]
             expected = f"finite values of {channel.name} for parameters inside the bounds"
             check(not invalid_values.size, expected, invalid_values[:1], location)
     simulator.close()
@@ -379,7 +418,13 @@ def _describe_first_difference(kind: type[Simulator], expected: Array, observati
 
 
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
-    """Check that the simulator does not change `theta` and the scenario."""
+    """Check that the simulator does not change `theta` and the scenario.
+
+    The harness passes the same arrays to later calls, which would give other results.
+
+    Args:
+        kind: Simulator class under test.
+    """
     simulator, scenario = kind(), _make_scenario(kind)
     points = _draw_points(simulator, 3)
     points_before, times = points.copy(), scenario.times.copy()
@@ -394,7 +439,14 @@ def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
 
 
 def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simulator]) -> None:
-    """Check that a NaN parameter makes its own batch element NaN, and no other."""
+    """Check that a NaN parameter makes its own batch element NaN, and no other.
+
+    A tuner may propose NaN; this must not change the results of other parameter vectors in the same
+    batch.
+
+    Args:
+        kind: Simulator class under test.
+    """
     simulator, location = kind(), f"{kind.__name__}.simulate"
     points = _draw_points(simulator, 3)
     expected_observations = simulator.simulate(points, _make_scenario(kind))
@@ -417,7 +469,14 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
 
 
 def check_every_parameter_shows(kind: type[Simulator]) -> None:
-    """Check that each parameter changes some channel, in a run of ten seconds."""
+    """Check that each parameter changes some channel, in a run of ten seconds.
+
+    A parameter without influence on any channel cannot be estimated. All inputs are 1. The base
+    point is at 40 % of the training range; each parameter is then increased by 20 % of its range.
+
+    Args:
+        kind: Simulator class under test.
+    """
     simulator = kind(observe=[c.name for c in kind.channels])
     cube = UnitCube(simulator.parameters)
     # Points inside the training range: outside it, a large friction may prevent all motion.
@@ -429,9 +488,9 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
     observations = simulator.simulate(
         cube.to_physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs)
     )
-    for parameter, lane in zip(simulator.parameters, observations[1:], strict=True):
+    for parameter, changed_observations in zip(simulator.parameters, observations[1:], strict=True):
         check(
-            not np.array_equal(lane, observations[0]),
+            not np.array_equal(changed_observations, observations[0]),
             f"parameter {parameter.name} to change the observations",
             "nothing",
             kind.__name__,
@@ -440,7 +499,17 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
 
 
 def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that each initial state changes some channel, in a run of ten seconds."""
+    """Check that each initial state changes some channel, in a run of ten seconds.
+
+    Each state is changed by the share `_STATE_CHANGE_SHARE` of its value or of its channel's scale,
+    whichever is larger.
+
+    Args:
+        kind: Simulator class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     if not kind.states:
         return NotApplicable("it has no initial state")
     simulator = kind(observe=[c.name for c in kind.channels])
@@ -494,7 +563,17 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
 
 
 def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that `observe` selects and orders columns without changing their values."""
+    """Check that `observe` selects and orders columns without changing their values.
+
+    The simulator is run with all channels and with the reversed list of channels; the columns must
+    agree bit for bit.
+
+    Args:
+        kind: Simulator class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     full_simulator = kind()
     names = [c.name for c in full_simulator.channels][::-1]
     if len(names) == 1:

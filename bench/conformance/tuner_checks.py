@@ -91,7 +91,13 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
 
 
 def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
-    """Return the tuner specification for an isolated process; None if the class cannot load."""
+    """Return the tuner specification for an isolated process; None if the class cannot load.
+
+    The specification says from which module or plugin file another process loads the class.
+
+    Args:
+        kind: Tuner class under test.
+    """
     module = sys.modules.get(kind.__module__)
     if getattr(module, kind.__name__, None) is not kind:
         return None
@@ -196,7 +202,14 @@ def check_budget_is_exact(kind: type[Tuner]) -> None:
 
 
 def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
-    """Check that the tuner does not write to the task and the evaluations of the harness."""
+    """Check that the tuner does not write to the task and the evaluations of the harness.
+
+    The tuner runs for up to ten steps. Every array that it receives is copied before and compared
+    afterwards.
+
+    Args:
+        kind: Tuner class under test.
+    """
     task, _ = make_task(2, 20)
     task = replace(
         task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy()
@@ -291,7 +304,13 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
 
 
 def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
-    """Check that a run on a used instance equals one on a fresh instance."""
+    """Check that a run on a used instance equals one on a fresh instance.
+
+    A tuner that keeps state in `self` between runs would make results depend on their order.
+
+    Args:
+        kind: Tuner class under test.
+    """
     used_tuner = make_trained_tuner(kind, 2)
     run_tuner(used_tuner, 2, 15, seed=1)
     reused, fresh_trace = (
@@ -315,7 +334,16 @@ def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
 
 
 def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
-    """Check that a tuner declared as not stochastic gives the same run for every seed."""
+    """Check that a tuner declared as not stochastic gives the same run for every seed.
+
+    The harness repeats only stochastic tuners with several seeds.
+
+    Args:
+        kind: Tuner class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
     if kind.stochastic:
         return NotApplicable("it declares that it is random")
     tuner = make_trained_tuner(kind, 2)
@@ -446,7 +474,14 @@ def compute_run_digests(
 
 
 def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
-    """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers."""
+    """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers.
+
+    Results must not depend on the number of workers, else a comparison could not be repeated
+    elsewhere. Runs are compared by digests of their proposals.
+
+    Args:
+        kind: Tuner class under test.
+    """
     location = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
     seeds = (0, 1, 2, 3)
     local_digests = compute_run_digests(kind, seeds)

@@ -69,7 +69,13 @@ def takes_options(
     """
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
-        """Return the function that takes the fields of the options dataclass as its arguments."""
+        """Return the function that takes the fields of the options dataclass as its arguments.
+
+        `options` (the dataclass) and `name` are bound by the enclosing function.
+
+        Args:
+            function: Function of one options object.
+        """
         signature, function_name = inspect.signature(options), name or function.__name__
 
         @wraps(function)

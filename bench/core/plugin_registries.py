@@ -127,7 +127,11 @@ def _load_plugin_file(path: Path) -> None:
 
 
 def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]:
-    """Return the non-abstract classes that the module defines, each with its registry."""
+    """Return the non-abstract classes that the module defines, each with its registry.
+
+    Args:
+        module: Module of a plugin.
+    """
     module_classes = [
         value
         for value in vars(module).values()
@@ -144,7 +148,11 @@ def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]
 
 
 def _make_module_name(path: Path) -> str:
-    """Return a module name for a plugin file that no other file has in this process."""
+    """Return a module name for a plugin file that no other file has in this process.
+
+    Args:
+        path: Python file of the plugin.
+    """
     name = f"simgap_plugin_{path.stem}"
     number = 1
     # Two files of the same name in different folders need different modules, because the source of

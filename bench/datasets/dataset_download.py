@@ -283,7 +283,11 @@ def _check_content(file: SourceFile, location: str, content: bytes) -> bytes:
 
 
 def _format_provenance(data_set: DataSet) -> str:
-    """Format SOURCE.txt: source, citation, licence and hashes of the files."""
+    """Format SOURCE.txt: source, citation, licence and hashes of the files.
+
+    Args:
+        data_set: Data set with its repository, commit, licence and files.
+    """
     lines = [
         data_set.title,
         f"Source: {data_set.repository}, commit {data_set.commit}",

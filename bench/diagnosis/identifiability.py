@@ -164,6 +164,8 @@ class _IdentifiabilityAssessment:
         determine (its eigenvalues below `MIN_EIGENVALUE`) get the variance `UNIDENTIFIED_VARIANCE`
         instead of that of the pseudoinverse, which is zero. A parameter without any influence has
         an infinite variance.
+
+        With the whitened derivatives D by the parameters, the covariance is (D'D)^-1 (1).
         """
         columns = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))

@@ -59,7 +59,11 @@ class DiagnosisReportDataBuilder:
     notes: tuple[str, ...] = ()
 
     def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
-        """Collect everything that text, figures and page of a report need, for a verdict."""
+        """Collect everything that text, figures and page of a report need, for a verdict.
+
+        Args:
+            verdict: Verdict that the report explains.
+        """
         evaluator = self.assessor.fitting_evaluator
         recording = self.assessor.recording
         before = self.finding.base.fit.simulated
@@ -114,7 +118,10 @@ class DiagnosisReportDataBuilder:
         )
 
     def _assess_consistency(self) -> ConsistencySummary:
-        """Assess the consistency of runs, logs and loads for the base and the extended model."""
+        """Assess the consistency of runs, logs and loads for the base and the extended model.
+
+        Consistency means that groups of runs give the same parameters as all runs together.
+        """
         if self.finding.early_stop is not None or self.finding.unidentified_parameters:
             return ConsistencySummary()
         before = assess_consistency(self.search, self.finding.base)
@@ -155,7 +162,11 @@ class DiagnosisReportDataBuilder:
         return tuple(group_estimates)
 
     def _assess_identifiability(self) -> tuple[ParameterIdentifiability, ...]:
-        """Assess identifiability from the directions that the search has simulated."""
+        """Assess identifiability from the directions that the search has simulated.
+
+        If no directions are known, those of the scan of the base model are used; without them, the
+        result is empty.
+        """
         key: frozenset[str] = frozenset()
         scan = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
         directions = self.search.get_known_directions()
@@ -178,7 +189,11 @@ class DiagnosisReportDataBuilder:
         return "left out" if self._is_cross_validated else "held out"
 
     def _summarise_held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
-        """Return the held-out runs and their gap locations; None and empty if not measured."""
+        """Return the held-out runs and their gap locations; None and empty if not measured.
+
+        Args:
+            sigma: (C,) standard deviation of the noise of each channel.
+        """
         evaluator = self.assessor.held_out_evaluator
         held_out_fits = self.finding.held_out_fits
         names = self.finding.model.effects

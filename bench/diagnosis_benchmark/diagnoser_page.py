@@ -216,7 +216,11 @@ def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
 
 
 def _make_board(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against false alarms."""
+    """Make the chart of diagnosed single causes against false alarms.
+
+    Args:
+        data: Results of all diagnosers.
+    """
     x_axis = Axis(
         "false alarms if nothing is hidden [%]",
         "symlog",
@@ -246,7 +250,11 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
 
 
 def _make_power(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of the shares named and detected against the size of the hidden effect."""
+    """Make the chart of the shares named and detected against the size of the hidden effect.
+
+    Args:
+        data: Results of all diagnosers; sizes are in units of the noise.
+    """
     table = data.tables["power"]
     sizes = tuple(sorted(float(size) for size in table["size"].unique()))
     x_axis = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
@@ -296,7 +304,11 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_cost(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against the cost of an answer."""
+    """Make the chart of diagnosed single causes against the cost of an answer.
+
+    Args:
+        data: Results of all diagnosers.
+    """
     y_axis = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
     labels = {
         "simulations_median": "simulations for an answer, median",

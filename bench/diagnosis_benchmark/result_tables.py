@@ -164,7 +164,11 @@ def _build_diagnoser_table(
 
 
 def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
-    """Yield the lines of table.csv for one diagnoser: the fraction of each metric."""
+    """Yield the lines of table.csv for one diagnoser: the fraction of each metric.
+
+    Args:
+        diagnoser_rows: Graded answers of one diagnoser, one row per case.
+    """
     for metric in METRICS:
         successes = metric.predicate(metric.select(diagnoser_rows))
         yield {"metric": metric.name, **_compute_share(successes, metric.is_exact)}

@@ -116,7 +116,11 @@ def render_pdf(figure: Figure) -> bytes:
 
 
 def render_svg(figure: Figure) -> bytes:
-    """Render a figure as the bytes of an SVG file."""
+    """Render a figure as the bytes of an SVG file.
+
+    Args:
+        figure: Figure of Matplotlib.
+    """
     from matplotlib import rc_context
 
     file = BytesIO()

@@ -107,7 +107,12 @@ def _render_in_child(backend: str, model: Any, positions: Array, view: Projectio
 
 
 def render_requested(folder: str) -> None:
-    """Render the request that `_render_in_child` stored in a folder; any error ends the process."""
+    """Render the request that `_render_in_child` stored in a folder; any error ends the process.
+
+    Args:
+        folder: Folder with the model (`model.mjb`) and the view (`view.npz`); the image is written
+            there.
+    """
     import mujoco
 
     folder_path = Path(folder)

@@ -108,7 +108,14 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
 
 
 def _place_runs(runs: Sequence[Run]) -> list[_PlacedRun]:
-    """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
+    """Place runs end to end with small gaps; of too many runs, use evenly spaced ones.
+
+    Args:
+        runs: Runs of a recording, each beginning at its own time.
+
+    Returns:
+        Runs with their start on the common time axis.
+    """
     if len(runs) > _MAX_DRAWN_RUNS:
         chosen_indices = np.linspace(0, len(runs) - 1, _MAX_DRAWN_RUNS).round().astype(int)
         runs = [runs[i] for i in chosen_indices]
@@ -296,7 +303,11 @@ def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, la
 
 
 def _choose_frames(track: BallTrack) -> list[int]:
-    """Return the indices of a few frames with the ball, evenly spaced along its path."""
+    """Return the indices of a few frames with the ball, evenly spaced along its path.
+
+    Args:
+        track: Track of the ball, with its centre (u, v) in each frame.
+    """
     visible = track.visible_frames.tolist()
     steps = np.hypot(np.diff(track.u[visible]), np.diff(track.v[visible]))
     path_length = np.concatenate([[0.0], np.cumsum(steps)])
@@ -308,7 +319,11 @@ def _choose_frames(track: BallTrack) -> list[int]:
 
 
 def _overlay_balls(track: BallTrack) -> RgbImage:
-    """Return the background with the balls of a few frames copied into it."""
+    """Return the background with the balls of a few frames copied into it.
+
+    Args:
+        track: Track with the background and the stored pictures of a few frames.
+    """
     picture = track.background.copy()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     # Only the disc of the ball is copied from each stored frame.

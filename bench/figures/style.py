@@ -258,7 +258,14 @@ class TunerStyles:
         references: Sequence[ReferenceResult] = (),
         notes: Mapping[str, str] | None = None,
     ) -> None:
-        """Map each tuner with runs to its index in the experiment, which sets colour and marker."""
+        """Map each tuner with runs to its index in the experiment, which sets colour and marker.
+
+        Args:
+            experiment: Experiment with all its tuners.
+            order: Labels of the tuners in the order of a legend.
+            references: Reference results that are drawn in grey.
+            notes: Notes by tuner, which are added to its label.
+        """
         self.experiment, self.references, self.notes = experiment, references, notes or {}
         present = set(order)
         # Tuners without runs count, too, so that a colour means the same tuner in every figure.
@@ -266,7 +273,11 @@ class TunerStyles:
         self.order = [label for label in order if label in self._places]
 
     def get_plot_style(self, tuner: str) -> dict[str, Any]:
-        """Return keyword arguments for plotting `tuner`."""
+        """Return keyword arguments for plotting `tuner`.
+
+        Args:
+            tuner: Label of the tuner.
+        """
         i = self._places[tuner]
         return {
             "color": _COLOURS[i % len(_COLOURS)],

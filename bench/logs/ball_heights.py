@@ -269,14 +269,24 @@ def estimate_height_noise(times: Array, z: Array) -> float:
 
 
 def find_release_frame(track: BallTrack) -> int:
-    """Find the frame at which the ball begins to move; the first one unless it is held before."""
-    s, visible_frames = _compute_fall_position(track), track.visible_frames
-    start = float(np.median(s[visible_frames[:5]]))
-    # Up to a pixel, or four sigmas, is a trembling hand or an error of the outline, not a fall.
-    moved_places = np.flatnonzero(np.abs(s[visible_frames] - start) > max(1.0, 4 * track.noise))
+    """Find the frame at which the ball begins to move; the first one unless it is held before.
+
+    A hand may hold the ball at the beginning of the film. It counts as held if it stays for at
+    least `_MIN_HOLD_SECONDS`.
+
+    Args:
+        track: Centres of the ball in the frames of a film.
+    """
+    fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
+    start = float(np.median(fall_position[visible_frames[:5]]))
+    # Motion up to a pixel, or four standard deviations of the noise, is a trembling hand or an
+    # error of the outline, not a fall.
+    moved_indices = np.flatnonzero(
+        np.abs(fall_position[visible_frames] - start) > max(1.0, 4 * track.noise)
+    )
     first = int(visible_frames[0])
-    if not len(moved_places):
+    if not len(moved_indices):
         return first
-    release = int(visible_frames[moved_places[0]])
+    release = int(visible_frames[moved_indices[0]])
     hold_seconds = track.times[release] - track.times[first]
     return first if hold_seconds < _MIN_HOLD_SECONDS else release

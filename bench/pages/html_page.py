@@ -139,7 +139,11 @@ class CompiledTemplates(BytecodeCache):
             bucket.code = code if isinstance(code, CodeType) else None
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        """Store the compiled code of a template on disk, for reuse in the next process."""
+        """Store the compiled code of a template on disk, for reuse in the next process.
+
+        Args:
+            bucket: Jinja2's compiled template.
+        """
         if sys.dont_write_bytecode or bucket.code is None:
             return
         path = self._get_path(bucket)

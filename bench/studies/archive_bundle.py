@@ -429,7 +429,16 @@ def _find_folder_kind(folder: Path) -> str:
 
 
 def _list_result_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """List the files of a folder by their relative paths, and those that are left out."""
+    """List the files of a folder by their relative paths, and those that are left out.
+
+    Links and hidden files are left out, because an archive must not contain files from elsewhere.
+
+    Args:
+        folder: Folder of results.
+
+    Returns:
+        Files by relative path, and a line for each path that is left out.
+    """
     files, left_out = {}, []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -443,7 +452,14 @@ def _list_result_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
 
 
 def _list_plugin_files(folder: Path) -> dict[str, Path]:
-    """List the plugin files of a comparison, so that they can be inspected before they run."""
+    """List the plugin files of a comparison, so that they can be inspected before they run.
+
+    Args:
+        folder: Folder of a comparison.
+
+    Returns:
+        Existing plugin files by their path in the archive.
+    """
     plugins = [
         Path(file)
         for part in list_study_folders(folder)
@@ -495,7 +511,14 @@ def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
 
 
 def _format_explain_command(folder: Path) -> str:
-    """Build the command that reproduces an explanation, as far as its folder states it."""
+    """Build the command that reproduces an explanation, as far as its folder states it.
+
+    Args:
+        folder: Folder of an explanation, with the record of its settings and recordings.
+
+    Returns:
+        Command line for a shell.
+    """
     environment = read_environment(folder)
     tables = [
         recording["file"]

@@ -137,7 +137,10 @@ class ComparisonDiff:
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Table of errors, a line per range, tuner and number of simulations (schema ``diff``)."""
+        """Table of errors, a line per range, tuner and number of simulations (schema ``diff``).
+
+        The p-values of all lines are corrected together (Holm).
+        """
         lines = list(self._compare_all_errors())
         if not lines:
             return pd.DataFrame()
@@ -214,7 +217,10 @@ class ComparisonDiff:
 
     @cached_property
     def shared_targets(self) -> set[str]:
-        """Targets that both comparisons have, with the same true parameters and the same start."""
+        """Targets that both comparisons have, with the same true parameters and the same start.
+
+        Only runs on shared targets can be compared in pairs.
+        """
         a, b = self.a.targets, self.b.targets
         if list(a.columns) != list(b.columns):
             return set()
@@ -232,7 +238,10 @@ class ComparisonDiff:
 
     @cached_property
     def statuses(self) -> list[dict[str, Any]]:
-        """Numbers of runs by tuner and status that differ between the comparisons."""
+        """Numbers of runs by tuner and status that differ between the comparisons.
+
+        A status is the way a run ended, such as finished, failed or timed out.
+        """
         counts = [
             Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
             for s in (self.a, self.b)
@@ -300,7 +309,11 @@ class ComparisonDiff:
 
     @cached_property
     def notes(self) -> list[str]:
-        """Notes on limitations of the comparison."""
+        """Notes on limitations of the comparison.
+
+        One note says that no difference can be significant if there are too few targets for the
+        number of lines that are compared.
+        """
         notes = []
         error_table = self.errors
         if not len(error_table):
@@ -322,7 +335,10 @@ class ComparisonDiff:
         return notes
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert to a JSON document.
+
+        The document follows the schema ``diff``; `a` and `b` are the two comparisons.
+        """
         experiments = [s.stored.experiment for s in (self.a, self.b)]
         environments = [read_environment(s.folder) for s in (self.a, self.b)]
         side_documents = [
@@ -344,7 +360,11 @@ class ComparisonDiff:
         }
 
     def format_lines(self) -> Iterator[str]:
-        """Format the differences as text lines."""
+        """Format the differences as text lines.
+
+        The table has the significant lines and those after all simulations; changed statuses,
+        tuners, settings and notes follow.
+        """
         document = self.to_document()
         head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
         yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"

@@ -143,7 +143,10 @@ class ExplanationSide:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """System, settings, recordings, versions and machine of the explanation."""
+        """System, settings, recordings, versions and machine of the explanation.
+
+        Two explanations can only be expected to agree if these are equal.
+        """
         environment = self.environment
         recordings = {
             recording["file"]: recording["sha256"]
@@ -191,7 +194,11 @@ class ExplanationDiff:
 
     @cached_property
     def causes(self) -> list[dict[str, Any]]:
-        """All effects that either explanation names, with their roles in both."""
+        """All effects that either explanation names, with their roles in both.
+
+        Roles are those of `ExplanationSide.classify_effect`: a cause, an alternative of a cause, or
+        neither.
+        """
         effect_names = [
             effect
             for side in (self.a, self.b)
@@ -209,7 +216,14 @@ class ExplanationDiff:
 
     @cached_property
     def numbers(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Coefficients and parameters of either explanation, with intervals and significance."""
+        """Coefficients and parameters of either explanation, with intervals and significance.
+
+        A difference is significant if its p-value, with Holm's correction over all numbers, is
+        below `FAMILYWISE_ERROR_RATE`.
+
+        Returns:
+            Rows of coefficients, and rows of parameters.
+        """
         coefficients = _pair_coefficients(
             _collect_coefficients(self.a), _collect_coefficients(self.b)
         )
@@ -286,7 +300,10 @@ class ExplanationDiff:
         return notes
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert to a JSON document.
+
+        The document follows the schema ``diff``; `a` and `b` are the two explanations.
+        """
         coefficients, parameters = self.numbers
         side_documents = [
             describe_side(side.folder, side.title, side.environment) for side in (self.a, self.b)
@@ -307,7 +324,11 @@ class ExplanationDiff:
         }
 
     def format_lines(self) -> Iterator[str]:
-        """Format the differences as text lines."""
+        """Format the differences as text lines.
+
+        The lines have the verdict, causes, fitted numbers, held-out errors, ranks of candidates,
+        settings and notes.
+        """
         document = self.to_document()
         words = document["verdict"]
         is_same = words["a"] == words["b"]
@@ -389,7 +410,14 @@ def _pair_coefficients(
 
 
 def _compute_p_value(row: Mapping[str, Any]) -> float:
-    """Compute the p-value of no difference; NaN if an interval is open or a number is missing."""
+    """Compute the p-value of no difference; NaN if an interval is open or a number is missing.
+
+    The standard errors follow from the 95 % intervals of both numbers; the difference is assumed to
+    be normally distributed.
+
+    Args:
+        row: Values `a` and `b` with the limits `low_a`, `high_a`, `low_b` and `high_b`.
+    """
     limits = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
     if any(end is None for end in limits):
         return math.nan

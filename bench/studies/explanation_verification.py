@@ -161,7 +161,12 @@ def read_verdict(folder: Path) -> Verdict:
 def _find_differing_numbers(
     verdict: Verdict, extended: ExtendedSimulator
 ) -> Iterator[VerificationFailure]:
-    """Yield numbers of the verdict that are missing or different in the extended simulator."""
+    """Yield numbers of the verdict that are missing or different in the extended simulator.
+
+    Args:
+        verdict: Verdict read from `verdict.json`.
+        extended: Extended simulator read from `extended.toml`, which must state the same numbers.
+    """
     for name, fitted_value in verdict.parameters.items():
         model_value = extended.parameters.get(name)
         if model_value is not None and not math.isclose(

@@ -120,7 +120,14 @@ def open_study(folder: Path) -> Study:
 
 
 def get_study_class(experiment: Experiment) -> type[Study]:
-    """Return the kind of study that an experiment describes."""
+    """Return the kind of study that an experiment describes.
+
+    Args:
+        experiment: Experiment whose tables [shot], [calibration] or [diagnosis] select the kind.
+
+    Returns:
+        The class; an ordinary comparison of tuners if none of these tables exists.
+    """
     # The classes are imported here, because a comparison does not need the other studies' modules.
     if experiment.shot:
         from bench.bounce_shot.shot_study import BounceShotStudy

@@ -76,7 +76,11 @@ class MultiProblemResult(NamedTuple):
     files: list[Path]
 
     def to_document(self) -> dict[str, Any]:
-        """Return the result as a JSON document."""
+        """Return the result as a JSON document.
+
+        It has the ranks of each tuner on each problem, their means, the p-value of the Friedman
+        test, and the files written.
+        """
         ranked = self.together.mean_ranks
         return {
             "problems": list(ranked.index),
@@ -178,7 +182,10 @@ class ComparisonCollection:
 
     @cached_property
     def mean_ranks(self) -> pd.DataFrame:
-        """Ranks among the common tuners: one row per problem, one column per tuner, 1 is best."""
+        """Ranks among the common tuners: one row per problem, one column per tuner, 1 is best.
+
+        Common tuners are those that every comparison has.
+        """
         problem_errors = pd.concat(
             [
                 compute_problem_ranks(part.statistics.curves, part.statistics.floor)
@@ -202,7 +209,11 @@ class ComparisonCollection:
         return compute_nemenyi_p_values(self.mean_ranks)
 
     def build_tables(self) -> dict[str, pd.DataFrame]:
-        """Build the tables ert, pairs, ranks, and nemenyi if `has_enough_problems`, by name."""
+        """Build the tables ert, pairs, ranks, and nemenyi if `has_enough_problems`, by name.
+
+        They are the expected running times (ERT), paired tests, ranks, and the p-values of
+        Nemenyi's test between all tuners.
+        """
         ert, paired = [], []
         for part in self.parts:
             curves, levels = part.statistics.curves, part.statistics.levels
@@ -232,7 +243,11 @@ class ComparisonCollection:
         return frame.assign(trusted=True) if self.has_trusted_runs else frame
 
     def build_figures(self) -> dict[str, Figure]:
-        """Draw runtime-distribution, and critical-difference if `has_enough_problems`."""
+        """Draw runtime-distribution, and critical-difference if `has_enough_problems`.
+
+        The critical-difference figure shows mean ranks and which tuners do not differ significantly
+        (Friedman and Nemenyi tests).
+        """
         figures = {"runtime-distribution": self._draw_runtime_distribution()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests
@@ -336,7 +351,14 @@ def _make_runtime_panel(
 
 
 def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], pd.DataFrame]:
-    """Make the panels of error against simulations, one per problem, with their table."""
+    """Make the panels of error against simulations, one per problem, with their table.
+
+    Args:
+        collection: Comparisons on several problems with their common tuners.
+
+    Returns:
+        A panel for each problem and range of targets, and the medians that all panels draw.
+    """
     frames, panels = [], []
     counts: Counter[str] = Counter()
     for part in collection.parts:

@@ -136,7 +136,14 @@ def build_guide(tables: SuiteTables) -> pd.DataFrame:
 
 
 def describe_tests(tables: SuiteTables) -> Iterator[str]:
-    """Describe at each checkpoint from which methods the best one differs significantly."""
+    """Describe at each checkpoint from which methods the best one differs significantly.
+
+    Args:
+        tables: Statistics of the suite.
+
+    Returns:
+        One sentence per number of simulations (checkpoint).
+    """
     for k in tables.checkpoints:
         pair_rows = tables.pairs
         pair_rows = pair_rows[(pair_rows["training"] == FREE) & (pair_rows["simulations"] == k)]
@@ -144,6 +151,7 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
             continue
         best = str(pair_rows["best"].iloc[0])
         significant = pair_rows[
+            # The best tuner must also win on more than half of the problems.
             (pair_rows["p_holm"] < _SIGNIFICANCE) & (pair_rows["best_better"] > 0.5)
         ]
         undecided_tuners = [
@@ -158,7 +166,14 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
 
 
 def describe_losses(tables: SuiteTables) -> Iterator[str]:
-    """Describe where the methods of this project lose, and to which method."""
+    """Describe where the methods of this project lose, and to which method.
+
+    A loss is a cell (problem and range) in which another method has a median error that is smaller
+    by `LOSS_FACTOR`.
+
+    Args:
+        tables: Statistics of the suite.
+    """
     for tuner in REFERENCE_TUNERS:
         if tuner not in tables.suite.tuners:
             continue
@@ -293,7 +308,14 @@ def _make_anchor(cell: str) -> str:
 
 
 def _build_guide_rows(tables: SuiteTables) -> list[dict[str, Any]]:
-    """Arrange the guide with one row per property and one entry per number of simulations."""
+    """Arrange the guide with one row per property and one entry per number of simulations.
+
+    The guide names, for each property of a problem such as its dimension, the best tuner and the
+    best tuner without training.
+
+    Args:
+        tables: Statistics of the suite.
+    """
     rows = []
     for (name, value), group in build_guide(tables).groupby(["property", "value"], sort=False):
         by_k = group.set_index("simulations")
@@ -452,7 +474,13 @@ def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
 
 
 def find_stored_runs(version: str) -> SuiteRuns | None:
-    """Return the stored runs of a version of a suite; None if there are none."""
+    """Return the stored runs of a version of a suite; None if there are none.
+
+    They are read from the reference results of this project.
+
+    Args:
+        version: Version of the suite, which changes when its problems change.
+    """
     for place in REFERENCE_FOLDERS:
         folder = place / _REFERENCE_NAME
         if (folder / CURVES_FILE).is_file():

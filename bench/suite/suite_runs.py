@@ -233,7 +233,11 @@ def _count_parameters(experiment: Experiment) -> int:
 
 
 def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
-    """Return the result for a comparison without runs: only the tuners that were skipped."""
+    """Return the result for a comparison without runs: only the tuners that were skipped.
+
+    Args:
+        skipped: Table of tuners that could not run, with the reason.
+    """
     return SuiteRuns(
         pd.DataFrame(columns=RUN_COLUMNS),
         np.empty((0, 1)),
@@ -244,7 +248,14 @@ def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
 
 
 def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
-    """Concatenate runs; of several rows for one cell, training or skipped tuner the first stays."""
+    """Concatenate runs; of several rows for one cell, training or skipped tuner the first stays.
+
+    Args:
+        parts: Runs of several comparisons; `errors` (runs, simulations + 1) may differ in width.
+
+    Returns:
+        All runs; shorter rows of errors are filled with NaN.
+    """
     width = max(part.errors.shape[1] for part in parts)
     errors = np.concatenate(
         [

@@ -100,7 +100,11 @@ class SuiteTables:
 
     @cached_property
     def floors(self) -> dict[str, float]:
-        """Error of each cell below which tuners count as equal."""
+        """Error of each cell below which tuners count as equal.
+
+        For simulated targets it is the `negligible_error` of the experiment. For a recording, whose
+        error cannot become zero, it is the smallest median error increased by that share.
+        """
         floors = {}
         for row in self.suite.cells.itertuples():
             floor = float(row.negligible_error)  # type: ignore[arg-type]
@@ -110,7 +114,11 @@ class SuiteTables:
         return floors
 
     def _find_smallest_error(self, cell: str) -> float:
-        """Return the smallest median error of any tuner after all simulations."""
+        """Return the smallest median error of any tuner after all simulations.
+
+        Args:
+            cell: Name of the problem and range.
+        """
         curves = self.curves[cell]
         with np.errstate(invalid="ignore"):
             medians = [
@@ -152,7 +160,11 @@ class SuiteTables:
 
     @cached_property
     def _start_errors(self) -> dict[str, pd.Series[float]]:
-        """Errors of the starts by target, for each cell: those of tuners without training."""
+        """Errors of the starts by target, for each cell: those of tuners without training.
+
+        The start is the point at which a tuner begins, before any simulation of its own; trained
+        tuners may begin elsewhere.
+        """
         result = {}
         for cell, curves in self.curves.items():
             costs = {t: self._get_training_share(cell, t) for t in curves.list_tuners()}
@@ -352,7 +364,11 @@ class SuiteTables:
 
     @cached_property
     def profile(self) -> pd.DataFrame:
-        """Mean ranks by problem property: dimension, noise, range, misspecification and others."""
+        """Mean ranks by problem property: dimension, noise, range, misspecification and others.
+
+        A row has the property and its value, the number of simulations, the tuner, its mean rank,
+        and the number of cells.
+        """
         lines = []
         groups = [
             (name, value, cells) for name, value, cells in self.list_properties() if len(cells)

@@ -198,7 +198,12 @@ class GaussianProcess:
 
 
 def _compute_cholesky_factor(matrix: Array, jitter: float) -> Array:
-    """Return the lower Cholesky factor of matrix + jitter, with more jitter if it is needed."""
+    """Return the lower Cholesky factor of matrix + jitter, with more jitter if it is needed.
+
+    Args:
+        matrix: (n, n) covariance matrix.
+        jitter: First number to add to the diagonal; multiplied by ten until the factor exists.
+    """
     while True:
         shifted = matrix + jitter * np.eye(len(matrix))
         try:

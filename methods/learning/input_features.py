@@ -126,7 +126,14 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
 
 
 def _compute_smoothed_velocity_signs(series: Array) -> Array:
-    """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction."""
+    """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction.
+
+    Args:
+        series: (n, T, C) observed channels.
+
+    Returns:
+        (n, T, C) values in -1 to 1.
+    """
     # Slopes of lines through seven samples; noise would change the sign of single differences.
     offsets = np.arange(-3, 4)
     line = offsets / (offsets**2).sum()
@@ -394,7 +401,14 @@ class InputFeatures:
         return np.concatenate([rows, further], axis=1)
 
     def compute_rows(self, data: TrainingData) -> Array:
-        """Compute the input rows (scenarios, each, D) of training simulations."""
+        """Compute the input rows (scenarios, each, D) of training simulations.
+
+        Args:
+            data: Training simulations of all scenarios.
+
+        Returns:
+            (scenarios, simulations per scenario, D) inputs of the network.
+        """
         if self.scenario_features is None:
             # All scenarios are computed in one call, because the rows do not depend on the
             # scenario.

@@ -160,6 +160,9 @@ class TuneNetPublished(PairTuner):
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
         """Run Algorithm 1; guesses are limited to non-negative values only, as published.
 
+        Each step is zeta_k = zeta_{k-1} + h(o_P, o_T) (1), with the network h, the observation o_P
+        of the proposed simulation and o_T of the target.
+
         Args:
             task: start, observations, number of parameters and budget of the run.
             rng: unused; the method is deterministic.
@@ -246,6 +249,8 @@ class BroydenSearch:
             `change` y
         (dim,) that of their estimates h.
             A step of length zero is ignored.
+
+        With a step s and the change y of h, B <- B + (y - B s) s' / (s's) (3).
         """
         square = step @ step
         if square > 0.0:
@@ -257,6 +262,8 @@ class BroydenSearch:
 
         If it points against the estimate, Algorithm 1's step is used. After the first setback the
         updated slope is enough; after each further one the step is halved.
+
+        It is s = -B^-1 h (2), with the slope B of the network's estimate h; B = -1 at first.
         """
         try:
             step = np.linalg.solve(self._slope, -residual)  # (2)

@@ -212,11 +212,18 @@ class Effect(metaclass=EffectType):
 
     @classmethod
     def misses(cls, system: System | type[System]) -> str:
-        """Return why the system cannot have this effect; empty if it can."""
+        """Return why the system cannot have this effect; empty if it can.
+
+        `needs` is the property that the effect requires. Conditions are checked in this order: the
+        property, coefficients defined for this kind of system, and the system's own refusal.
+
+        Args:
+            system: System, or class of a system.
+        """
         system_class = system if isinstance(system, type) else type(system)
-        heavy = any(c.name == "gravity" for c in system.constants)
-        says_push = system_class.push is not System.push
-        in_space = len(system.coordinates) == 3
+        has_gravity = any(c.name == "gravity" for c in system.constants)
+        defines_push = system_class.push is not System.push
+        has_three_coordinates = len(system.coordinates) == 3
         reason = {
             "": "",
             "input": "" if system.inputs else "it has no input",
@@ -225,9 +232,11 @@ class Effect(metaclass=EffectType):
             "guide": "it flies freely" if system.bounces else "",
             "joint": "" if _is_joint(system) else "it is not a single joint",
             "servo": "" if system_class.servo else "it has no servo that follows a set point",
-            "gravity": "" if heavy else "it states no gravity",
-            "push": "" if says_push else "it does not define the effect of horizontal acceleration",
-            "space": "" if in_space else "it does not move in three dimensions",
+            "gravity": "" if has_gravity else "it states no gravity",
+            "push": ""
+            if defines_push
+            else "it does not define the effect of horizontal acceleration",
+            "space": "" if has_three_coordinates else "it does not move in three dimensions",
             "model": ""
             if system_class.has_model
             else "it has no model file whose numbers may be wrong",

@@ -60,7 +60,14 @@ def is_existing_file(path: Path) -> bool:
 
 
 def _format_similar_names(path: Path) -> str:
-    """Format the names of similar files in the folder as the end of a message."""
+    """Format the names of similar files in the folder as the end of a message.
+
+    Args:
+        path: Path that does not exist.
+
+    Returns:
+        Text such as "; did you mean swing.csv?"; empty if no name is similar.
+    """
     from difflib import get_close_matches
 
     try:

@@ -33,7 +33,10 @@ def align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> list[str]
 
 
 def to_toml_value(value: Any) -> Any:
-    """Copy a value as plain dicts, lists and numbers, as TOML gives them."""
+    """Copy a value as plain dicts, lists and numbers, as TOML gives them.
+
+    NumPy numbers become Python numbers, tuples become lists, and keys become text.
+    """
     # The command line imports this module, and starts faster without NumPy.
     import numpy as np
 
@@ -116,8 +119,12 @@ def truncate_text(text: str, max_length: int = MAX_QUOTED_NAME_LENGTH) -> str:
 
 
 def is_plausible_number(value: Any) -> bool:
-    """Return whether a value is a number of plausible size; booleans and NaN are not."""
-    # As above.
+    """Return whether a value is a number of plausible size; booleans and NaN are not.
+
+    The limit `MAX_NUMBER` is far below the largest float, so that products of two numbers do not
+    overflow.
+    """
+    # Imported here, because the command line starts faster without NumPy.
     import numpy as np
 
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):

@@ -110,7 +110,16 @@ class Registry(Generic[T]):
         return result
 
     def _load_entry_point(self, name: str) -> Any:
-        """Load the entry point `name`; it is imported once."""
+        """Load the entry point `name`; it is imported once.
+
+        An installed plugin is an entry point of its package.
+
+        Args:
+            name: Registered name.
+
+        Returns:
+            The class or function behind the entry point.
+        """
         if name not in self._imported:
             try:
                 loaded_part = self._entry_points[name].load()

@@ -33,7 +33,11 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """Make the message safe for one line of a terminal: shorten and escape it."""
+        """Make the message safe for one line of a terminal: shorten and escape it.
+
+        Args:
+            message: One line that says what is wrong, what was expected and what to do.
+        """
         # Names and cells from a user's file may contain anything; escape characters that would
         # break the line or a terminal.
         escaped = [
@@ -284,7 +288,13 @@ class UnitCube:
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
-        """Compute the bounds of the unit cube, as logarithms for log-scaled parameters."""
+        """Compute the bounds of the unit cube, as logarithms for log-scaled parameters.
+
+        Tuners work in the unit cube [0, 1]^dim; each parameter is mapped to it by its bounds.
+
+        Args:
+            parameters: Parameters with bounds and training range.
+        """
         self.parameters = tuple(parameters)
         self._log = np.array([p.log for p in self.parameters])
         self._any_log = bool(self._log.any())

@@ -355,7 +355,10 @@ class System(ABC):
         return -self.weight(moment)
 
     def force(self, moment: StateSnapshot) -> Array:
-        """Return the generalised force (L, D) of the system itself, without effects."""
+        """Return the generalised force (L, D) of the system itself, without effects.
+
+        With the mass M, M x'' = U(x, v, u) - P(x, v) + forces of effects (1).
+        """
         return self.drive(moment) - self.passive(moment)  # (1)
 
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:

@@ -15,7 +15,13 @@ register_effect = registry.register
 
 
 def list_effects_for(system: type[System]) -> dict[str, type[Effect]]:
-    """Return every usable effect that the system can have, by name."""
+    """Return every usable effect that the system can have, by name.
+
+    An effect whose package is missing is left out.
+
+    Args:
+        system: Class of the system.
+    """
     usable = {}
     for name in registry.names():
         try:

@@ -43,7 +43,18 @@ def run_recursion(kind: int, a: Array, b: Array, start: Array) -> Array:
 
 
 def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
-    """Write the values after each step into `result`; arguments as in `run_recursion`."""
+    """Write the values after each step into `result`; arguments as in `run_recursion`.
+
+    Kinds: limited acceleration; linear, y = a y + b; clamped to the range from a to b; and towards
+    a by at most b (rate limit).
+
+    Args:
+        kind: Kind of the recursion.
+        a: (L, S) first coefficients.
+        b: (L, S) second coefficients.
+        start: (L, ...) values before the first step.
+        result: (L, S) values after each step.
+    """
     for i in range(result.shape[0]):
         if kind == ACCELERATION_LIMIT:
             move_with_limited_acceleration(a[i], b[i], start[i], result[i])

@@ -29,7 +29,11 @@ def render_effects_table() -> str:
 
 
 def _format_effect_rows(effect: type[Effect]) -> list[str]:
-    """Return the rows of one effect in the Markdown table, one for each of its coefficients."""
+    """Return the rows of one effect in the Markdown table, one for each of its coefficients.
+
+    Args:
+        effect: Effect with its coefficients and their ranges by kind of system.
+    """
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
     for c in effect.coefficients:

@@ -184,6 +184,9 @@ class SupplySag(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the drive.
 
+        With the forces U_i of all drives that share the supply and D = sum |U_i|, the lost force is
+        U_i c D / (1 + c D) (2).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.

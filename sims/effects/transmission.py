@@ -116,17 +116,22 @@ class DrivenLoad(HiddenStateEffect):
         return np.clip(c[self.share], 0.0, _MAX_LOAD_SHARE)
 
     def element(self, c: Array) -> SeriesElement:
-        """Return the series element: a spring with damper for a compliance, else backlash."""
+        """Return the series element: a spring with damper for a compliance, else backlash.
+
+        Args:
+            c: Coefficients (K, L, 1) in the order of `between`: compliance or gap, damping, and
+                inertia of the rotor.
+        """
         coefficients = {
             coefficient.name: values for coefficient, values in zip(self.between, c, strict=True)
         }
-        none = np.zeros_like(c[0])
-        compliance = coefficients.get("compliance", none)
+        zeros = np.zeros_like(c[0])
+        compliance = coefficients.get("compliance", zeros)
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
         stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _MIN_COMPLIANCE), 0.0)
-        gap = np.maximum(coefficients.get("gap", none), 0.0)
+        gap = np.maximum(coefficients.get("gap", zeros), 0.0)
         return SeriesElement(
-            stiffness, coefficients.get("damping", none), gap, coefficients["rotor"]
+            stiffness, coefficients.get("damping", zeros), gap, coefficients["rotor"]
         )
 
     def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:
@@ -201,6 +206,9 @@ class JointFlexibility(DrivenLoad):
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
         """Return the force (L, 1) of spring and damper per unit of load inertia.
 
+        It is T = s M (w^2 (x - y) + 2 z w (x' - y')) (3), with the inertia M of drive and load, the
+        share s of the load, the drive's position x and the load's y.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -235,6 +243,9 @@ class JointBacklash(DrivenLoad):
         """Return the force (L, 1) of the flanks per unit of load inertia.
 
         Damping increases with the penetration, so that the force is continuous.
+
+        It is T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with d the excess of
+        x - y over the gap, the inertia M, the share s of the load, and the contact's frequency k.
 
         Args:
             c: (K, L, 1) coefficients.

@@ -51,7 +51,15 @@ class BatchEngine:
         patience: float = np.inf,
         jobs: int = 1,
     ) -> None:
-        """Check the settings; an infinite `turn` or `patience` means no limit."""
+        """Check the settings; an infinite `turn` or `patience` means no limit.
+
+        Args:
+            time_step: Largest step in s.
+            turn: Largest phase of the fastest oscillation per step, in rad; smaller steps are used
+                for stiff systems.
+            patience: Largest number of steps per planned step, after which an element fails.
+            jobs: Number of threads.
+        """
         if not (is_plausible_number(time_step) and time_step > 0):
             raise InputError(
                 "engine batch: time_step must be a positive number of seconds, found"
@@ -73,7 +81,11 @@ class BatchEngine:
         self._jobs = jobs
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
-        """Integrate every element over its steps; an element that overflows is NaN throughout."""
+        """Integrate every element over its steps; an element that overflows is NaN throughout.
+
+        Args:
+            batch: Systems, initial states, inputs and effects of all elements.
+        """
         trajectories = integrate_batch(batch, self._max_phase, self._patience, self._jobs)
         # Values that are not finite stay so; therefore the last state shows whether the whole run
         # is.

@@ -64,6 +64,8 @@ class AugmentedSystem(System):
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the inertia (L, 1) of the system's own coordinates.
 
+        It is M' = M (1 - sum of the load-side shares) (1).
+
         Args:
             theta: (L, p) parameters of the augmented system.
             constants: (L, 1) constants by name.

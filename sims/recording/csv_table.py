@@ -137,7 +137,13 @@ def has_run_column(path: Path) -> bool:
 
 
 def _make_encoding_error(path: Path) -> InputError:
-    """Make the error for a table that is not UTF-8."""
+    """Make the error for a table that is not UTF-8.
+
+    The message names the row of the first invalid byte.
+
+    Args:
+        path: Table that cannot be decoded.
+    """
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
@@ -171,7 +177,10 @@ class RecordingTable:
         self.channels, self.inputs = channels, inputs
 
     def read(self) -> list[CsvRun]:
-        """Return the runs of the file."""
+        """Return the runs of the file.
+
+        Large files are parsed by a fast reader first, which does not locate errors.
+        """
         records = self._iterate_records()
         header = self._check_header(next(records, []))
         parsed = None
@@ -223,7 +232,14 @@ class RecordingTable:
                 ) from None
 
     def _check_header(self, cells: list[str]) -> list[str]:
-        """Check the names of the columns against the declared ones, and return them."""
+        """Check the names of the columns against the declared ones, and return them.
+
+        Args:
+            cells: Cells of the first row.
+
+        Returns:
+            Names without spaces around them.
+        """
         header = [cell.strip() for cell in cells]
         # A single column is most likely due to another separator.
         if len(header) < 2:

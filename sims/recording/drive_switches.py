@@ -95,7 +95,13 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
 
 
 def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables of actuators that the model file lacks, without the keys of this module."""
+    """Return the tables of actuators that the model file lacks, without the keys of this module.
+
+    A switch key names the column that says when the drive is on; it does not describe an actuator.
+
+    Args:
+        actuators: Tables ``[actuators.NAME]`` of a description.
+    """
     kept_tables = {}
     for name, table in actuators.items():
         if not isinstance(table, dict):

@@ -213,7 +213,14 @@ class _FolderLogs:
         return make_read_only(times)
 
     def _read_signal(self, signal: str, rows: _LogRows) -> Array:
-        """Return the values (N,) of a signal in the rows of a run, in the unit of the log."""
+        """Return the values (N,) of a signal in the rows of a run, in the unit of the log.
+
+        A signal may combine several columns, for example a quaternion.
+
+        Args:
+            signal: Name of the channel or input.
+            rows: Rows of its log that belong to the run.
+        """
         log = self._logs[signal]
 
         def read_column(name: str) -> Array:

@@ -88,7 +88,11 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
 
 
 def is_unit(unit: str) -> bool:
-    """Return whether `unit` can be converted, which means that pint knows every name in it."""
+    """Return whether `unit` can be converted, which means that pint knows every name in it.
+
+    Args:
+        unit: Text such as "N*m" or "rad/s".
+    """
     if len(unit) > _MAX_UNIT_LENGTH or not _is_simple_unit(unit):
         return False
     try:
@@ -118,7 +122,11 @@ def _is_simple_unit(unit: str) -> bool:
 
 @lru_cache(maxsize=1)
 def _get_unit_registry() -> Any:
-    """Return pint's registry of units, in which an angle has its own dimension."""
+    """Return pint's registry of units, in which an angle has its own dimension.
+
+    pint treats an angle as a plain number; here rad is a dimension, so that rad/s is not confused
+    with 1/s.
+    """
     # Imported here: it takes a second, and most recordings are in SI units.
     import pint
 

@@ -53,7 +53,13 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
 
 @cache_per_robot
 def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
-    """List the joints whose drives can be coupled to the preceding joint."""
+    """List the joints whose drives can be coupled to the preceding joint.
+
+    The preceding joint is the next joint towards the base; a joint without one cannot be coupled.
+
+    Args:
+        robot: Robot with its joints and actuators.
+    """
     driven_joints = {actuator.joint for actuator in robot.actuators}
     return tuple(
         joint.name

@@ -78,7 +78,13 @@ class FittedCause:
         return np.array([self.numbers.get(axis, zero).value for axis in axes])
 
     def format(self, recording: str) -> str:
-        """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``."""
+        """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``.
+
+        A cause that is an option of the solver is formatted as "from ... to ...".
+
+        Args:
+            recording: Name of the recording for the text; empty to leave it out.
+        """
         has_several = len(self.numbers) > 1
         origin_text = f", fitted to {recording}" if recording else ""
         if self.effect in OPTION_EFFECTS:

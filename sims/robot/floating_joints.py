@@ -74,7 +74,16 @@ class FloatingJoints:
 
     @classmethod
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:
-        """Return the floating joints of a robot."""
+        """Return the floating joints of a robot.
+
+        These are free joints (three translations and a quaternion) and ball joints (a quaternion).
+
+        Args:
+            robot: Robot with its joints.
+
+        Returns:
+            The joints with their columns in `qpos` and `qvel`.
+        """
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
         positions = [
             j.position + k
@@ -150,6 +159,9 @@ class FloatingJoints:
     def displace(self, pose: Array, number: int, displacement: float) -> Array:
         """Displace poses along one degree of freedom, by eq. (1): add to a position, or rotate.
 
+        The pose becomes position + d_p and q exp(d_r / 2) (1), with the orientation q as a
+        quaternion.
+
         Args:
             pose: (n, P) poses.
             number: index of the degree of freedom, below F.
@@ -166,6 +178,9 @@ class FloatingJoints:
         """Displace poses (n, P) by small displacements (n, F) by eq. (1), in m and rad.
 
         Positions move along the axes of the world; rotations are about the axes of the body.
+
+        The pose becomes position + d_p and q exp(d_r / 2) (1), with the orientation q as a
+        quaternion.
         """
         displaced_pose = pose.copy()
         for axes, quaternion_columns, first in self._joint_addresses:
@@ -184,11 +199,17 @@ class FloatingJoints:
         return displaced_pose
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
-        """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
+        """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P).
+
+        A displacement has the difference of positions, and the rotation vector of q_reference^-1 q.
+        F and P are the numbers of velocities and of pose numbers of all floating joints.
+        """
         columns = []
         for axes, quaternion_columns, _ in self._joint_addresses:
-            place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
-            columns.append(pose[:, place] - reference[:, place])
+            translation_columns = slice(
+                quaternion_columns.start - len(axes), quaternion_columns.start
+            )
+            columns.append(pose[:, translation_columns] - reference[:, translation_columns])
             inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
             columns.append(
                 _compute_rotation_vectors(
@@ -199,7 +220,11 @@ class FloatingJoints:
 
     @cached_property
     def _joint_addresses(self) -> tuple[FloatingJoint, ...]:
-        """Where the pose numbers and the velocities of each joint are, in order."""
+        """Where the pose numbers and the velocities of each joint are, in order.
+
+        They are columns of the poses and displacements of floating joints alone, not of MuJoCo's
+        state.
+        """
         floating_joints, end, first = [], 0, 0
         for axes in map(_list_translation_axes, self.joints):
             end += len(axes + QUATERNION_ENTRIES)
@@ -216,7 +241,14 @@ def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
 
 
 def _compute_rotation_vectors(quaternions: Array) -> Array:
-    """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
+    """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi.
+
+    A quaternion (cos(a / 2), u sin(a / 2)) has the rotation vector a u. q and -q are the same
+    rotation; the sign with a nonnegative real part gives the smaller angle.
+
+    Args:
+        quaternions: (n, 4) unit quaternions (w, x, y, z).
+    """
     sign = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
     real_part, vector = sign * quaternions[:, :1], sign * quaternions[:, 1:]
     length = np.linalg.norm(vector, axis=1, keepdims=True)

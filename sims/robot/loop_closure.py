@@ -35,6 +35,9 @@ def close_loops(
 ) -> dict[str, float]:
     """Place unmeasured joints of closed loops where the constraints put them, by eq. (1).
 
+    Unmeasured joints u satisfy the constraints r(q) = 0 by steps q_u <- q_u - J_u^+ r(q); their
+    velocities are v_u = -J_u^+ J_m v_m, with the measured joints m and J = dr/dq (1).
+
     Args:
         robot: the robot.
         states: positions ``q.JOINT`` and velocities ``qd.JOINT`` of its joints.
@@ -83,6 +86,8 @@ def _solve_constraints(
     model: Any, data: Any, positions: Sequence[int], velocities: Array
 ) -> Array | None:
     """Move the unmeasured joints until the equality constraints are satisfied, by eq. (1).
+
+    Each Gauss-Newton step is q_u <- q_u - J_u^+ r(q) (1).
 
     Args:
         model: compiled model, whose constraints have a dense Jacobian.

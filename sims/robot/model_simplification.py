@@ -159,7 +159,13 @@ def strip_shapes(robot: RobotModel) -> RobotModel:
 
 
 def _needs_shapes(model: Any) -> bool:
-    """Return whether non-contact quantities depend on geoms, or contacts on more than hulls."""
+    """Return whether non-contact quantities depend on geoms, or contacts on more than hulls.
+
+    Meshes may be replaced by their convex hulls only if nothing else depends on the shapes.
+
+    Args:
+        model: Compiled model of MuJoCo.
+    """
     import mujoco
 
     sensor_types = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}

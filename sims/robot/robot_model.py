@@ -323,7 +323,11 @@ class RobotModel:
         )
 
     def _get_tendon_joints(self, i: int) -> tuple[str, ...]:
-        """Return the joints of the fixed tendon that an actuator drives, if it drives one."""
+        """Return the joints of the fixed tendon that an actuator drives, if it drives one.
+
+        Args:
+            i: Index of the actuator.
+        """
         import mujoco
 
         model = self.compiled

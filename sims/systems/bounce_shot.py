@@ -146,6 +146,9 @@ class ShotSystem(System):
     ) -> dict[str, Array]:
         """Return the position of the centre in the world frame by channel.
 
+        With the incline's angle a, x = along cos a + away sin a (3) and z = r / cos a + H - along
+        sin a + away cos a (4).
+
         Args:
             x: (L, T, 3) displacement from the release in the frame of the incline, m.
             v: unused.

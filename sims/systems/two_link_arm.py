@@ -225,6 +225,8 @@ class TwoLinkArm(OwnSimulator):
         The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
         these means are of second order.
 
+        From v through v1 to v2, q' = q + h (v + v1) / 2 (2) and v' = (v + v2) / 2 (3).
+
         Args:
             torques: torques at both joints, N·m.
             seconds: length of the step, s.

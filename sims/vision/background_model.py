@@ -159,13 +159,20 @@ def compute_masked_background(
 
 
 def _compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the median over the first axis, ignoring NaN; numpy's takes four times as long."""
+    """Return the median over the first axis, ignoring NaN; numpy's takes four times as long.
+
+    Args:
+        values: (n, ...) values, NaN where missing; at least one in each column is present.
+
+    Returns:
+        (...) medians; the mean of both middle values if their number is even.
+    """
     # NaN are sorted last, so the number of other values determines the middle.
-    ranked = np.sort(values, axis=0)
+    sorted_values = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0, keepdims=True)
-    low = np.take_along_axis(ranked, (count - 1) // 2, axis=0)
-    high = np.take_along_axis(ranked, count // 2, axis=0)
-    result: NDArray[np.float32] = (low[0] + high[0]) / 2
+    lower_middle = np.take_along_axis(sorted_values, (count - 1) // 2, axis=0)
+    upper_middle = np.take_along_axis(sorted_values, count // 2, axis=0)
+    result: NDArray[np.float32] = (lower_middle[0] + upper_middle[0]) / 2
     return result
 
 

@@ -200,7 +200,14 @@ class BallScene:
         radius: float,
         rng: np.random.Generator,
     ) -> None:
-        """Render the background once, and create the ball's mesh."""
+        """Render the background once, and create the ball's mesh.
+
+        Args:
+            camera: Camera that does not move.
+            appearance: Colours, light and noise of the pictures.
+            radius: Radius of the ball in m.
+            rng: Random generator of the noise.
+        """
         self.camera = camera
         self.appearance = appearance
         self.radius = radius
@@ -233,7 +240,11 @@ class BallScene:
         return (self.render_frame(np.asarray(position, dtype=np.float64)) for position in positions)
 
     def render_frame(self, position: Array) -> RgbImage:
-        """Render a frame with the ball's centre at `position` (3,), m."""
+        """Render a frame with the ball's centre at `position` (3,), m.
+
+        Returns:
+            Picture (height, width, 3) with shadow, ball and noise.
+        """
         picture = self._background.copy()
         # The shadow comes first, because the ball may hide a part of it.
         self._cast_shadow(picture, position)
@@ -251,7 +262,13 @@ class BallScene:
         )
 
     def _create_body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
-        """Create a body that is only drawn; `size` are the arguments of Bullet's shape."""
+        """Create a body that is only drawn; `size` are the arguments of Bullet's shape.
+
+        Args:
+            shape: Bullet's constant of the shape, such as `GEOM_BOX`.
+            colour: Red, green and blue, 0 to 1.
+            size: Arguments of Bullet's shape, such as `halfExtents`.
+        """
         pybullet = bullet_world.import_pybullet()
         visual = pybullet.createVisualShape(
             shape,
@@ -264,10 +281,13 @@ class BallScene:
         return body
 
     def _compute_view_directions(self) -> Array:
-        """Return the viewing direction of each pixel as world vectors (height, width, 3)."""
+        """Return the viewing direction of each pixel as world vectors (height, width, 3).
+
+        The vectors have length 1 along the camera's forward axis, not unit length.
+        """
         v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
         right, down, forward = self.camera.axes
-        # Equation (2) of sims.vision.pinhole_camera at depth 1, inverted
+        # Inverse of the projection u = middle_u + focal a / depth, at depth 1 (likewise v with b).
         middle_u, middle_v = self.camera.principal_point
         a = (u - middle_u) / self.camera.focal
         b = (v - middle_v) / self.camera.focal

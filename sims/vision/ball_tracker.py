@@ -486,7 +486,14 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
 
 
 def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
-    """Return the sum over frames of the best circle's fraction of agreeing rays."""
+    """Return the sum over frames of the best circle's fraction of agreeing rays.
+
+    It decides between background models: with the better one, outlines of the ball are rounder.
+
+    Args:
+        pictures: Detections in each frame; ghosts (traces of the ball in the background) do not
+            count.
+    """
     return sum(
         max(
             (detection.ray_agreement for detection in detections if not detection.is_ghost),

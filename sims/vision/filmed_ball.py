@@ -80,7 +80,15 @@ class FilmedBall(Simulator):
         film: str = "projected",
         **settings: Any,
     ) -> None:
-        """Create the simulator of the ball, and check that its film can be tracked."""
+        """Create the simulator of the ball, and check that its film can be tracked.
+
+        Args:
+            constants: Constants of ball and camera that differ from their defaults.
+            observe: Names of the observed channels; all if None.
+            film: "projected": the ball's centre is projected by the camera model; "tracked": a film
+                is rendered and tracked.
+            settings: Settings of the simulator of the ball, such as its engine.
+        """
         super().__init__(constants, observe)
         if film not in FILM_MODES:
             raise InputError(
@@ -94,7 +102,7 @@ class FilmedBall(Simulator):
         self._ball = Ball(
             self._select_ball_constants(self.constant_values), ["x", "y", "z"], **settings
         )
-        # with the coefficients of effects that are not fixed
+        # The parameters include the coefficients of effects that are not fixed.
         self.parameters = self._ball.parameters
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:

@@ -161,7 +161,12 @@ class VideoFile:
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        """Check the frame rate, and that the file can be opened as a video."""
+        """Check the frame rate, and that the file can be opened as a video.
+
+        Args:
+            path: Video file.
+            fps: Frames per second; None for the time stamps of the file.
+        """
         require_file(path)
         if fps is not None and not _FRAME_RATE_RANGE[0] <= fps <= _FRAME_RATE_RANGE[1]:
             expected = f"more than 0, from {_FRAME_RATE_RANGE[0]:g} to {_FRAME_RATE_RANGE[1]:g}"

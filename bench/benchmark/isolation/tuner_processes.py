@@ -71,7 +71,14 @@ class LockedFolder(NamedTuple):
 
 
 def create_locked_folder() -> LockedFolder:
-    """Create a new locked folder."""
+    """Create a new locked folder.
+
+    The lock shows other processes that the folder is in use; folders of ended processes are removed
+    first.
+
+    Returns:
+        The folder and its open lock, which is held until the process ends.
+    """
     remove_stale_folders()
     while True:
         path = tempfile.mkdtemp(prefix=_FOLDER_PREFIX)

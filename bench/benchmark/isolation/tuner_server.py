@@ -167,7 +167,14 @@ def load_class(description: dict[str, Any], base: type[Any] = Tuner) -> type[Any
 
 
 def _load_plugin_file(path: str) -> Any:
-    """Execute a plugin file as a module, and return the module."""
+    """Execute a plugin file as a module, and return the module.
+
+    Args:
+        path: Path of a Python file that defines a tuner.
+
+    Returns:
+        The module, named after the file with the prefix `simgap_plugin_`.
+    """
     stem = os.path.splitext(os.path.basename(path))[0]
     spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
     if spec is None or spec.loader is None:

@@ -307,7 +307,14 @@ class Experiment:
         self._check_calibration(subject)
 
     def _check_calibration(self, subject: str) -> None:
-        """Raise an error if the calibration has no runs to fit, or is not applicable."""
+        """Raise an error if the calibration has no runs to fit, or is not applicable.
+
+        The table [calibration] has runs of the true system to which the simulator is fitted first;
+        `held_out` of them are not used in the fit.
+
+        Args:
+            subject: Name of the experiment's file for the message.
+        """
         if self.calibration is None:
             return
         runs, held_out = self.calibration.runs, self.calibration.held_out
@@ -319,7 +326,11 @@ class Experiment:
             raise InputError(f"{subject}: [calibration] needs simulated targets, and no shot")
 
     def _check_words(self, subject: str) -> None:
-        """Raise an error for texts that do not fit into figures, tables or paths."""
+        """Raise an error for texts that do not fit into figures, tables or paths.
+
+        Args:
+            subject: Name of the experiment's file for the message.
+        """
         check_text(subject, "title", self.title)
         check_text(subject, "says", self.says, max_length=MAX_DESCRIPTION_LENGTH)
         check_text(subject, "identifiable", self.identifiable, max_length=MAX_DESCRIPTION_LENGTH)
@@ -335,7 +346,11 @@ class Experiment:
             check_text(subject, "tuners: label", entry.label, max_length=MAX_NAME_LENGTH)
 
     def _check_numbers(self, subject: str) -> None:
-        """Raise an error for numbers that are not finite or out of range."""
+        """Raise an error for numbers that are not finite or out of range.
+
+        Args:
+            subject: Name of the experiment's file for the message.
+        """
         if not 0 <= check_finite(subject, "negligible_error", self.negligible_error) < 1:
             expected = "a share of the training range, from 0 to below 1"
             raise make_error(subject, "negligible_error", expected, self.negligible_error)
@@ -365,7 +380,10 @@ class Experiment:
                     check_finite(subject, f"{table_name}.{name}", end)
 
     def document(self) -> dict[str, Any]:
-        """Return the whole configuration as TOML tables, the inverse of `parse_experiment`."""
+        """Return the whole configuration as TOML tables, the inverse of `parse_experiment`.
+
+        Keys without a value are left out, as are rare keys at their default.
+        """
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
         for rare in _RARE_KEYS:

@@ -56,6 +56,9 @@ class InformationSpectrum:
         """Cramer-Rao bound (dim,) along each direction, in training ranges.
 
         It is the smallest standard deviation of any unbiased estimate, and may be infinite.
+
+        With the eigenvalue lambda_k of the Fisher information along direction k, sigma_k = 1 /
+        sqrt(lambda_k) (3).
         """
         with np.errstate(divide="ignore"):  # an eigenvalue may be zero
             sigmas: Array = 1.0 / np.sqrt(self.values)  # (3)
@@ -101,6 +104,9 @@ def compute_spectrum(
 
     A sample that is missing (NaN) in a simulation near the true parameters contributes no
     information about the changed parameter.
+
+    The Jacobian is J_nk = (d y_n / d theta_k) / sigma_n (1), for sample n and parameter k in units
+    of its training range.
 
     Args:
         simulate: parameters (n, dim) in physical units -> observations (n, T, C).

@@ -136,7 +136,14 @@ def _explain_missing_simulator(experiment: Experiment) -> str:
 
 
 def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
-    """Return the data set that an experiment needs and that is missing here."""
+    """Return the data set that an experiment needs and that is missing here.
+
+    Args:
+        experiment: Experiment that may name a model file and a recording.
+
+    Returns:
+        The first data set of the catalogue that has a missing file; None if all files exist.
+    """
     required_files = [("robot", experiment.model)] if experiment.model else []
     if experiment.recording:
         required_files.append(("recording", experiment.recording.path))

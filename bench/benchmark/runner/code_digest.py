@@ -93,7 +93,14 @@ def _convert_for_json(value: Any) -> Any:
 
 @cache
 def hash_source_folders(which: tuple[str, ...] = ()) -> str:
-    """Hash every file of some source folders; those that determine runs if none are given."""
+    """Hash every file of some source folders; those that determine runs if none are given.
+
+    Args:
+        which: Folders relative to the project; `COMPARISON_SOURCE_FOLDERS` if empty.
+
+    Returns:
+        Digest of the version and of all files, which changes with any line of code.
+    """
     return compute_digest(
         __version__,
         [
@@ -273,7 +280,11 @@ def _represent_class(kind: type) -> Any:
 
 
 def _read_class_source(kind: type) -> str:
-    """Return the source of a class of a notebook cell or of the main script."""
+    """Return the source of a class of a notebook cell or of the main script.
+
+    Args:
+        kind: Class whose source determines results and is therefore hashed.
+    """
     try:
         return inspect.getsource(kind)
     except (OSError, TypeError):
@@ -327,7 +338,11 @@ def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
 
 
 def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
-    """Return all effect names in settings, also those that a plugin may define later."""
+    """Return all effect names in settings, also those that a plugin may define later.
+
+    Args:
+        settings: Tables of an experiment's simulator, with `effects` and `fixed` effects by name.
+    """
     names: set[str] = set()
     for table in settings:
         for key in ("effects", "fixed"):

@@ -88,7 +88,14 @@ class _Experiment:
 
 
 def _count_simulated_samples(problem: TuningProblem) -> tuple[int, float]:
-    """Return the numbers of samples and of time steps that one evaluation simulates."""
+    """Return the numbers of samples and of time steps that one evaluation simulates.
+
+    Args:
+        problem: Tuning problem with its simulator, true system and data.
+
+    Returns:
+        The samples of all runs, and the time steps at the smaller step of both simulators.
+    """
     experiment = problem.experiment
     step = min(map(get_max_step, (problem.simulator, problem.world)))
     if problem.recording:

@@ -76,7 +76,11 @@ class ClusterPool:
     """
 
     def __init__(self, address: str) -> None:
-        """Connect to the scheduler, and check that the workers have the code of this process."""
+        """Connect to the scheduler, and check that the workers have the code of this process.
+
+        Args:
+            address: Address of the Dask scheduler, such as "tcp://host:8786".
+        """
         try:
             from distributed import Client
         except ImportError:
@@ -365,11 +369,17 @@ def _write_plugin_file(plugin: Plugin, content: bytes) -> Plugin:
 
 
 def _write_hashed_folder(files: FileContents) -> Path:
-    """Write files into a folder of this machine that is named by their hash; return the folder."""
+    """Write files into a folder of this machine that is named by their hash; return the folder.
+
+    Equal files give the same folder, so that each worker writes them only once.
+
+    Args:
+        files: Names and contents of the files.
+    """
     hashed = hashlib.sha256()
     for name, content in files:
         hashed.update(name.encode() + hashlib.sha256(content).digest())
-    place = Path(tempfile.gettempdir()) / f"simgap-{hashed.hexdigest()[:16]}"
+    folder = Path(tempfile.gettempdir()) / f"simgap-{hashed.hexdigest()[:16]}"
     for name, content in files:
-        _write_if_absent(place / name, content)
-    return place
+        _write_if_absent(folder / name, content)
+    return folder

@@ -142,7 +142,11 @@ class ExperimentRun:
         ]
 
     def build_skipped_rows(self) -> list[dict[str, Any]]:
-        """Return rows of status.csv for tuners that could not be used."""
+        """Return rows of status.csv for tuners that could not be used.
+
+        A tuner is skipped if, for example, a package that it needs is not installed; it has one row
+        without a target.
+        """
         experiment = self.problem.experiment
         simulator = experiment.simulator
         common_cells = {

@@ -200,7 +200,14 @@ class RunIds:
 
 
 def _hash_target(target: BlindedTarget) -> str:
-    """Hash a target's scenarios, observations and start."""
+    """Hash a target's scenarios, observations and start.
+
+    Args:
+        target: Target as tuners see it, without its true parameters.
+
+    Returns:
+        Digest of scenarios and observations of the fitting and held-out runs, and of the start.
+    """
     run_sets = [target.fitting, target.held_out]
     scenarios = [
         [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]

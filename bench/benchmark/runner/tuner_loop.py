@@ -308,7 +308,11 @@ def _run_ask_tell_loop(
 
 
 def _close_generator(steps: TunerRun | None) -> str:
-    """Close a tuner's generator, and return the traceback of an error in it, or an empty text."""
+    """Close a tuner's generator, and return the traceback of an error in it, or an empty text.
+
+    Args:
+        steps: Generator of the tuner's run; None if it never started.
+    """
     # An object without `close` is not a generator, and has already failed with its own message.
     if steps is None or not hasattr(steps, "close"):
         return ""
@@ -398,7 +402,11 @@ class ProposalEvaluator:
         return np.array([math.sqrt(loss) if math.isfinite(loss) else math.inf])
 
     def _sum_squared_errors(self, observations: Array) -> Array:
-        """Compute sums (n, C) of squared errors over present samples, in squared channel units."""
+        """Compute sums (n, C) of squared errors over present samples, in squared channel units.
+
+        Args:
+            observations: (n, T, C) simulated channels of n proposals; overwritten.
+        """
         difference = observations - self._observed
         if self._missing is not None:
             difference[:, self._missing] = 0.0

@@ -191,7 +191,11 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     finished_count = 0
 
     def print_finished_recording(row: LogResult) -> None:
-        """Print the result of one log (recording) as soon as it is explained."""
+        """Print the result of one log (recording) as soon as it is explained.
+
+        Args:
+            row: Result of one recording: its verdict or error, its causes and the time taken.
+        """
         nonlocal finished_count
         finished_count += 1
         causes = [format_cause(cause) for cause in row.causes]

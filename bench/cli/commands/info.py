@@ -29,7 +29,11 @@ def _run_info(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 
 
 def collect_info() -> JsonDocument:
-    """Collect versions, engines, platform and paths."""
+    """Collect versions, engines, platform and paths.
+
+    Returns:
+        The document that users attach to a bug report.
+    """
     import os
     import platform
 

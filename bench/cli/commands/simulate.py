@@ -48,7 +48,11 @@ class _ValuesAction(argparse._ExtendAction):
         values: Any,
         option: str | None = None,
     ) -> None:
-        """Store the values; a last word that cannot be a value becomes the system."""
+        """Store the values; a last word that cannot be a value becomes the system.
+
+        In `simgap simulate --theta mass=1 pendulum`, argparse takes the system's name as one more
+        value of `--theta`; here it is moved to `system`.
+        """
         words = list(values)
         if len(words) > 1 and not namespace.system and not _is_value(words[-1]):
             namespace.system = words.pop()

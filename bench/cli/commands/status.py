@@ -72,7 +72,14 @@ def _print_isolation_layers(print_line: PrintLine) -> list[JsonDocument]:
 
 
 def _describe_isolation(study: Study) -> JsonDocument:
-    """Describe how the tuners of a study are isolated from the true parameters."""
+    """Describe how the tuners of a study are isolated from the true parameters.
+
+    The salt is the secret number from which targets are drawn; while it is secret, tuners cannot
+    draw them.
+
+    Args:
+        study: Study whose configuration records the active isolation layers.
+    """
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 
     configuration = study.configuration
@@ -89,7 +96,11 @@ def _describe_isolation(study: Study) -> JsonDocument:
 
 
 def _format_isolation(isolation: JsonDocument) -> str:
-    """Format the isolation of a study as text."""
+    """Format the isolation of a study as text.
+
+    Args:
+        isolation: Document of `_describe_isolation`.
+    """
     if isolation["trusted"]:
         return "trusted: its tuners run without isolation"
     missing, salt = isolation["missing"], isolation["salt_sha256"]

@@ -427,6 +427,9 @@ class ConventionComparison:
         It is that of the filter's innovations for the converted signals, corrected for the change
         of units: eq. (1) of the module docstring.
 
+        A factor k_c of channel c with N_c samples adds its Jacobian: log L(transformed y) + sum_c
+        N_c log |k_c| (1).
+
         Args:
             hypothesis: Difference between the conventions.
             recording: Recording as it is described, or with some conventions corrected.
@@ -588,7 +591,11 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
 
 
 def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
-    """Return the model file's numbers as a fit, the starting point of candidate directions."""
+    """Return the model file's numbers as a fit, the starting point of candidate directions.
+
+    Args:
+        evaluator: Run evaluator of the recording; it has the nominal parameters.
+    """
     empty = np.zeros(0)
     return TrajectoryFit(
         (),

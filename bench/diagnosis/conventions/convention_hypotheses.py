@@ -490,7 +490,14 @@ def _generate_units(
 
 
 def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
-    """Return whether all recorded values of these signals are integers, as encoder ticks are."""
+    """Return whether all recorded values of these signals are integers, as encoder ticks are.
+
+    Integers indicate raw counts, whose unit the description may have wrong.
+
+    Args:
+        signals: Signals with the gain that converts the recorded numbers to SI units.
+        recording: Recording in SI units.
+    """
     for run in recording.training():
         recorded = {**run.inputs, **run.channels}
         for signal in signals:
@@ -502,7 +509,13 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
 
 
 def _generate_late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield delays of command time stamps: the robot responds before them."""
+    """Yield delays of command time stamps: the robot responds before them.
+
+    A robot that seems to respond before a command shows that the stamps of commands are late.
+
+    Args:
+        recording: Recording whose sampling interval is the unit of the delays.
+    """
     run = recording.runs[0]
     if not run.inputs or run.times.size < 2:
         return

@@ -281,7 +281,14 @@ class Subject:
         return self.recording.path.with_suffix(".toml").name
 
     def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
-        """Return the recorded signals with the units that the description specifies."""
+        """Return the recorded signals with the units that the description specifies.
+
+        Args:
+            channels: Names of the recorded channels.
+
+        Returns:
+            Channels, then inputs, with declared unit, recorded unit and conversion factors.
+        """
         try:
             conversions = stated_columns(self.recording.path, self.kind)
         except InputError:
@@ -720,6 +727,9 @@ def _test_distinctness(
     subject: Subject, hypothesis: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
     """Test whether a hypothesis is distinct from nearby factors, the second half of (1).
+
+    With the excess residual e(k) at factor k, the condition is e(k) < e(k / STEP) and e(k) < e(k
+    STEP), part of (1).
 
     Args:
         subject: Recording and simulator to check.

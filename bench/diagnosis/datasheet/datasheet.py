@@ -86,7 +86,11 @@ def render_page(
 
 
 def _describe_rest_forces(diagram: DriveDiagram) -> str:
-    """Describe the forces at rest in a sentence."""
+    """Describe the forces at rest in a sentence.
+
+    Args:
+        diagram: Drive diagram; its back-drive load is infinite if the joint is self-locking.
+    """
     starts = append_unit(format_number(diagram.breakaway), diagram.unit)
     text = f"At rest and without a load, the joint starts to move at {starts}. "
     if diagram.backdrive < float("inf"):

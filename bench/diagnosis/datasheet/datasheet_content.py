@@ -76,7 +76,10 @@ class SheetRow:
     strongest: bool = False
 
     def to_document(self) -> dict[str, Any]:
-        """Return the row as TOML data, which has no null."""
+        """Return the row as TOML data, which has no null.
+
+        Keys without a value are left out.
+        """
         row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
         row["part"] = self.part
         if self.number is not None:
@@ -158,7 +161,11 @@ class _Rows:
             yield replace(row, strongest=derived.strongest)
 
     def parameters(self) -> Iterator[SheetRow]:
-        """Yield the parameters of the system, or the free numbers of the robot's file here."""
+        """Yield the parameters of the system, or the free numbers of the robot's file here.
+
+        Of a robot, the names have the form ``effect@place``, or ``effect@place.coefficient`` for
+        one of several coefficients; only places of this joint are shown.
+        """
         if not self.subject.joint:
             for parameter in self.subject.kind.parameters:
                 nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
@@ -192,7 +199,10 @@ class _Rows:
                 yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
-        """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
+        """Yield the diagnosed causes; members of a family that may be zero here are not shown.
+
+        A cause at all places of a kind (a family) is resolved to the place of this joint.
+        """
         for name, coefficients in self.extended.effects.items():
             local_coefficients = list(self.subject.localise_effect(name, coefficients))
             for effect, coefficient, fitted_value in local_coefficients:
@@ -259,7 +269,10 @@ class _Rows:
         )
 
     def absent(self) -> Iterator[SheetRow]:
-        """Yield the effects that are not in the model, with their detection limits."""
+        """Yield the effects that are not in the model, with their detection limits.
+
+        The detection limit is the smallest size that the data would have revealed.
+        """
         for (effect, coefficient), detection_limit in self.detection_limits.limits.items():
             has_several = len({c for e, c in self.detection_limits.limits if e == effect}) > 1
             label = f"{effect} {coefficient}" if has_several else effect
@@ -396,6 +409,10 @@ NAMES_IN_TERMINAL = 5
 """Maximum number of effects that the terminal names as not shown by the data."""
 
 
+MAX_LINE_NAME_LENGTH = 80
+"""Maximum number of characters of a name in the text of a sheet."""
+
+
 @dataclass(frozen=True)
 class SheetContent:
     """Content of a data sheet.
@@ -417,7 +434,10 @@ class SheetContent:
     rows: tuple[SheetRow, ...]
 
     def document(self) -> dict[str, Any]:
-        """Return the content of sheet.toml."""
+        """Return the content of sheet.toml.
+
+        `quantities` has one table per row; the diagram, or the friction at rest, follows.
+        """
         rows_by_name = {row.name: row.to_document() for row in self.rows}
         joint = {"joint": self.subject.joint} if self.subject.joint else {}
         return {
@@ -492,10 +512,10 @@ class SheetContent:
 
     def lines(self) -> list[str]:
         """Format the sheet as text: numbers first, then the effects that are not shown."""
-        lines = [f"{sanitise(self.name, 80)}: {self.verdict.verdict}"]
+        lines = [f"{sanitise(self.name, MAX_LINE_NAME_LENGTH)}: {self.verdict.verdict}"]
         identified = [row for row in self.rows if row.number is not None]
         lines += [
-            f"  {sanitise(r.name, 60)} = {format_fitted_value(r.number)}"
+            f"  {sanitise(r.name, MAX_LINE_NAME_LENGTH)} = {format_fitted_value(r.number)}"
             for r in identified
             if r.number
         ]
@@ -590,7 +610,14 @@ def format_evidence(row: SheetRow, is_short: bool = False) -> str:
 
 
 def format_detection_limit(row: SheetRow) -> str:
-    """Format in words how large an absent effect could be without being detected."""
+    """Format in words how large an absent effect could be without being detected.
+
+    Args:
+        row: Row of an effect that is not in the model.
+
+    Returns:
+        Text such as "0 ± 0.02 N·m": a coefficient in this range would not have been detected.
+    """
     detection_limit = row.detection_limit
     if detection_limit is None or detection_limit.size == float("inf"):
         return "none: the data do not depend on it"

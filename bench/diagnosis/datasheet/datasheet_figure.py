@@ -140,7 +140,14 @@ def render_pdf(content: SheetContent) -> bytes:
 
 
 def draw_sheet(content: SheetContent) -> Figure:
-    """Draw the sheet as a figure of one page."""
+    """Draw the sheet as a figure of one page.
+
+    From top to bottom, it has a heading, the table of numbers, the drive diagram or the reason why
+    there is none, and the table of absent effects.
+
+    Args:
+        content: Content of the data sheet.
+    """
     from bench.figures.notebook_figure import NotebookFigure
 
     figure = NotebookFigure(figsize=A4_INCHES, layout=None)

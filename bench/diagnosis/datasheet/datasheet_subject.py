@@ -36,7 +36,14 @@ class ModelFileValue(NamedTuple):
     share: bool
 
     def compute_total(self, number: FittedValue) -> FittedValue:
-        """Return the value of the model file with an effect's coefficient applied."""
+        """Return the value of the model file with an effect's coefficient applied.
+
+        For example, a mass of 2 kg in the file with the coefficient 0.1 of ``mass.scale`` is 2.2
+        kg; the interval is transformed likewise.
+
+        Args:
+            number: Fitted coefficient with its 95 % interval.
+        """
         low, high = number.low, number.high
         if low is None or high is None:
             return FittedValue(self._add_correction(number.value), self.unit, None, None)

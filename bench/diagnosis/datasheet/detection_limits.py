@@ -175,7 +175,15 @@ def compute_detection_limits(
 def _compute_prediction_half_widths(
     consistencies: Sequence[ParameterConsistency],
 ) -> dict[str, float]:
-    """Return half the prediction interval of each parameter for a new log, or else a new run."""
+    """Return half the prediction interval of each parameter for a new log, or else a new run.
+
+    Prediction intervals have the variation between logs (or runs) in them, in addition to the error
+    of the joint fit.
+
+    Args:
+        consistencies: Consistency of each parameter between runs, and between logs if there are
+            several.
+    """
     by_run = {
         consistency.number: Z95 * consistency.prediction_sigma
         for consistency in consistencies
@@ -363,6 +371,9 @@ class _DetectionLimitCalculator:
 
         The limit is half the 95 % interval, 1.96 / sqrt(power) with the power of eq. (1). It is
         infinite if the data contain no information on the coefficient.
+
+        With d the whitened derivatives by the coefficient and A those by the parameters, the
+        information is power = d'd - d'A (A'A)^-1 A'd (1).
         """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
@@ -385,7 +396,18 @@ class _DetectionLimitCalculator:
         return self.evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
 
     def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
-        """Return the parameters of the model that together have nearly the same influence."""
+        """Return the parameters of the model that together have nearly the same influence.
+
+        Without the parameters, the information on coefficient k would be `products[i, i]`; with
+        them only `powers[k]` remains. If the share that remains is above 1 -
+        `CONFOUNDING_CORRELATION`^2, nothing is confounded with it.
+
+        Args:
+            k: Index of the candidate coefficient.
+
+        Returns:
+            Names in descending order of their contribution.
+        """
         i = self.q + k
         if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.products[i, i]:
             return ()

@@ -95,7 +95,10 @@ class DriveDiagram:
     without: tuple[str, ...] = ()
 
     def to_document(self) -> dict[str, Any]:
-        """Return the diagram with the names of its laws as TOML data."""
+        """Return the diagram with the names of its laws as TOML data.
+
+        The curves are thinned to every tenth part of their points.
+        """
         return {
             "unit": self.unit,
             "laws": list(self.laws),
@@ -111,6 +114,9 @@ def compute_drive_diagram(
     subject: SheetSubject, extended: ExtendedSimulator, force_limit: float | None
 ) -> DriveDiagram:
     """Compute the diagram of a joint.
+
+    With the motor's force U, the load P, all other forces f at rest and the friction limit F, the
+    joint moves forward if U - P + f > F(U, P) (1), and back if U - P + f < -F(U, P) (2).
 
     Args:
         subject: Joint or system.

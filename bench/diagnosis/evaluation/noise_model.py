@@ -77,6 +77,9 @@ def _has_predecessor(observed_mask: Mask) -> Mask:
 def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
     """Whiten values with AR(1) noise, by eq. (2) of the module docstring.
 
+    With the residual e_t, w_t = (e_t - phi e_{t-1}) / (sigma sqrt(1 - phi^2)); a sample without a
+    predecessor has w_t = e_t / sigma (2).
+
     Args:
         values: (R, T, C, ...) noise, or derivatives of noisy signals, because whitening is linear.
         observed_mask: (R, T, C) mask of available samples; the others become zero.
@@ -179,6 +182,9 @@ def _maximise_channel_likelihood(
 
     The variance is estimated with the remaining degrees of freedom. The likelihood counts all
     samples, because Schwarz's criterion has a separate penalty for fitted parameters.
+
+    With n samples, m of them with a predecessor, and the mean square v of the whitened values for
+    sigma = 1, 2 log L = -n log v - m log(1 - phi^2) - n (4).
 
     Args:
         residual: (R, T, 1) residual.

@@ -194,6 +194,8 @@ class _ReferenceMotions:
 
         A motion has converged if halving the time step hardly changes it. RK4 is tried first; for
         stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
+
+        The extrapolation (Richardson) from step sizes h and h / 2 is q = 2 q(h / 2) - q(h) (1).
         """
         for division in (1, 2, 5):
             coarse, refined = (

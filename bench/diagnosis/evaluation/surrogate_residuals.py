@@ -95,6 +95,8 @@ def _simulate_autoregression(
 ) -> Array:
     """Simulate autoregressions, eq. (1), with resampled innovations of a residual.
 
+    The process is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and innovations u_t.
+
     Args:
         residual: (R, T, C) residual.
         observed_mask: (R, T, C) mask of available samples.
@@ -130,6 +132,9 @@ def _simulate_autoregression(
 def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) -> Array:
     """Correct weights (p,) for the bias of a fit, by eq. (2) of the module docstring.
 
+    With the weights a* estimated from surrogates of a, the corrected weights are a + s (a - a*)
+    (2), where s <= 1 keeps the process stationary.
+
     Args:
         weights: (p,) weights of an autoregression.
         projected_pilots: (count, R, T) residuals of the fit to noise with these weights.
@@ -155,6 +160,8 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     """Turn innovations (T, ...) into autocorrelated noise by the autoregression (1), in place.
 
     `weights` (p,) has the a_k; without weights the noise stays white.
+
+    The autoregression is e_t = sum_k a_k e_{t-k} + u_t (1).
     """
     order = weights.size
     if not order:
@@ -171,6 +178,8 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
 
 def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> Array:
     """Fit an autoregression by the Yule-Walker equations, with the order of Akaike's criterion.
+
+    The model is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and independent u_t.
 
     Args:
         values: (R, T) residual of one channel.
@@ -246,6 +255,8 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
 
     Times at which one of the required samples is missing are left out.
+
+    The innovations are u_t = e_t - sum_k a_k e_{t-k}, from (1).
 
     Args:
         filled: (R, T) residual of one channel, zero where it is not recorded.

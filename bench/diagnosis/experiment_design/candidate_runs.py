@@ -287,7 +287,14 @@ class RigModel:
                     yield RunPlan(input_groups, form, size)
 
     def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
-        """Yield variants of a plan with one property changed, to improve the best plans."""
+        """Yield variants of a plan with one property changed, to improve the best plans.
+
+        Properties are initial states, constants, offset and size of the commands, and the time for
+        which a command is held.
+
+        Args:
+            plan: Plan of a run.
+        """
         for name, value in self._iterate_initial_states():
             yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
         for name, values in self._list_adjustable_constants().items():
@@ -335,7 +342,10 @@ class RigModel:
                 yield name, value
 
     def _list_adjustable_constants(self) -> dict[str, list[float]]:
-        """Return the constants that differ between runs, with their values, which are available."""
+        """Return the constants that differ between runs, with their values, which are available.
+
+        A constant that has had several values, such as a load, can be set by the experimenter.
+        """
         values: dict[str, set[float]] = {}
         for run in self.evaluator.runs:
             for name, value in run.constants.items():
@@ -349,7 +359,14 @@ class RigModel:
     # -- runs
 
     def make_run(self, plan: RunPlan) -> CandidateRun:
-        """Turn a plan into a run that can be simulated: commands, constants and initial state."""
+        """Turn a plan into a run that can be simulated: commands, constants and initial state.
+
+        Commands that exceed the limits of an input are clipped, and the description says so.
+
+        Args:
+            plan: Plan of the run: form, size and offset of the commands, held time, constants and
+                initial states.
+        """
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
             name: self._limit_command(name, np.full(times.size, self.median_commands[name]))

@@ -242,7 +242,11 @@ def _clip(values: Any, limits: Interval | None) -> Any:
 
 
 def _lengthen_run(first: _Run) -> _Run:
-    """Return the run recorded for twice the time, with its inputs repeated from the beginning."""
+    """Return the run recorded for twice the time, with its inputs repeated from the beginning.
+
+    Args:
+        first: Run to lengthen.
+    """
     times = first.scenario.times
     later_times = times[1:] - times[0]
     doubled_times = np.concatenate([times, times[-1] + later_times])
@@ -337,7 +341,11 @@ def _compute_largest_factor(signal: Array, limits: Interval) -> float:
 
 
 def _list_state_units(evaluator: RunEvaluator) -> list[str]:
-    """List the units of the states: coordinates, their rates, and further states."""
+    """List the units of the states: coordinates, their rates, and further states.
+
+    Args:
+        evaluator: Run evaluator of the system.
+    """
     system = evaluator.simulator.system
     units = {channel.name: channel.unit for channel in evaluator.kind.channels}
     coordinate_units = [units.get(name, "m") for name in system.coordinates]
@@ -358,6 +366,9 @@ def _compute_discrimination(
     """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
 
     The larger it is, the more clearly the run shows which model is right.
+
+    It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2) (1), in standard
+    deviations of the noise.
 
     Args:
         evaluator: run evaluator that simulates the run.

@@ -156,6 +156,9 @@ class RunRanker:
 
         They are ordered by the linearised discrimination T, or with one model by the information
         gain D: eqs. (1) and (2) of the module docstring.
+
+        If models compete, the value is their discrimination (1); otherwise it is the information
+        gain about uncertain parameters (2). Both are defined in the module docstring.
         """
         diagnosed_model = self.information[0].model
         allowed_runs = [
@@ -202,7 +205,14 @@ class RunRanker:
         return RunValue(run, values, _sum_discrimination(values))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
-        """Compute the discrimination T exactly, as the competing model may be far from linear."""
+        """Compute the discrimination T exactly, as the competing model may be far from linear.
+
+        Each model of a pair is taken as true in turn. A run that violates a limit under any model
+        has the value zero.
+
+        Args:
+            entry: Candidate run with its linearised value.
+        """
         if not self.pairs:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
@@ -312,6 +322,10 @@ class RunRanker:
         The prediction of the model `true_model` takes the place of the recording. The fit of
         `competing_model` by Levenberg-Marquardt may move its parameters as far as the present data
         allow.
+
+        It is T = min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta (1), with the
+        difference d of two models, the derivatives J by parameters and B by the initial state, and
+        the covariance C of the parameters.
         """
         fit = competing_model.model.fit
         simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
@@ -400,6 +414,8 @@ def _compute_remaining_difference(
 ) -> tuple[float, Array, Array]:
     """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
+    It is min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta (1), in whitened units.
+
     Args:
         gap: (n,) residual of the competing model.
         slopes: Linearisation of the competing model.
@@ -423,6 +439,9 @@ def _compute_remaining_difference(
 
 def _compute_information_gain(slopes: _LinearisedRun, information: _ParameterInformation) -> float:
     """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty.
+
+    It is D = 1/2 log det(I + C J' (I - B B^+) J) (2), with the derivatives J by parameters and B by
+    the initial state, and the covariance C of the parameters.
 
     Args:
         slopes: the run, linearised by parameters and initial states.

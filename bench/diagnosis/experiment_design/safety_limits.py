@@ -55,7 +55,14 @@ class RigLimits:
     """
 
     def __init__(self, evaluator: RunEvaluator, model: FittedModel) -> None:
-        """Simulate the present runs with the fitted model, and derive the channel limits."""
+        """Simulate the present runs with the fitted model, and derive the channel limits.
+
+        A proposed run may not exceed these limits by far, so that it is safe on the real system.
+
+        Args:
+            evaluator: Run evaluator of the recording.
+            model: Fitted model.
+        """
         self.evaluator = evaluator
         self.past = self._simulate_monitored_channels(
             model,
@@ -87,7 +94,11 @@ class RigLimits:
 
     @cached_property
     def monitored_channels(self) -> list[str]:
-        """Names of the monitored channels."""
+        """Names of the monitored channels.
+
+        For a robot they are positions, velocities and forces of joints; otherwise coordinates,
+        rates and observed channels.
+        """
         kind = self.evaluator.kind
         if not kind.has_model:
             monitored_names = {

@@ -151,7 +151,12 @@ class ModelSet:
         return self.models[key]
 
     def _rate_fit(self, fit: TrajectoryFit) -> FittedModel:
-        """Return a fit with its likelihood and its penalised log-likelihood, eq. (1)."""
+        """Return a fit with its likelihood and its penalised log-likelihood, eq. (1).
+
+        The merit is M = 2 log L - k log n - sum_e max(c_e - k_e log n, 0) (1), with the likelihood
+        L, k parameters, n samples, and for each effect e its k_e coefficients and the gain c_e of
+        its best shape under the null hypothesis.
+        """
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = FAILED_LIKELIHOOD
@@ -197,6 +202,9 @@ class ModelSet:
 
         An effect with many shapes gains likelihood from noise alone. The part of this gain that the
         penalty of its coefficients does not cover is subtracted.
+
+        It is the term max(c_e - k_e log n, 0) of (1), with k_e coefficients and the gain c_e that
+        the best shape has under the null hypothesis.
         """
         coefficients = self.evaluator.coefficient_slices[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null

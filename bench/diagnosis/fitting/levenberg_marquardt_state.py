@@ -318,6 +318,9 @@ class FitState:
 
         The update is eq. (4) of the module docstring.
 
+        For a step delta with scales D, J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 /
+        (delta' D^-2 delta) (4).
+
         Args:
             new_point: the point that the step has reached.
         """
@@ -356,6 +359,9 @@ class FitState:
     def accept_step(self, decrease: float, cost: float, is_own_jacobian: bool) -> None:
         """Update the damping and the convergence state after an accepted step.
 
+        With the gain ratio rho, the damping becomes lambda max(0.1, 1 - (2 rho - 1)^3), and its
+        growth factor nu = 2 (2).
+
         Args:
             decrease: decrease of the cost.
             cost: new cost.
@@ -385,6 +391,8 @@ class FitState:
 
         If the derivatives belong to another point, they may have caused the bad step, so they are
         recomputed first. A fit with a rough cost ends if it can hardly gain anything.
+
+        The damping becomes 2 nu lambda, and its growth factor 2 nu (3).
         """
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True

@@ -81,6 +81,9 @@ class _ArrowheadEquations:
     def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
         """Solve the normal equations by the Schur complement, eqs. (4) and (5).
 
+        Parameters follow from the Schur complement (U - sum W_i V_i^-1 W_i') dx = a - sum W_i
+        V_i^-1 b_i (4), the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx (5).
+
         Args:
             blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
 
@@ -118,6 +121,8 @@ class _ArrowheadEquations:
 
 def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
     """Eliminate the initial states of every run from the normal equations.
+
+    The result is U - sum_i W_i V_i^-1 W_i' and a - sum_i W_i V_i^-1 b_i, both sides of (4).
 
     Args:
         shared: (q, q) U.
@@ -197,6 +202,9 @@ def _assemble_normal_equations(
 ) -> _ArrowheadEquations:
     """Build the normal equations, eqs. (2) and (3), of all runs, without damping.
 
+    They are U dx + sum_i W_i dz_i = a (2) and W_i' dx + V_i dz_i = b_i (3), for parameters x and
+    the initial state z_i of each run.
+
     Args:
         j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
         r: (R, n) whitened residuals.
@@ -253,6 +261,9 @@ def _predict_decrease(
     """Return the decrease of the cost by a step if the residual were linear, eq. (6).
 
     The damping is adapted to how well the actual decrease agrees with it.
+
+    It is sum |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 + sum |d_i|^2 - |d_i + dz_i / pi|^2 (6), with
+    residuals r_i and normalised deviations d_i of the initial states from their prior.
 
     Args:
         j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.

@@ -64,7 +64,14 @@ def make_segment_evaluator(evaluator: RunEvaluator) -> RunEvaluator | None:
 
 
 def _split_run(run: Run) -> list[Run]:
-    """Split a run into segments of equal length, or return it whole if one is too sparse."""
+    """Split a run into segments of equal length, or return it whole if one is too sparse.
+
+    Args:
+        run: Recorded run.
+
+    Returns:
+        At most `SEGMENTS_PER_RUN` segments, each with its own initial state in a fit.
+    """
     # A time counts as sampled if any channel has a sample.
     values = np.stack(list(run.channels.values()))
     is_sampled: Mask = np.any(np.isfinite(values), axis=0)

@@ -369,7 +369,11 @@ class TrajectoryFitter:
             self._move_to_point(fit_state, point)
 
     def _create_fit_state(self, start: FitStart) -> FitState:
-        """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
+        """Create the state of a new fit: fitted parameters, their bounds and difference steps.
+
+        Args:
+            start: Effects, theta and initial states from which the fit begins.
+        """
         evaluator = self.evaluator
         bounds: dict[int, tuple[float, float]] = {}
         if self.fits_parameters:

@@ -325,7 +325,14 @@ def has_placed_causes(report: DiagnosisReportData) -> bool:
 
 
 def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
-    """List the diagnosed places, to be marked on the robot."""
+    """List the diagnosed places, to be marked on the robot.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        One mark per place; alternatives of a cause are marked, too.
+    """
     marks: dict[tuple[str, str, str], PlaceMark] = {}
     for cause in report.verdict.causes:
         is_certain = not cause.alternatives
@@ -467,7 +474,14 @@ LONGEST_PLACE = 64
 
 
 def shorten_effect_name(effect: str) -> str:
-    """Format an effect for a list: without its article, and without the kind of its place."""
+    """Format an effect for a list: without its article, and without the kind of its place.
+
+    Args:
+        effect: Name such as ``friction.coulomb@elbow``.
+
+    Returns:
+        Text such as "Coulomb friction at elbow".
+    """
     effect_name, place = split_effect_name(effect)
     if not place:
         return format_effect_name(effect)

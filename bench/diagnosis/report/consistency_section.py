@@ -288,7 +288,14 @@ class AgreementRow(NamedTuple):
 
 
 def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
-    """Build the rows of the table, the least consistent number first."""
+    """Build the rows of the table, the least consistent number first.
+
+    Each row has a parameter, its joint estimate, the interval expected for a further group, and the
+    estimates of all groups drawn on one line.
+
+    Args:
+        report: Data of the report, with the consistency of the extended model.
+    """
     rows = []
     for spread in sorted(report.consistency.after, key=lambda spread: spread.p_value):
         halves = [(part.value, Z95 * part.error) for part in spread.group_estimates]
@@ -326,7 +333,14 @@ def _format_interval(spread: ParameterConsistency, error: float) -> str:
 
 
 def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ...]]:
-    """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals."""
+    """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals.
+
+    Each parameter has a row "all" for the joint fit, one for each group of runs, and a row
+    "another" with the prediction interval of a further group.
+
+    Args:
+        report: Data of the report, with the consistency of the base and the extended model.
+    """
     models = [("base", report.consistency.before)]
     if report.verdict.causes:
         models.append(("extended", report.consistency.after))

@@ -55,7 +55,11 @@ def format_effect(effect: str) -> str:
 
 
 def _format_effect_as_noun(name: str) -> str:
-    """Format one effect as a noun with its place, or by its name and description without a noun."""
+    """Format one effect as a noun with its place, or by its name and description without a noun.
+
+    Args:
+        name: Name of an effect, such as ``friction.coulomb@elbow``.
+    """
     base, place = split_effect_name(name)
     if base in NUMERICS_NAMES:
         return NUMERICS_NAMES[base]
@@ -91,7 +95,14 @@ def get_place_kind(effect: str) -> str:
 
 
 def is_parameter_error(effect: str) -> bool:
-    """Return whether the effect corrects a wrong value instead of adding a missing effect."""
+    """Return whether the effect corrects a wrong value instead of adding a missing effect.
+
+    For example, ``mass.scale`` corrects the mass of the model file, while ``drag.linear`` adds a
+    force.
+
+    Args:
+        effect: Name of the effect, with its place if it has one.
+    """
     base, place = split_effect_name(effect)
     if base in NUMERICS_NAMES:
         return True
@@ -130,7 +141,11 @@ def format_effect_name(effect: str) -> str:
 
 
 def format_sentence(text: object) -> str:
-    """Format text as a sentence, with a capital first letter and a final period."""
+    """Format text as a sentence, with a capital first letter and a final period.
+
+    Args:
+        text: Text of a file or of this project; control characters are removed.
+    """
     sanitised_text = sanitise(text)
     if not sanitised_text:
         return sanitised_text

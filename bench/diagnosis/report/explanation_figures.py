@@ -370,7 +370,13 @@ def _format_split_size(split: DataSplit) -> str:
 
 
 def _make_legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
-    """Return handles and labels of the legend, for the styles that are drawn."""
+    """Return handles and labels of the legend, for the styles that are drawn.
+
+    It explains the styles of bars: a candidate may be a cause, explained by it, or not needed.
+
+    Args:
+        report: Data of the report.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -462,7 +468,14 @@ class RenderedFigure(NamedTuple):
 
 
 def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
-    """Draw all figures and render their files, by name."""
+    """Draw all figures and render their files, by name.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        PNG, and PDF and SVG if requested, of each figure by name.
+    """
     with apply_settings(_STYLE):
         # The settings must stay active, because text is laid out again when a figure is written.
         figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
@@ -651,7 +664,15 @@ _PROFILES_AFTER = 4.1
 
 
 def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
-    """Draw the gap locations on the left, and the most informative profiles on the right."""
+    """Draw the gap locations on the left, and the most informative profiles on the right.
+
+    A gap location is a run, channel or phase of the motion with its RMS residual. A profile is the
+    mean residual in bins of another variable, such as the speed. All sizes are in inches, because
+    texts do not grow with the figure.
+
+    Args:
+        report: Data of the report.
+    """
     locations, profiles = (
         select_gap_locations(report.gap_locations),
         select_informative_profiles(report.profiles),

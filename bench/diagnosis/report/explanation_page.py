@@ -90,7 +90,13 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 
 
 def build_candidate_table(report: DiagnosisReportData) -> Table:
-    """Build a table with one row per candidate, the highest score first."""
+    """Build a table with one row per candidate, the highest score first.
+
+    `set` numbers the candidates that the data cannot distinguish.
+
+    Args:
+        report: Data of the report.
+    """
     sets = _map_indistinguishable_sets(report)
     heads = {entry.best.effect for entry in rank_candidates(report)}
     has_causes = bool(report.verdict.causes)
@@ -156,7 +162,11 @@ def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
 
 
 def build_gap_location_table(report: DiagnosisReportData) -> Table:
-    """Build a table with one row per part of the data: its RMS residual in units of the noise."""
+    """Build a table with one row per part of the data: its RMS residual in units of the noise.
+
+    Args:
+        report: Data of the report, whose gap locations are runs, channels and phases of the motion.
+    """
     rows = []
     for location in report.gap_locations:
         row = {
@@ -175,7 +185,14 @@ def build_gap_location_table(report: DiagnosisReportData) -> Table:
 
 
 def build_residual_profile_table(report: DiagnosisReportData) -> Table:
-    """Build the table of residual profiles, with one row per bin."""
+    """Build the table of residual profiles, with one row per bin.
+
+    A profile is the mean residual of a channel in bins of another variable; its interval is two
+    standard errors to either side.
+
+    Args:
+        report: Data of the report.
+    """
     rows = []
     for profile in report.profiles:
         profile_columns = {
@@ -419,7 +436,11 @@ class Bar(NamedTuple):
 
 
 def _make_bars(report: DiagnosisReportData) -> Iterator[Bar]:
-    """Yield bars of the held-out error before and after, and of the noise floor."""
+    """Yield bars of the held-out error before and after, and of the noise floor.
+
+    Args:
+        report: Data of the report; without held-out runs there are no bars.
+    """
     held_out = report.verdict.heldout
     if held_out is None:
         return
@@ -513,7 +534,14 @@ class ChannelRow(NamedTuple):
 
 
 def _list_splits(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
-    """List name, runs, and `` before`` or `` after``, of each error of a channel."""
+    """List name, runs, and `` before`` or `` after``, of each error of a channel.
+
+    The fitted and the held-out runs are reported separately, each before and after the causes are
+    added.
+
+    Args:
+        report: Data of the report.
+    """
     model_suffixes = (" before", " after") if report.verdict.causes else ("",)
     splits = [("fitted", report.fitting), (report.validation_run, report.held_out)]
     return [
@@ -545,7 +573,11 @@ def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
 
 
 def compute_channel_errors(split: DataSplit) -> Array:
-    """Compute each channel's RMSE (C, 2) before and after, in its unit; NaN without samples."""
+    """Compute each channel's RMSE (C, 2) before and after, in its unit; NaN without samples.
+
+    Args:
+        split: Recorded runs with the simulation before and after the causes are added.
+    """
     errors = np.full((split.observed.shape[2], 2), np.nan)
     for column, simulated in enumerate((split.before, split.after)):
         for c in range(len(errors)):
@@ -567,7 +599,11 @@ class ParameterRow(NamedTuple):
 
 
 def _make_parameter_row(p: ParameterChange) -> ParameterRow:
-    """Return a table row with a base parameter before and after the causes were added."""
+    """Return a table row with a base parameter before and after the causes were added.
+
+    Args:
+        p: Parameter with its estimates and intervals in the base and the extended model.
+    """
     # An insensitive parameter was not estimated from the data.
     if not p.is_sensitive:
         nominal = append_unit(format_number(p.before[0]), p.unit)

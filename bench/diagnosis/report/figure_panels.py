@@ -91,7 +91,11 @@ def has_extended_model(report: DiagnosisReportData) -> bool:
 
 
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
-    """Select the runs, channels and phases with the largest gaps, in their original order."""
+    """Select the runs, channels and phases with the largest gaps, in their original order.
+
+    Args:
+        places: Gap locations with their RMS residual before the causes are added.
+    """
     selected: list[GapLocation] = []
     # A part without samples has no RMS.
     measured_locations = [p for p in places if np.isfinite(p.before) and p.samples > 0]
@@ -191,7 +195,12 @@ def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
 
 
 def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
-    """Use a logarithmic axis with plain numbers if the values differ by a large factor."""
+    """Use a logarithmic axis with plain numbers if the values differ by a large factor.
+
+    Args:
+        axis: Axes whose horizontal scale is set.
+        values: Values to be shown; only positive ones can be on a logarithmic axis.
+    """
     positive = np.array([v for v in values if np.isfinite(v) and v > 0])
     if not positive.size or positive.max() / positive.min() < _SPAN_FOR_LOG:
         axis.set_xlim(left=0)
@@ -335,7 +344,14 @@ class RunView(NamedTuple):
 
 
 def select_worst_run(report: DiagnosisReportData) -> RunView:
-    """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
+    """Select the run with the largest gap in units of the noise, a held-out one if there is any.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        The run with its worst channels, at most `MAX_CHANNELS`, in their original order.
+    """
     split = list_data_splits(report)[-1]
     sigma = np.array([c.sigma for c in report.channels])
     squares = ((split.observed - split.before) / sigma) ** 2

@@ -127,7 +127,13 @@ class IdentifiabilitySection(NamedTuple):
 
 
 def build_identifiability_section(report: DiagnosisReportData) -> IdentifiabilitySection | None:
-    """Build the section on free parameters and causes; None if identifiability is unknown."""
+    """Build the section on free parameters and causes; None if identifiability is unknown.
+
+    Causes that can act at several places are shown as matrices (effect by place), others as a list.
+
+    Args:
+        report: Data of the report, with the identifiability of each number.
+    """
     if not report.identifiability:
         return None
     rows = _list_rows(report)
@@ -181,7 +187,11 @@ def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
 
 
 def format_counts(report: DiagnosisReportData) -> str:
-    """Format how many causes are identifiable, and which were found."""
+    """Format how many causes are identifiable, and which were found.
+
+    Args:
+        report: Data of the report, with the identifiability of each number.
+    """
     rows = _list_rows(report)
     statuses = [str("identifiable" if r.status == "found" else r.number.word) for r in rows]
     counts = {s: statuses.count(s) for s in _STATUSES[2:]}

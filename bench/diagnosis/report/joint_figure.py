@@ -91,7 +91,13 @@ def is_robot(report: DiagnosisReportData) -> bool:
 
 
 def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
-    """List a row for each joint, in the order of the channels, then one for each sensor."""
+    """List a row for each joint, in the order of the channels, then one for each sensor.
+
+    Channels are named ``quantity.joint``, such as ``q.elbow`` for its position.
+
+    Args:
+        report: Data of the report of a robot.
+    """
     joints: dict[str, dict[str, int]] = {}
     sensors = []
     for c, channel in enumerate(report.channels):

@@ -212,7 +212,14 @@ class MotionChart(NamedTuple):
 
 
 def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
-    """Make the chart with its table."""
+    """Make the chart with its table.
+
+    The chart shows measured and simulated channels over time, and their residual; readers select
+    the run and the channels.
+
+    Args:
+        report: Data of the report.
+    """
     table, places = build_motion_table(report), _list_switches(report)
     is_wide = len(places) > 2 or is_robot(report)
     panels: list[Panel] = []
@@ -231,7 +238,14 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
 
 
 def _list_switches(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
-    """Return the switches of each channel; for a robot, joint and quantity."""
+    """Return the switches of each channel; for a robot, joint and quantity.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        Labels by which a panel is switched on, and the index of its channel.
+    """
     if not is_robot(report):
         return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(report.channels)]
     places = []

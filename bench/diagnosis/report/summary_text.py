@@ -89,7 +89,15 @@ def format_summary(report: DiagnosisReportData) -> list[str]:
 
 
 def format_details(report: DiagnosisReportData) -> Iterator[str]:
-    """Yield the paragraphs below the headline."""
+    """Yield the paragraphs below the headline.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        Paragraphs on causes, reasons, largest gaps, parameters, consistency, residual and next
+        experiment.
+    """
     verdict = report.verdict.verdict
     if report.verdict.recording_faults:
         yield format_simulation_count(report)
@@ -132,7 +140,13 @@ def _describe_within_sentence(cause: Cause) -> str:
 
 
 def format_headline(report: DiagnosisReportData) -> str:
-    """Format in one sentence what is wrong with the simulator."""
+    """Format in one sentence what is wrong with the simulator.
+
+    The first rule that applies decides: a fault of the recording, an early stop, then the verdict.
+
+    Args:
+        report: Data of the report.
+    """
     verdict, causes = report.verdict.verdict, report.verdict.causes
     if report.verdict.recording_faults:
         return format_sentence(report.verdict.recording_faults[0].says)
@@ -186,7 +200,11 @@ def format_headline(report: DiagnosisReportData) -> str:
 
 
 def _format_unconfirmed_reason(causes: Sequence[Cause]) -> str:
-    """Say why causes are not confirmed: their coefficient is at a bound or has no interval."""
+    """Say why causes are not confirmed: their coefficient is at a bound or has no interval.
+
+    Args:
+        causes: Causes with a coefficient at a bound or without an interval.
+    """
     numbers = [n for cause in causes for n in cause.open_numbers.values()]
     at_bounds = [n for n in numbers if n.at_bound is not None]
     if not at_bounds:
@@ -198,7 +216,11 @@ def _format_unconfirmed_reason(causes: Sequence[Cause]) -> str:
 
 
 def iterate_undetermined_numbers(report: DiagnosisReportData) -> Iterator[str]:
-    """Yield which coefficients are not results, what that means, and what to do."""
+    """Yield which coefficients are not results, what that means, and what to do.
+
+    Args:
+        report: Data of the report.
+    """
     open_numbers = [
         (f"{sanitise(cause.effect, 60)}, {sanitise(key, 60)}", fitted)
         for cause in report.verdict.causes
@@ -283,7 +305,11 @@ def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
 
 
 def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
-    """Yield the sentences directly after the headline: gain, caveats and required details."""
+    """Yield the sentences directly after the headline: gain, caveats and required details.
+
+    Args:
+        report: Data of the report.
+    """
     verdict = report.verdict.verdict
     yield from (format_sentence(note) for note in report.verdict.recording_notes)
     if report.verdict.recording_faults:
@@ -310,7 +336,11 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
 
 
 def _format_unit_errors(errors: Sequence[RecordingFault]) -> Iterator[str]:
-    """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do."""
+    """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do.
+
+    Args:
+        errors: Wrong units or signs that explain the misfit, the likeliest first.
+    """
     likeliest_fault, *further_faults = errors
     if likeliest_fault.error_after is not None:
         before = (
@@ -363,7 +393,14 @@ def format_interval(held_out: HeldOutResult) -> str:
 
 
 def _format_closed_gap_subject(report: DiagnosisReportData) -> str:
-    """Return the subject and verb of the sentence on how much of the gap is closed."""
+    """Return the subject and verb of the sentence on how much of the gap is closed.
+
+    Args:
+        report: Data of the report, with at least one cause.
+
+    Returns:
+        Beginning of the sentence, such as "Together they close".
+    """
     causes = report.verdict.causes
     if report.verdict.verdict == "unknown" and report.verdict.cut is None:
         names = joined([format_effect(cause.effect) for cause in causes])
@@ -429,7 +466,11 @@ def _format_error(report: DiagnosisReportData, value: float | None) -> str:
 
 
 def format_search_summary(report: DiagnosisReportData) -> str:
-    """Say how many causes were tested, and which is the best if none is significant."""
+    """Say how many causes were tested, and which is the best if none is significant.
+
+    Args:
+        report: Data of the report with its candidates, the best first.
+    """
     candidates = report.verdict.candidates
     if not candidates:
         return "There were no candidate causes."
@@ -460,7 +501,13 @@ def format_detectable_gap(report: DiagnosisReportData) -> str:
 def _select_worst_of_each_kind(
     sizes: Sequence[tuple[ChannelInfo, float]],
 ) -> list[tuple[ChannelInfo, float]]:
-    """Select, from many channels, the one of each kind that hides most, in units of its noise."""
+    """Select, from many channels, the one of each kind that hides most, in units of its noise.
+
+    The kind of a channel is the part of its name before the point, such as ``q`` for positions.
+
+    Args:
+        sizes: Channels with the smallest gap that would be detected in them, in their units.
+    """
     if len(sizes) <= MAX_NAMED_CHANNELS:
         return list(sizes)
     worst_by_kind: dict[str, tuple[ChannelInfo, float]] = {}
@@ -604,7 +651,11 @@ def format_tuned_value(p: ParameterChange, model_index: int) -> str:
 
 
 def format_shift(p: ParameterChange) -> str:
-    """Format the change of a parameter in percent, or as a number if it was zero before."""
+    """Format the change of a parameter in percent, or as a number if it was zero before.
+
+    Args:
+        p: Parameter with its estimates before and after the causes are added.
+    """
     change = p.after[0] - p.before[0]
     if not change:
         return "unchanged"

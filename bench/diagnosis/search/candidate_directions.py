@@ -433,6 +433,8 @@ def _compute_directions(
 
     For a fixed probe it is the whole change.
 
+    A direction is d = (y(c) - y(0)) / c (1), with the simulated runs y(c) at a small coefficient c.
+
     Args:
         evaluator: the runs.
         fit: fit of the model without the candidates.

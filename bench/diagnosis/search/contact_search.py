@@ -226,7 +226,15 @@ def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[
 
 
 def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> FittedModel:
-    """Fit an effect and estimate the initial states in turn, while the sum of squares decreases."""
+    """Fit an effect and estimate the initial states in turn, while the sum of squares decreases.
+
+    Contacts make the sum of squares rough, so initial states are estimated by a smoother, then
+    coefficients and initial states by random search, and finally all by Levenberg-Marquardt.
+
+    Args:
+        search: Search with its models and run evaluator.
+        start: Start with a single effect.
+    """
     evaluator, sigma = search.evaluator, search.noise.sigma
     (name,) = start.effects
     indices = list(evaluator.get_coefficient_indices(name))
@@ -365,7 +373,14 @@ def _get_unit(search: EffectSearch, name: str) -> float:
 
 
 def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
-    """Return the likeliest of some values of all effects at contacts; None if there are none."""
+    """Return the likeliest of some values of all effects at contacts; None if there are none.
+
+    Each effect at a contact is tried at several smaller and larger values, by the likelihood of a
+    filter.
+
+    Args:
+        search: Search with its run evaluator.
+    """
     values = []
     for start in _list_effects_at_contacts(search):
         values += [start._replace(coefficient=-share * start.unit) for share in DECREASES]
@@ -452,7 +467,14 @@ def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Arra
 
 
 def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValue]) -> Array:
-    """Return the log-likelihood (N,) of each value, summed over the runs."""
+    """Return the log-likelihood (N,) of each value, summed over the runs.
+
+    A cubature filter follows each run under each value.
+
+    Args:
+        search: Search with its run evaluator and noise.
+        values: N effects, each with one coefficient.
+    """
     evaluator = search.evaluator
     evaluator.search_control.check_not_stopped()
     runs = range(len(evaluator.prepared_runs))
@@ -501,7 +523,13 @@ def search_in_contact(search: EffectSearch) -> FittedModel:
 
 
 def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
-    """Exclude effects from scores whose shape parameters have many values to try."""
+    """Exclude effects from scores whose shape parameters have many values to try.
+
+    They are searched by separate fits, because scoring every shape would take too long.
+
+    Args:
+        search: Search whose `excluded_effects` are set.
+    """
     evaluator, base = search.evaluator, search.base_model.fit
     probe_counts = {
         name: sum(1 for _ in iterate_first_probes(evaluator, base.effects, name))
@@ -513,7 +541,14 @@ def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
 
 
 def _search_simple_laws(search: EffectSearch) -> FittedModel:
-    """Return the best model of the present library."""
+    """Search the effects that are not excluded, and return the best model.
+
+    If the best model already explains the residual, no further search is needed, and only its
+    single-effect competitors are fitted.
+
+    Args:
+        search: Search with its models.
+    """
     best = max(search.models.values(), key=lambda model: model.penalised_log_likelihood)
     if not search.is_noise_like(best) or not search.is_complete(best, MAX_P_VALUE_FURTHER_EFFECT):
         return search.run()

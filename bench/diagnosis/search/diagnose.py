@@ -300,7 +300,11 @@ def is_motionless(search: EffectSearch) -> bool:
 
 
 def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
-    """Return the verdict "unidentifiable" for a recording without motion."""
+    """Return the verdict "unidentifiable" for a recording without motion.
+
+    Args:
+        search: Search with the base model.
+    """
     base, evaluator = search.base_model, search.evaluator
     # No parameter can be determined, and no test of the residual is meaningful.
     unidentified = tuple(evaluator.parameters[i].name for i in evaluator.base_indices)

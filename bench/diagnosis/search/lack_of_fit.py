@@ -210,6 +210,9 @@ class HatForce(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return strength c times a triangle of half-width w around the centre m, eq. (1).
 
+        The force is f(z) = c max(1 - |z - m| / w, 0) d (1), with the variable z, centre m, width w
+        and direction d.
+
         Args:
             c: The six coefficients: strength, variable, centre, width, direction, slow (the speed
                 over which dry friction reverses its sign).
@@ -341,6 +344,9 @@ def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel:
 
     Its residual must exceed the noise by a multiple of this error to count as too large.
 
+    For n samples with correlation phi, sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))
+    (2).
+
     Args:
         models: the models, with the mask of recorded samples.
         model: model whose residual shows the correlation of the noise.
@@ -463,14 +469,23 @@ class _Family(NamedTuple):
 
 
 def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
-    """Yield every family of hat forces, eq. (1), whose variable the recording shows."""
+    """Yield every family of hat forces, eq. (1), whose variable the recording shows.
+
+    A hat is a triangular basis function max(1 - |z - m| / w, 0) of time, position or speed z (1).
+    """
     yield from _iterate_hats_over_time(evaluator)
     yield from _iterate_hats_over_positions(evaluator)
     yield from _iterate_hats_over_speed(evaluator)
 
 
 def _iterate_hats_over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hat forces over time, along each coordinate and against the motion."""
+    """Yield families of hat forces over time, along each coordinate and against the motion.
+
+    A hat is a triangular basis function; a family has hats over the whole of the longest run.
+
+    Args:
+        evaluator: Run evaluator of the recording.
+    """
     durations = []
     for run_data in evaluator.prepared_runs:
         times = run_data.scenario.times

@@ -76,7 +76,14 @@ class RandomSearch:
         smoothed: Sequence[SmoothedStart],
         rng: np.random.Generator,
     ) -> None:
-        """Begin with the smoothed states, whose deviates are normalised by their covariances."""
+        """Begin with the smoothed states, whose deviates are normalised by their covariances.
+
+        Args:
+            evaluator: Run evaluator of the recording.
+            sigma: (C,) standard deviation of the noise of each channel.
+            smoothed: Smoothed initial state of each run, mean and covariance.
+            rng: Random generator.
+        """
         self._evaluator, self._sigma, self._rng = evaluator, sigma, rng
         self._means = [one.mean for one in smoothed]
         self._roots = [compute_root(one.covariance[None])[0] for one in smoothed]
@@ -88,6 +95,9 @@ class RandomSearch:
         self, theta: Array, indices: Sequence[int], widths: Array, bounds: Array
     ) -> FoundValues:
         """Return the best sample of all rounds.
+
+        It minimises J(c) = sum over runs r of min_x J_r(c, x) (1), with the coefficients c and the
+        initial state x of each run.
 
         Args:
             theta: (P,) parameters.

@@ -84,7 +84,13 @@ class GroupBatch:
 
 
 def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
-    """Group the directions of each effect at each grid point of its shape; they act together."""
+    """Group the directions of each effect at each grid point of its shape; they act together.
+
+    A grid point is one choice of the shape parameters, such as a frequency.
+
+    Args:
+        directions: Directions of all candidate effects.
+    """
     columns_by_group: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
         columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
@@ -97,7 +103,11 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
 
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
-    """Collect groups with equal sign constraints in batches, which are solved at once."""
+    """Collect groups with equal sign constraints in batches, which are solved at once.
+
+    Args:
+        members: Groups of directions; coefficients that must be positive constrain their solution.
+    """
     groups_by_signs: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
         groups_by_signs.setdefault(group.positive, []).append(i)
@@ -444,6 +454,9 @@ class _BestScores:
 
         It is log det W'W - n log(remaining squares), eq. (3) of the module docstring.
 
+        It is l(phi) = log det W'W - n log(<e, e> - h'G^-1 h) (3), with n samples, the whitened
+        residual e, and h'G^-1 h the part of <e, e> that the directions explain.
+
         Args:
             remaining_squares: sums of squares of the residual after the directions have explained
                 their part.
@@ -481,7 +494,10 @@ class _BestScores:
         self._group_coefficients[improved_groups, : coefficients.shape[1]] = coefficients[is_better]
 
     def end_correlation(self) -> None:
-        """Finish a correlation: update the best likelihood of each effect from its groups."""
+        """Finish a correlation: update the best likelihood of each effect from its groups.
+
+        It is called once for each correlation phi of the grid, after all groups were scored.
+        """
         values = self._compute_log_likelihood(
             self._total_squares - self._explained_squares, self._total_squares
         )
@@ -494,7 +510,12 @@ class _BestScores:
             self._white_noise_scores = np.maximum(values[:, 0] - value_without_effects, 0.0)
 
     def rank_effects(self) -> CandidateScores:
-        """Return the scores of eq. (4) in descending order, with the p-value of eq. (5)."""
+        """Return the scores of eq. (4) in descending order, with the p-value of eq. (5).
+
+        A score is the largest l(phi) of the effect's groups minus the largest l(phi) without any
+        direction (4). The p-value is the share of surrogates whose best score, relative to the 90 %
+        quantile of its effect, is at least the observed one (5).
+        """
         gains = self._best_log_likelihoods - self._best_without_effects  # (4)
         observed = gains[:, 0]
         surrogate_gains = gains[:, 1:]
@@ -554,6 +575,9 @@ def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
 
     Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
     of a likelihood ratio is.
+
+    It is p = P(max over k of s_k >= max over k of observed_k) (5), with the scores s_k of
+    surrogates for effects k.
 
     Args:
         null_values: (E, S) values of the surrogates; the maximum over E is compared.

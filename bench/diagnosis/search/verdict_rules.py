@@ -271,7 +271,13 @@ class DiagnosisState:
 
 
 def decide_verdict(state: DiagnosisState) -> VerdictName:
-    """Return the verdict that follows from the answers; the first rule that applies decides."""
+    """Return the verdict that follows from the answers; the first rule that applies decides.
+
+    Args:
+        state: Answers to the questions of the diagnosis: is the base model determined, does
+            anything remain unexplained, how much of the gap is closed, and which causes and
+            alternatives were found.
+    """
     # If the base model is not determined, every cause could be a wrong parameter value.
     if not state.fixed:
         return "unidentifiable"

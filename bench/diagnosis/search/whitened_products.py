@@ -50,7 +50,11 @@ class LaggedSums(NamedTuple):
         return LaggedSums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     def combine(self, phi: float) -> Array:
-        """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1)."""
+        """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1).
+
+        It is ((1 + phi^2) sum a_t b_t - phi sum a_t (b_{t-1} + b_{t+1}) - phi^2 sum n_t a_t b_t) /
+        (1 - phi^2) (1), with n_t the number of missing neighbours of sample t.
+        """
         square = phi * phi
         scaled_products = (
             (1.0 + square) * self.same_samples - phi * self.neighbours - square * self.run_ends
@@ -229,7 +233,11 @@ class WhiteningDesign:
             self._add_section_products(segment)
 
     def _iterate_sections(self) -> Iterator[RunSegment]:
-        """Yield sections of the runs that are so short that their columns fit in the CPU cache."""
+        """Yield sections of the runs that are so short that their columns fit in the CPU cache.
+
+        Each section has the positions of its samples with missing neighbours, at which whitening
+        differs.
+        """
         count, runs, length, channels = self._directions.shape
         step = max(MAX_CHUNK_SIZE // (max(count, 1) * channels), MIN_CHUNK_SAMPLES)
         for run in range(runs):
@@ -373,6 +381,8 @@ class WhiteningDesign:
         """Whiten the design with the correlation phi, and project it by eq. (2), without a cache.
 
         First the initial states of each run are projected out, then the parameters of all runs.
+
+        The projected product is a'b - (L'J'a)'(L'J'b) (2), with the Jacobian J and L L' = (J'J)^-1.
         """
         q = self._parameter_count
         normal = self._jacobian_products.combine(phi)
@@ -425,6 +435,9 @@ class InnerProducts:
 
     def project(self, phi: float) -> tuple[Array, list[Array], Array]:
         """Return the products of eq. (2) after whitening with a correlation.
+
+        The projected product is <a, b> = a'b - (L'J'a)'(L'J'b) (2), with the Jacobian J and L L' =
+        (J'J)^-1.
 
         Args:
             phi: the AR(1) correlation.
@@ -488,6 +501,8 @@ def _compute_matrix_root(normal: Array) -> Array:
     """Return L of eq. (2) for positive semidefinite matrices (..., s, s).
 
     Eigenvectors with very small eigenvalues are omitted.
+
+    L is the root of a pseudoinverse, L L' = (J'J)^-1.
     """
     if not normal.shape[-1]:
         return normal

@@ -175,6 +175,10 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     It is the inverse of the curvature of the whitened sum of squares, from which the initial states
     of each run are eliminated: eq. (2) of the module docstring.
 
+    It is (sum_r A_r'A_r - A_r'B_r (B_r'B_r + diag sigma_0^-2)^-1 B_r'A_r)^-1 (2), with the whitened
+    derivatives A_r of run r by parameters and B_r by its initial state, whose prior has the
+    standard deviation sigma_0.
+
     Args:
         models: the models, with the runs to which they are fitted.
         model: the fitted model.
@@ -347,6 +351,8 @@ def compute_held_out_gain(
     With a single run, or on request, segments of the runs are resampled (D. N. Politis, J. P.
     Romano 1992).
 
+    For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
+
     Args:
         evaluator: Run evaluator of the held-out runs.
         before: (R, T, C) simulated by the base model.
@@ -438,6 +444,8 @@ def _compute_closed_share(sums: Array, floor: float) -> Array:
     """Compute the share of the gap closed, eq. (1), for each row of sums (n, 3); 0 without a gap.
 
     A row has the squared errors before and after, and the number of samples.
+
+    For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
 
     Args:
         sums: (n, 3) sum of squared errors before and after, and number of samples, of n resamples.

@@ -276,6 +276,9 @@ class HeldOutRuns:
 def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:
     """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
 
+    It is M = 2 log L - f log n (1), with the likelihood L of n samples and f effective initial
+    states.
+
     Args:
         observed: (R, T, C) observations; NaN where missing.
         simulated: (R, T, C) predictions.
@@ -401,7 +404,10 @@ class CrossValidation:
 
     @cached_property
     def _run_folds(self) -> list[_Fold]:
-        """The folds; each has run evaluators for its own runs, with the parameters of the whole."""
+        """The folds; each has run evaluators for its own runs, with the parameters of the whole.
+
+        Runs of one fold are left out together and predicted by a fit to all other runs.
+        """
         fold_numbers = np.array([run.fold for run in self.evaluator.runs])
         folds = []
         for fold_number in sorted(set(fold_numbers.tolist())):
@@ -418,7 +424,11 @@ class CrossValidation:
         return folds
 
     def _make_evaluator(self, rows: Indices) -> RunEvaluator:
-        """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones."""
+        """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones.
+
+        Args:
+            rows: Indices of the runs.
+        """
         evaluator = self.evaluator.with_runs([self.evaluator.runs[row] for row in rows])
         length = evaluator.observed.shape[1]
         if self.evaluator.discretisation_correction is not None:

@@ -260,7 +260,10 @@ class ParameterConsistency:
 
     @property
     def prediction_sigma(self) -> float:
-        """Standard error for a run that is not yet recorded, eq. (5) of the module docstring."""
+        """Standard error for a run that is not yet recorded, eq. (5) of the module docstring.
+
+        The variance is var_joint + tau^2 (5): that of the joint fit and that between groups.
+        """
         return float(np.hypot(self.error, self.scatter))
 
 
@@ -448,6 +451,10 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     They are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the
     run are eliminated: eq. (1) of the module docstring.
 
+    With the whitened derivatives A_r by parameters and B_r by initial states and S_r = B_r'B_r +
+    diag sigma_0^-2, H_r = A_r'A_r - A_r'B_r S_r^-1 B_r'A_r and g_r = A_r'e_r - A_r'B_r S_r^-1
+    (B_r'e_r + prior) (1).
+
     Args:
         models: the models, with the runs.
         model: the fitted model.
@@ -488,6 +495,9 @@ def _test_parameters(
 
     Each group G alone would change the joint fit by the Gauss-Newton step d_G of eq. (2). A group
     whose interval is too wide is left out, and a parameter needs at least two groups.
+
+    The step of group G is d_G = H_G^-1 g_G with covariance H_G^-1, where H_G and g_G are sums over
+    its runs (2).
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -549,6 +559,9 @@ def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[f
     """Estimate by how much groups differ beyond their errors: tau of eq. (4), and the p-value.
 
     The method is that of DerSimonian and Laird, with Cochran's Q.
+
+    Q = sum w (x - mean)^2 with w = 1 / var (3), and tau^2 = (Q - (n - 1)) / (sum w - sum w^2 / sum
+    w) for n groups (4).
     """
     values = np.array([part.value for part in group_estimates])
     weights = np.array([part.error for part in group_estimates]) ** -2.0

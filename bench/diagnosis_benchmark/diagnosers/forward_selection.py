@@ -199,6 +199,9 @@ class ForwardBIC(_ForwardSelection):
     def compute_criterion(self, model: RefittedModel, samples: int) -> float:
         """Compute the Bayesian information criterion, BIC = n log(S / n) + k log n, equation (1).
 
+        For n samples and k numbers, BIC = n log(S / n) + k log n, with the sum of squares S in
+        units of the noise (1).
+
         Args:
             model: a fitted model, with sum of squares S and k numbers.
             samples: number of samples n.

@@ -174,7 +174,11 @@ class RegressionEvidence:
         return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
-        """Build the regression r = J delta + D c + noise, equation (1), with one row per sample."""
+        """Build the regression r = J delta + D c + noise, equation (1), with one row per sample.
+
+        To first order the residual is r = J delta + D c + noise (1), with the derivatives J by
+        parameters and initial states and the directions D of the effects.
+        """
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
         return self._flatten_to_rows(
@@ -262,6 +266,8 @@ class RegressionEvidence:
 
         For a channel with a rate, the first derivative replaces the second, and the term with A is
         omitted. Channels that are neither coordinates nor rates are not used.
+
+        It is L r = r'' - A r - B r' (2), with the stiffness A and damping B of the motion.
 
         Args:
             values: trajectories, (R, T, C, K).

@@ -117,7 +117,14 @@ def split_name(text: str) -> list[str]:
 
 
 def guess_role(column: LogColumn) -> Role | None:
-    """Return the role of a column by its name and unit, else by its file's name, or None."""
+    """Return the role of a column by its name and unit, else by its file's name, or None.
+
+    Args:
+        column: Column of a log, with name, unit and file.
+
+    Returns:
+        Command, position, velocity, force or other; None if nothing indicates a role.
+    """
     column_words, file_words = _split_into_words(column)
     if column_words & ROLE_KEYWORDS["command"] or (
         file_words & ROLE_KEYWORDS["command"] and not column_words & ROLE_KEYWORDS["other"]
@@ -157,7 +164,11 @@ def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
 
 
 def _guess_measured_role(words: set[str]) -> Role | None:
-    """Return the role of a measured signal that some words indicate; None if there is none."""
+    """Return the role of a measured signal that some words indicate; None if there is none.
+
+    Args:
+        words: Words of a column's or file's name, in lower case.
+    """
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
     # `current` in "current position" is not an electric current, and a joint state may be a
     # velocity.
@@ -195,7 +206,14 @@ def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
 
 
 def _strip_shared_words(joints: Sequence[Joint]) -> list[str]:
-    """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``."""
+    """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``.
+
+    Args:
+        joints: Joints of the robot.
+
+    Returns:
+        One stem per joint; empty where it would be ambiguous.
+    """
     shared_words = {"joint", "motor", "link", "actuator", "dof"}
     stems = [
         "".join(w for w in split_name(joint.name) if w not in shared_words) for joint in joints
@@ -255,7 +273,14 @@ def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
 
 
 def guess_time_unit(stamps: Array) -> str | None:
-    """Return the unit of time stamps for a plausible sampling rate; None if no unit gives one."""
+    """Return the unit of time stamps for a plausible sampling rate; None if no unit gives one.
+
+    Args:
+        stamps: (T,) time stamps in an unknown unit.
+
+    Returns:
+        Unit for which the median interval is a sampling rate within `SAMPLING_RATE_RANGE_HZ`.
+    """
     steps = np.diff(stamps)
     interval = float(np.median(steps[steps > 0]))
     for unit, second in TIME_UNITS.items():

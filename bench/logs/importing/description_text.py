@@ -40,12 +40,28 @@ class DescriptionWriter:
         folder: Path,
         result: ImportResult,
     ) -> None:
-        """Store the inputs; nothing is written yet."""
+        """Store the inputs; nothing is written yet.
+
+        Args:
+            logs: Files of the runs.
+            signals: Columns that were assigned to channels and inputs.
+            options: Facts that the user has stated.
+            model: Model file of the robot.
+            folder: Folder of the description, to which its paths are relative.
+            result: Result of the import, whose guesses are marked in the text.
+        """
         self._logs, self._signals, self._options = logs, signals, options
         self._model, self._folder, self._result = model, folder, result
 
     def write(self) -> str:
-        """Return the description."""
+        """Return the description.
+
+        It has the time, the runs, actuators that are missing in the model file, channels, inputs
+        and extra columns. Guesses have a comment.
+
+        Returns:
+            Text of the TOML file.
+        """
         servos = [
             self._estimate_added_servo(*named_servo)
             for named_servo in self._signals.added_servos.items()

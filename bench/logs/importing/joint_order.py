@@ -147,6 +147,9 @@ def _compute_order_residual(
 
     It is infinite if joints would be far beyond their ranges.
 
+    With the force f_j that joint j needs and the force a_j that its actuator exerts, R = sqrt(sum_j
+    mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order, about 1 otherwise.
+
     Args:
         robot: The model.
         driven: Joints with their actuators.
@@ -223,6 +226,9 @@ def find_best_order(distances: Array) -> list[int]:
     """Return the order of columns with the smallest sum of mean square distances (1).
 
     All orders of a few joints are compared; for more it is found by linear assignment.
+
+    It minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1) over permutations p, with commands
+    u_i and positions q_j.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns).

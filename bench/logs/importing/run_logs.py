@@ -106,7 +106,16 @@ def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
 
 
 def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
-    """Return a run for each file if all files have the same columns; otherwise an empty dict."""
+    """Return a run for each file if all files have the same columns; otherwise an empty dict.
+
+    Files with equal columns are runs; files with different columns are parts of one run.
+
+    Args:
+        run: Files that a user named together.
+
+    Returns:
+        Runs by the stem of their file name.
+    """
     tables = [path for path in run.paths if path.suffix.lower() in TABLE_ENDINGS and path.is_file()]
     stems = [path.stem for path in tables]
     if len(tables) < 2 or len(tables) < len(run.paths) or len(set(stems)) < len(stems):
@@ -180,7 +189,12 @@ class RunLogs:
         return next(iter(self.runs.values())).paths[0]
 
     def read(self, run: str, column: LogColumn) -> tuple[Array, Array] | None:
-        """Return time stamps (T,) in s and values (T,) of a column in a run; None if missing."""
+        """Return time stamps (T,) in s and values (T,) of a column in a run; None if missing.
+
+        Args:
+            run: Name of the run.
+            column: Column to read; its file is only used if a run has several files.
+        """
         files = self.runs[run]
         paths = files.paths
         if not files.alone:
@@ -248,7 +262,11 @@ class RunLogs:
         return logs
 
     def _make_missing_header_error(self, log: LogFile) -> InputError:
-        """Make the error for a table whose first row contains numbers."""
+        """Make the error for a table whose first row contains numbers.
+
+        Args:
+            log: Table without a header.
+        """
         names = ["t", *(f"{name}_pos" for name in self._joint_names)]
         example_header = ",".join(names[:MAX_NAMES])
         return InputError(

@@ -140,6 +140,9 @@ def _compute_transfer_functions(
 
         q(t) = 1 - (p2 exp(p1 t) - p1 exp(p2 t)) / (p2 - p1)                                     (2)
 
+    The servo is q'' = w^2 (u - q) - 2 d w q' (1), with the command u, natural frequency w and
+    damping ratio d.
+
     Returns:
         (n, 3) coefficients of the numerators and of the denominators, by descending powers of z.
     """

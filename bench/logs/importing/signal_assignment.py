@@ -138,7 +138,14 @@ class SignalAssignment:
     def place_columns(
         self, columns: Sequence[LogColumn]
     ) -> list[tuple[LogColumn, Joint, Placement]]:
-        """Assign columns of one kind to joints: by their names, else by their numbers."""
+        """Assign columns of one kind to joints: by their names, else by their numbers.
+
+        Args:
+            columns: Columns with the same role, such as positions.
+
+        Returns:
+            Each assigned column with its joint, and how it was assigned (`Placement`).
+        """
         assignments = []
         numbered: dict[tuple[str, str], list[LogColumn]] = {}
         for column in columns:
@@ -216,7 +223,10 @@ class _Candidate(NamedTuple):
 
     @property
     def kind(self) -> tuple[str, ...]:
-        """File and words of the column's name, without those of its joint and without numbers."""
+        """File and words of the column's name, without those of its joint and without numbers.
+
+        Columns of one kind, such as `q_hip` and `q_knee`, are assigned together.
+        """
         joint_words = set(column_guessing.split_name(self.joint.name))
         words = column_guessing.split_name(self.column.bare)
         return (
@@ -511,7 +521,11 @@ class ColumnAssigner:
     # -- commands
 
     def assign_commands(self) -> None:
-        """Assign commands to actuators, and to servos that are missing in the model file."""
+        """Assign commands to actuators, and to servos that are missing in the model file.
+
+        Without any actuator in the model file, a position servo is assumed at each joint with a
+        command.
+        """
         for column, joint, placement in self._signals.place_columns(
             self._select_by_role("command")
         ):
@@ -674,7 +688,10 @@ class ColumnAssigner:
                 )
 
     def report_missing_inputs(self) -> None:
-        """Report actuators without a command column, and columns that may be the command."""
+        """Report actuators without a command column, and columns that may be the command.
+
+        Nothing is reported if every actuator has a command.
+        """
         signals = self._signals
         undriven_actuators = [
             a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs
@@ -696,7 +713,10 @@ class ColumnAssigner:
         )
 
     def report_unused(self) -> None:
-        """Report the columns that were neither used nor mentioned before."""
+        """Report the columns that were neither used nor mentioned before.
+
+        Joints without a position column are reported, too.
+        """
         for column in self._logs.columns:
             if self._is_used(column) or self._result.is_left_out(column):
                 continue

@@ -70,7 +70,14 @@ UNEVEN_SHARE = 0.01
 
 
 def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
-    """Find irregular sampling intervals (jitter) and lost samples, summarised over all runs."""
+    """Find irregular sampling intervals (jitter) and lost samples, summarised over all runs.
+
+    Intervals are compared with the median interval of their run. A lost sample makes an interval a
+    multiple of it.
+
+    Args:
+        recording: Recording with the time stamps of each run.
+    """
     jittered, jitters, lost_count, sample_count, lossy = [], [], 0, 0, []
     for run in recording.runs:
         steps = np.diff(_select_timestamps(run))
@@ -187,7 +194,11 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
 
 
 def _count_quantisation_steps(values: Array) -> Array:
-    """Return the (T - 1,) changes of a signal in units of its smallest change."""
+    """Return the (T - 1,) changes of a signal in units of its smallest change.
+
+    Args:
+        values: (T,) samples.
+    """
     changes = np.diff(values)
     sizes = np.abs(changes[np.isfinite(changes)])
     nonzero_sizes = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
@@ -388,6 +399,8 @@ def _estimate_lag(x: Array) -> float:
 
     Returns 0 if the first lag exceeds the spread already, since motion between samples is not
     recorded.
+
+    It is the smallest T with mean (x(t + T) - x(t))^2 >= var x (1).
     """
     variance = float(np.nanvar(x))
     lag, previous_lag = 1, 0
@@ -493,6 +506,9 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     The position is predicted by means of past commands, eq. (1). A drift makes the delay grow with
     time t, so that the error of the prediction has a part proportional to t times the velocity.
     Nothing is yielded if the commands explain too little of the motion.
+
+    The response to commands is p(t) = c + d t + sum_k h_k <u>_k(t) (1); a delay T that grows by a
+    share e of the time gives y(t) = p - (T + e t) p' to first order (2).
     """
     t, u, y = run.times, run.inputs[command], run.channels[position]
     is_recorded = np.isfinite(y)
@@ -532,19 +548,33 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 
 
-def _average_over_intervals(u: Array) -> Array:
-    """Return the (N, K) means of a command over the intervals of equation (1)."""
-    total = np.concatenate([[0.0], np.cumsum(u)])
-    samples = np.arange(u.size)
+def _average_over_intervals(command: Array) -> Array:
+    """Return the (N, K) means of a command over the intervals of equation (1).
+
+    The N samples have K intervals before them, whose ends are `LAG_BIN_EDGES` samples earlier;
+    means are differences of the cumulative sum.
+
+    Args:
+        command: (N,) samples of the command.
+    """
+    cumulative_sum = np.concatenate([[0.0], np.cumsum(command)])
+    samples = np.arange(command.size)
     columns = []
     for begin, end in pairwise(LAG_BIN_EDGES):
-        first, last = (np.clip(samples - bound + 1, 0, u.size) for bound in (end, begin))
-        columns.append((total[last] - total[first]) / (end - begin))
+        first, last = (np.clip(samples - bound + 1, 0, command.size) for bound in (end, begin))
+        columns.append((cumulative_sum[last] - cumulative_sum[first]) / (end - begin))
     return np.column_stack(columns)
 
 
 def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
-    """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
+    """Return the weighted mean; scale its error up if estimates scatter more than their errors.
+
+    The error is multiplied by the square root of the reduced chi-squared if this is above 1 (Birge
+    ratio).
+
+    Args:
+        estimates: Drift and standard error of each run.
+    """
     drifts, errors = np.array(estimates).T
     weights = np.maximum(errors, 1e-12) ** -2.0
     drift = float(weights @ drifts / weights.sum())

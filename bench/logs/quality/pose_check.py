@@ -395,6 +395,9 @@ def _compare_position_with_command(recording: Recording, command: str, position:
 
     The mean of each run is subtracted first.
 
+    With u and q about their means, the slope is b = <u q> / <u^2> and the correlation r = <u q> /
+    sqrt(<u^2> <q^2>) (1).
+
     Args:
         recording: the recording.
         command: name of the input.

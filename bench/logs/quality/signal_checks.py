@@ -398,7 +398,11 @@ class VelocityComparison(NamedTuple):
 
     @property
     def slope(self) -> float:
-        """Slope g of equation (1)."""
+        """Slope g of equation (1).
+
+        It is g = <dq s> / <s^2> (1), with changes dq of position and integrals s of velocity over
+        intervals: 1 if both agree, -1 if a sign is wrong, 57.3 if one is in degrees.
+        """
         s = self.velocity_integrals
         return float(self.position_changes @ s) / float(s @ s)
 
@@ -409,7 +413,11 @@ class VelocityComparison(NamedTuple):
         return float(dq @ s) / float(np.sqrt((s @ s) * (dq @ dq)))
 
     def delay(self) -> VelocityDelay | None:
-        """Return the lag by equation (2), in units of the slope; None if it is not significant."""
+        """Return the lag by equation (2), in units of the slope; None if it is not significant.
+
+        It is T = -<(s - dq) dv> / <dv^2> (2), with changes dq of position, integrals s of velocity
+        and changes dv of velocity over intervals.
+        """
         slope, dv = self.slope, self.velocity_changes
         difference = slope * self.velocity_integrals - self.position_changes
         power = slope * float(dv @ dv)

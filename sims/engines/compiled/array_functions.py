@@ -94,7 +94,16 @@ class ArrayFunctions:
     def _bind(
         self, function: Callable[..., None], sizes: Mapping[str, int], arguments: tuple[Any, ...]
     ) -> Callable[[], None]:
-        """Return a function that runs a function on measured arguments, see `bind`."""
+        """Return a function that runs a function on measured arguments, see `bind`.
+
+        The compiled function gets one array of integers: its number, the sizes, and the addresses
+        of arrays.
+
+        Args:
+            function: One of the functions of this object.
+            sizes: Sizes of the arguments by letter of their shapes.
+            arguments: Arrays and integers.
+        """
         if self._can_run_uncompiled and not HAS_LLVMLITE:
             return partial(function, *arguments)
         words = np.array(

@@ -88,6 +88,8 @@ def record_arc(block: Block, record: int, time: float) -> None:
     The position is x + v s + a s^2 / 2 and the velocity v + a s, with the time s since the
     beginning of the parabola. The record is position, velocity and acceleration, D numbers each.
 
+    Between impacts x(s) = x + v s + a s^2 / 2 (1) and v(s) = v + a s (2).
+
     Args:
         block: force program, batch elements, and buffers of the slots.
         record: index of the record.
@@ -107,6 +109,9 @@ def record_arc(block: Block, record: int, time: float) -> None:
 
 def compute_impact_time(block: Block) -> float:
     """Return the time of the next impact in seconds since the start; infinite if there is none.
+
+    From height H with upward speed u, s = (u + w) / g = 2 H / (w - u), w = sqrt(u^2 + 2 g H) (3);
+    the form without cancellation is used.
 
     Args:
         block: force program, batch elements, and buffers of the slots.

@@ -110,7 +110,13 @@ def _integrate_group(
     threads = min(jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
 
     def run(part: BatchArrays) -> None:
-        """Run one thread's part of the elements, in separate program buffers."""
+        """Run one thread's part of the elements, in separate program buffers.
+
+        `program` and `function` are bound by the enclosing function.
+
+        Args:
+            part: Elements of one thread.
+        """
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
         # Elements in closed form are integrated one after the other.
         width = 1 if function == fly_elements else min(program.block_width, padded_count)
@@ -155,7 +161,14 @@ def _stack_inputs(values: list[Array], steps: int) -> Array:
 
 
 def _get_ground_parameters(batch: IntegrationBatch) -> Array:
-    """Return the ground parameters (4, L), rows as in `sims.engines.compiled.data_layout`."""
+    """Return the ground parameters (4, L), rows as in `sims.engines.compiled.data_layout`.
+
+    The rows are the height of the ground, restitution, friction coefficient, and the share of slip
+    that remains after an impact.
+
+    Args:
+        batch: Elements to integrate.
+    """
     count = len(batch.x)
     ground = np.zeros((4, count))
     system = batch.system

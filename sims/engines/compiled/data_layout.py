@@ -269,7 +269,15 @@ class InputNames(NamedTuple):
 
 
 def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> IntTable:
-    """Return `ProgramArrays.flags` of a system with these effects."""
+    """Return `ProgramArrays.flags` of a system with these effects.
+
+    The compiled code reads these integers to skip parts that a system does not need.
+
+    Args:
+        system: System that is integrated.
+        names: Names and numbers of its coordinates and inputs.
+        effects: Effects that act on it.
+    """
     has_friction, has_forces = (
         any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
     )

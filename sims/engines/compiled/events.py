@@ -146,6 +146,9 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
 
     The error is of third order in h; it is corrected when the root is reached.
 
+    The parabola is p(s) = p + r s - b s^2 with b = (p + h r - q) / h^2 (8), from value p and rate r
+    at the beginning and value q at the end of a step h.
+
     Args:
         value: value >= 0 at the beginning.
         rate: rate at the beginning.
@@ -327,6 +330,9 @@ def handle_impact(block: Block, i: int, k: int) -> None:
 
     The remaining distance d to the ground is removed by the time correction (10), which is
     -d / r (1 + d a / (2 r^2)) with the rate r and acceleration a. Then the velocity changes.
+
+    The correction is s = -d / r (1 + d a / (2 r^2)) (10), with distance d to the event, its rate r
+    and acceleration a.
 
     Args:
         block: force program, batch elements, and buffers of the slots.

@@ -299,7 +299,14 @@ class _ProgramNodes(NamedTuple):
 
 
 def _write_program(nodes: _ProgramNodes) -> ForceProgram:
-    """Write traced expressions as instructions, with the registers of their inputs and outputs."""
+    """Write traced expressions as instructions, with the registers of their inputs and outputs.
+
+    Args:
+        nodes: Expression graph with the outputs: forces, friction limit and impact.
+
+    Returns:
+        The program with the registers of inputs and outputs.
+    """
     outputs = [*nodes.force, *nodes.limit, *nodes.impact]
     instructions = emit_instructions(nodes.inputs, outputs)
     limit = instructions.place[nodes.limit[0]] if nodes.limit else -1
@@ -380,12 +387,19 @@ def emit_instructions(
 
 
 def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
-    """Return the outputs and all nodes they depend on, each after its arguments."""
+    """Return the outputs and all nodes they depend on, each after its arguments.
+
+    It is a depth-first topological sort with a stack, because recursion would be too deep for large
+    graphs.
+
+    Args:
+        outputs: Nodes whose values the program must produce.
+    """
     order: dict[ExpressionNode, None] = {}
     stack = [(node, False) for node in reversed(outputs)]
     while stack:
-        node, ready = stack.pop()
-        if ready:
+        node, has_arguments_in_order = stack.pop()
+        if has_arguments_in_order:
             order[node] = None
         elif node not in order:
             stack.append((node, True))

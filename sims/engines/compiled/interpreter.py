@@ -105,6 +105,9 @@ def nan_minimum(a: float, b: float) -> float:
 def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -> None:
     """Compute row o = sin(row a + `quarter_turns` quarter turns).
 
+    With x = k pi/2 + r, |r| <= pi/4: sin r = r + r^3 (S1 + ...), cos r = 1 - r^2/2 + r^4 (C1 + ...)
+    (1).
+
     Args:
         r: registers.
         o: row of the result.
@@ -142,6 +145,8 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -
 
 def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
     """Compute row o = exp(row a).
+
+    With x = k ln 2 + r: exp r = 1 + r + r c / (2 - c), c = r - r^2 (P1 + ...) (2).
 
     Args:
         r: registers.

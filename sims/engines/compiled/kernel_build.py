@@ -200,7 +200,11 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
 
 
 def _get_argument_types(numba: Any) -> dict[str, Any]:
-    """Return numba's types by the names of annotations, derived from example values."""
+    """Return numba's types by the names of annotations, derived from example values.
+
+    Args:
+        numba: The module numba, which is imported on first use.
+    """
     examples = {
         "bool": True,
         "int": 1,

@@ -128,7 +128,11 @@ def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., Non
 
 
 def _make_target(llvm: Any) -> Any:
-    """Return the target machine of the present processor."""
+    """Return the target machine of the present processor.
+
+    Args:
+        llvm: The module `llvmlite.binding`.
+    """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(

@@ -108,7 +108,11 @@ class NumpyForces:
             self._r[self._rows[OUT_LIMIT:]] = np.nan
 
     def _evaluate_forces(self, width: int) -> None:
-        """Write total force and friction limit of the first `width` slots into the registers."""
+        """Write total force and friction limit of the first `width` slots into the registers.
+
+        Args:
+            width: Number of slots in use.
+        """
         moment, coefficients = self._make_snapshot(width)
         force = self._system.force(moment)
         limit: Any = 0.0
@@ -121,15 +125,21 @@ class NumpyForces:
         self._r[self._rows[OUT_LIMIT], :width] = np.broadcast_to(limit, (width, 1))[:, 0]
 
     def _evaluate_impact(self, width: int) -> None:
-        """Write restitution and friction coefficient, with effects, into the registers."""
+        """Write restitution and friction coefficient, with effects, into the registers.
+
+        Args:
+            width: Number of slots in use.
+        """
         _, coefficients = self._make_snapshot(width)
-        e, mu, speed = (self._view_registers(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED))
+        restitution, friction, speed = (
+            self._view_registers(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED)
+        )
         for effect, c in zip(self._effects, coefficients, strict=True):
             if isinstance(effect, Contact):
-                e = effect.restitution(c, e, speed)
-                mu = mu + effect.friction(c)
-        self._r[self._rows[OUT_E], :width] = e[:, 0]
-        self._r[self._rows[OUT_MU], :width] = mu[:, 0]
+                restitution = effect.restitution(c, restitution, speed)
+                friction = friction + effect.friction(c)
+        self._r[self._rows[OUT_E], :width] = restitution[:, 0]
+        self._r[self._rows[OUT_MU], :width] = friction[:, 0]
 
     def _make_snapshot(self, width: int) -> tuple[StateSnapshot, list[Array]]:
         """Return snapshot and coefficients (K, W, 1) of the first W = `width` slots.

@@ -188,7 +188,12 @@ class BallRollout:
     """
 
     def __init__(self, ball: BallWithImpacts, element: ElementWork) -> None:
-        """Set the ball to its initial state; it rests if it lies still on the ground."""
+        """Set the ball to its initial state; it rests if it lies still on the ground.
+
+        Args:
+            ball: Ball in the engine, with impacts at their exact time.
+            element: Initial state, constants, inputs and steps.
+        """
         self._ball = ball
         self._forces = ElementForces(element, 1)
         self._short_flights = 0
@@ -294,7 +299,13 @@ class BallRollout:
             self._apply_impact()
 
     def _prepare_step(self, step: float) -> Vector:
-        """Set the engine's step, and its state if necessary; return the engine's velocity."""
+        """Set the engine's step, and its state if necessary; return the engine's velocity.
+
+        The engine's velocity belongs to half a step before the position, so it depends on the step.
+
+        Args:
+            step: Step in s.
+        """
         # The velocity half a step earlier depends on the step size.
         if step != self.step:
             self._ball.set_step(step)
@@ -315,6 +326,8 @@ class BallRollout:
         No force has to be evaluated, so that the engine runs on its own. Returns the state
         after each count: position, velocity and acceleration, three numbers each. The engine's
         velocity w is half a step earlier than v.
+
+        With the engine's velocity w, v' = w' + h/2 a' (3).
         """
         self._prepare_step(step)
         ax, ay, az = self.a
@@ -336,6 +349,9 @@ class BallRollout:
         The engine's velocity w belongs to the time half a step before the position. The applied
         force per unit mass, (v + h/2 a - w) / h - g (4), makes the velocity v' = w' + h/2 a' (3)
         of second order in the step h.
+
+        The additional force per unit mass is f = (v + h/2 a - w) / h - g (4), with the engine's
+        velocity w half a step before the position.
         """
         half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)

@@ -167,7 +167,11 @@ class _BulletMover:
         self._x: Vector = _ZERO_VECTOR
 
     def reset_world(self, constants: dict[str, float]) -> None:
-        """Prepare a world for these constants, without contact points of the previous rollout."""
+        """Prepare a world for these constants, without contact points of the previous rollout.
+
+        Args:
+            constants: Constants of the ball: mass, radius and others.
+        """
         pybullet = bullet_world.import_pybullet()
         self._mass = constants["mass"]
         self._contact = (math.nan, math.nan)
@@ -224,7 +228,12 @@ class _BulletMover:
         return states
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
-        """Set the ball's restitution and friction coefficient."""
+        """Set the ball's restitution and friction coefficient.
+
+        Args:
+            restitution: Ratio of normal speeds after and before an impact.
+            friction: Coefficient of Coulomb friction.
+        """
         if (restitution, friction) != self._contact:
             self._contact = restitution, friction
             bullet_world.import_pybullet().changeDynamics(

@@ -74,7 +74,13 @@ class PersistentBulletWorld:
         return PersistentBulletWorld, (self._build,)
 
     def get_body(self, constants: Mapping[str, float]) -> tuple[int, int]:
-        """Return the ids (client, body) of a world with these constants."""
+        """Return the ids (client, body) of a world with these constants.
+
+        The world is only built again if the constants have changed.
+
+        Args:
+            constants: Constants of the system, such as mass and length.
+        """
         if self._disconnect is None:
             self._client = import_pybullet().connect(import_pybullet().DIRECT)
             self._disconnect = weakref.finalize(self, import_pybullet().disconnect, self._client)

@@ -375,7 +375,11 @@ class ElementForces:
         compute_constants()
 
     def set_inputs(self, step: int) -> bool:
-        """Set the inputs of a step; return whether any differs from the previous step."""
+        """Set the inputs of a step; return whether any differs from the previous step.
+
+        Args:
+            step: Index of the step.
+        """
         has_changed = step == 0
         for k, values in enumerate(self._signals):
             if step == 0 or values[step] != values[step - 1]:

@@ -134,7 +134,16 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
 
 
 def _find_equivalent_damping(element: ElementWork) -> float | None:
-    """Return the viscous damping that is equivalent to all effects; None if there is none."""
+    """Return the viscous damping that is equivalent to all effects; None if there is none.
+
+    Only then can the engine run without interruption, with its own joint damping.
+
+    Args:
+        element: Batch element with its effects.
+
+    Returns:
+        Damping coefficient, 0 without any effect.
+    """
     if not element.effects:
         return 0.0
     (effect, c), *other_effects = element.effects
@@ -252,7 +261,11 @@ def integrate_velocity(
 
 
 def _compute_drive_forces(element: ElementWork) -> Array:
-    """Return the generalised force (S,) of the inputs over each step, at least one value."""
+    """Return the generalised force (S,) of the inputs over each step, at least one value.
+
+    Args:
+        element: Batch element with inputs that are constant over each step.
+    """
     if not element.inputs:
         return np.zeros(max(element.steps.size, 1))
     signals = {name: values[:, None] for name, values in element.inputs.items()}
@@ -269,6 +282,9 @@ def _integrate_open_loop(
     """Integrate without feedback except viscous damping.
 
     The engine runs on its own while the input is constant.
+
+    The engine steps w' = w + h (T - c w) / J with J = M + h c / 2 (5), for viscous damping c and
+    force T.
 
     Args:
         joint: the body in the engine.
@@ -349,6 +365,9 @@ def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step:
     The engine's velocity w belongs to the time half a step h before. All arguments are numbers or
     arrays.
 
+    It is v = (w + h/2 (G + u) / M) / (1 + h/2 c / M) (6), with gravity G, input u, mass M and
+    damping c.
+
     Args:
         w: the engine's velocity, half a step before the position.
         force: force at the position.
@@ -364,6 +383,9 @@ def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step:
     """Return the engine's velocity, half a step before the position.
 
     This is the inverse of `_to_full_step_velocity`.
+
+    It is w = (1 + h/2 c / M) v - h/2 (G + u) / M (7), with gravity G, input u, mass M and damping
+    c.
 
     Args:
         v: velocity at the time of the position.
@@ -382,6 +404,8 @@ def _compute_transition_force(
     """Return the force over the step in which the input changes from u to u', equation (8).
 
     It is u' + (1/2 - h c / (4 M)) (u - u'), so that the step has half an impulse of each.
+
+    It is u' + (1/2 - h c / (4 M)) (u - u') (8).
 
     Args:
         drive_force: force of the input before the change.

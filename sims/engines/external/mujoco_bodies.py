@@ -74,7 +74,14 @@ class CompiledWorld:
         return CompiledWorld, (self._compile,)
 
     def get_reset_world(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
-        """Return model and data in their initial state, for these constants."""
+        """Return model and data in their initial state, for these constants.
+
+        Args:
+            constants: Constants of the system; a new model is compiled if they have changed.
+
+        Returns:
+            `MjModel` and `MjData`.
+        """
         if self._built_for != constants:
             mujoco = import_mujoco()
             self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
@@ -162,7 +169,11 @@ class MujocoMover:
         self._world = world
 
     def reset_world(self, constants: dict[str, float]) -> None:
-        """Prepare a world for these constants in its initial state, with contact switched off."""
+        """Prepare a world for these constants in its initial state, with contact switched off.
+
+        Args:
+            constants: Constants of the ball: mass, radius, gravity.
+        """
         mujoco = import_mujoco()
         self._mass = constants["mass"]
         self._floor = constants["radius"]
@@ -238,7 +249,10 @@ class MujocoBall(MujocoMover):
         self._is_supported = False
 
     def set_step(self, step: float) -> None:
-        """Set the step in seconds."""
+        """Set the step in seconds.
+
+        Support has damping = 1 / h and stiffness = 0.1 / h^2 (4).
+        """
         super().set_step(step)
         if self._is_supported:
             self._set_contact_parameters(0.1 * self._inverse_step**2, self._inverse_step)  # (4)
@@ -247,6 +261,9 @@ class MujocoBall(MujocoMover):
         """Return the velocity after an impact, from MuJoCo's contact solver in one short step.
 
         Gravity is compensated, and friction is applied as an impulse.
+
+        With the damping (1 + e) / h (3) of the contact, a single step h changes the normal velocity
+        v to -e v.
 
         Args:
             x: position at the impact.

@@ -268,7 +268,17 @@ def read_unit(text: str) -> tuple[str, Quantity] | None:
 
 
 def split_unit(name: str) -> NamedUnit:
-    """Split the name of a column into the name proper and the unit that follows it."""
+    """Split the name of a column into the name proper and the unit that follows it.
+
+    A unit may be in brackets (`q [rad]`), after a joiner (`q_rad_s`) or in camel case
+    (`speedRadS`).
+
+    Args:
+        name: Name of a column.
+
+    Returns:
+        The name without its unit; the whole name without a unit if none is found.
+    """
     bracket_match = _BRACKETED_UNIT_PATTERN.fullmatch(name)
     # The brackets of `q[1]` hold an index and no unit.
     if bracket_match and bracket_match["name"] and not bracket_match["unit"].strip().isdigit():

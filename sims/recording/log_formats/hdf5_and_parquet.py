@@ -51,7 +51,11 @@ def make_unreadable_error(path: Path, error: Exception) -> InputError:
 
 
 def is_numeric_type(kind: Any) -> bool:
-    """Return whether columns of a pyarrow type hold numbers, times or lists of them."""
+    """Return whether columns of a pyarrow type hold numbers, times or lists of them.
+
+    Args:
+        kind: Data type of pyarrow.
+    """
     import pyarrow
 
     if _is_list(kind):
@@ -70,7 +74,14 @@ def _is_list(kind: Any) -> bool:
 
 
 def _convert_to_numbers(column: Any) -> Array | None:
-    """Return the numbers (T,) or (T, k) of a column; None if it holds none."""
+    """Return the numbers (T,) or (T, k) of a column; None if it holds none.
+
+    Lists become k columns if all have the same length. Time stamps become integers in their own
+    unit.
+
+    Args:
+        column: Column of a pyarrow table.
+    """
     import pyarrow
 
     kind = column.type
@@ -171,7 +182,11 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
 
 @contextmanager
 def _open_file(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file, and convert the errors of its reader to one line."""
+    """Open an HDF5 file, and convert the errors of its reader to one line.
+
+    Args:
+        path: HDF5 file; the package h5py is optional.
+    """
     try:
         import h5py
     except ImportError:

@@ -237,7 +237,13 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
 
 
 def find_calibration(folders: Iterable[Path]) -> Path | None:
-    """Return the only calibration file in some folders; None if there is none or more than one."""
+    """Return the only calibration file in some folders; None if there is none or more than one.
+
+    A calibration is recognised by its tables of motors, whatever the name of the file.
+
+    Args:
+        folders: Folders in which a calibration may be.
+    """
     calibration_files = []
     for folder in folders:
         if not folder.is_dir():
@@ -270,6 +276,10 @@ def motor_of(column: str, motors: Iterable[str]) -> str | None:
 def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
     """Return the conversion of a normalised position to an angle in degrees.
 
+    With the range r in counts and N = 4096 counts per turn, q = s x r / 200 * 360 / (N - 1) for x
+    in -100 to 100 (1), and q = s (x - 50) r / 100 * 360 / (N - 1) for x in 0 to 100 (2), in
+    degrees.
+
     Args:
         motor: Calibrated range of the motor.
         from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
@@ -298,7 +308,11 @@ def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
 
 
 def _get_motor_tables(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
-    """Return the tables of the motors; None if the document is not a calibration."""
+    """Return the tables of the motors; None if the document is not a calibration.
+
+    Args:
+        document: Content of a JSON file.
+    """
     if not isinstance(document, dict) or not document:
         return None
     for motor in document.values():

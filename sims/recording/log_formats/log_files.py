@@ -99,18 +99,27 @@ class LogFile:
         return make_read_only(values[:, place])
 
     def _find_column(self, name: str) -> tuple[str, int | None]:
-        """Find a column regardless of case, and the index into its lists if the name has one."""
+        """Find a column regardless of case, and the index into its lists if the name has one.
+
+        `position[2]` is entry 2 of a list column, unless a column has this very name.
+
+        Args:
+            name: Name as a description or a user wrote it.
+
+        Returns:
+            Name in the file, and the index of the list entry, else None.
+        """
         match = _LIST_ENTRY_PATTERN.fullmatch(name)
-        for base, place in (
+        for base, entry in (
             ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
         ):
             matches = [
                 column for column in self.columns if column.strip().lower() == base.strip().lower()
             ]
             if base in self.columns:
-                return base, place
+                return base, entry
             if len(matches) == 1:
-                return matches[0], place
+                return matches[0], entry
         raise self._make_missing_column_error(name)
 
     def _make_missing_column_error(self, name: str) -> InputError:
@@ -217,7 +226,11 @@ def _read_group(stamp: FileVersion) -> LogFile:
 
 @lru_cache(maxsize=8)
 def _read_cached(stamp: FileVersion) -> LogFile:
-    """Read a log file; cached by file version, because logs are requested column by column."""
+    """Read a log file; cached by file version, because logs are requested column by column.
+
+    Args:
+        stamp: Path with size and modification time; a changed file is read again.
+    """
     path = stamp.path
     try:
         log = _READERS[path.suffix.lower()](path)
@@ -338,7 +351,11 @@ _READERS: Mapping[str, Callable[[Path], LogFile]] = {
 
 
 def list_logs(folder: Path) -> Iterator[Path]:
-    """List the logs of a folder, topics of a bag or episodes of a dataset, ordered by name."""
+    """List the logs of a folder, topics of a bag or episodes of a dataset, ordered by name.
+
+    Args:
+        folder: Folder of files, ROS bag, or LeRobot dataset.
+    """
     if lerobot_dataset.is_dataset(folder):
         yield from lerobot_dataset.list_episodes(folder)
         return

@@ -99,7 +99,11 @@ def _make_decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], A
 
 
 def _list_topics(path: Path) -> set[str]:
-    """Return the topics with messages in JSON or Protobuf."""
+    """Return the topics with messages in JSON or Protobuf.
+
+    Args:
+        path: MCAP file. Without a summary at its end, all messages are read.
+    """
     with _open_file(path) as reader:
         summary = reader.get_summary()
         if summary is not None and summary.channels:
@@ -196,7 +200,14 @@ class MessageTable:
 
 
 def _get_fields(value: Any) -> dict[str, Any] | None:
-    """Return the fields of a message by name; None if the value is not a message."""
+    """Return the fields of a message by name; None if the value is not a message.
+
+    Messages of ROS are dataclasses, JSON messages are mappings, and Protobuf messages have a
+    descriptor.
+
+    Args:
+        value: Message or part of a message.
+    """
     if is_dataclass(value):
         names = [field.name for field in fields(value) if field.name != "__msgtype__"]
         return {name: getattr(value, name) for name in names}
@@ -215,7 +226,13 @@ def _get_fields(value: Any) -> dict[str, Any] | None:
 
 
 def _get_stamp(message: Any) -> float:
-    """Return the time stamp of a message in seconds; 0 if it has none."""
+    """Return the time stamp of a message in seconds; 0 if it has none.
+
+    The stamp is in the header of a ROS message, else in one of the fields `STAMP_FIELDS`.
+
+    Args:
+        message: Message of any encoding.
+    """
     fields = _get_fields(message) or {}
     for table in (_get_fields(fields.get("header")) or {}, fields):
         for name in STAMP_FIELDS:

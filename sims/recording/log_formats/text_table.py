@@ -166,7 +166,14 @@ def _split_line(line: str, separator: str) -> list[str]:
 
 
 def _detect_separator(lines: Sequence[str]) -> str:
-    """Return the separator with which the largest share of the cells are numbers."""
+    """Return the separator with which the largest share of the cells are numbers.
+
+    Rows with the usual number of cells count; of equal shares, the separator with more columns
+    wins.
+
+    Args:
+        lines: First lines of the file.
+    """
     best, best_score = ",", (-1.0, 0.0)
     for separator in SEPARATORS:
         rows = [_split_line(line, separator) for line in lines]
@@ -308,7 +315,11 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
 
 
 def is_numeric(cell: str) -> bool:
-    """Return whether a cell holds a number, a list of numbers, a time or a missing-number mark."""
+    """Return whether a cell holds a number, a list of numbers, a time or a missing-number mark.
+
+    Args:
+        cell: Text of a cell, such as "1.5", "[0.1, 0.2]", "2026-01-31T12:00:00" or "nan".
+    """
     text = cell.strip()
     if NUMBER.fullmatch(text) or text.lower() in NO_NUMBER:
         return True
@@ -376,11 +387,17 @@ def read_text_table(path: Path) -> TextTable:
 
 
 def _make_unique_names(layout: Layout) -> list[str]:
-    """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``."""
-    names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
+    """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``.
+
+    Args:
+        layout: Layout of the table; it has no names if the file has no header.
+    """
+    names = layout.names or tuple(
+        f"column {column_index + 1}" for column_index in range(layout.width)
+    )
     result: list[str] = []
-    for place, name in enumerate(names):
-        unique_name = name or f"Unnamed: {place}"
+    for column_index, name in enumerate(names):
+        unique_name = name or f"Unnamed: {column_index}"
         number = 1
         while unique_name in result:
             unique_name, number = f"{name}.{number}", number + 1

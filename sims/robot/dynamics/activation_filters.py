@@ -71,6 +71,9 @@ class ActivationFilter(NamedTuple):
         They approach the control by the share h / T in each step (Euler's method) or by
         1 - exp(-h / T) (exactly).
 
+        With time constant T and step h, a[k+1] = a[k] + (h / T) (u[k] - a[k]) (1); the exact form
+        has the factor 1 - exp(-h / T) (2).
+
         Args:
             controls: (n, S) controls of the steps.
             initial: (n,) initial activations.
@@ -96,7 +99,13 @@ class ActivationFilter(NamedTuple):
 
 @cache_per_robot
 def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
-    """Return the filters before those actuators of a robot that have one control."""
+    """Return the filters before those actuators of a robot that have one control.
+
+    MuJoCo's types `filter` and `filterexact` delay a control by a first-order lag.
+
+    Args:
+        robot: Robot with its compiled model.
+    """
     import mujoco
 
     model = robot.compiled
@@ -106,8 +115,8 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
         i = actuator.id
         if int(model.actuator_dyntype[i]) not in filters() or actuator.controls != 1:
             continue
-        limited = bool(model.actuator_actlimited[i])
-        low, high = model.actuator_actrange[i] if limited else (-np.inf, np.inf)
+        is_limited = bool(model.actuator_actlimited[i])
+        low, high = model.actuator_actrange[i] if is_limited else (-np.inf, np.inf)
         filters_found.append(
             ActivationFilter(
                 actuator,

@@ -275,7 +275,13 @@ def _group_by_active_effects(
 
 
 def _group_requests(requests: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
-    """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each."""
+    """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each.
+
+    A group is evaluated in one batch, with one effect function per effect and one row per element.
+
+    Args:
+        requests: Inputs of runs with their active effects.
+    """
     requests_by_effects: dict[tuple[str, ...], list[_InputRequest]] = {}
     for request in requests:
         requests_by_effects.setdefault(tuple(e.of or e.name for e, _ in request.acting), []).append(

@@ -217,7 +217,14 @@ class MeasuredLinear(RunLinearisation):
         )
 
     def _interpolate_samples(self, motion: RobotMotion) -> Trajectory:
-        """Interpolate the measured joints between samples by quintic Hermite polynomials."""
+        """Interpolate the measured joints between samples by quintic Hermite polynomials.
+
+        Args:
+            motion: Simulated motion, whose measured joints are replaced by the measurement.
+
+        Returns:
+            Positions and velocities at the steps of the simulation.
+        """
         # Joints that are not recorded may diverge in the simulation.
         x, v = (
             np.clip(np.nan_to_num(u), -MAX_DEVIATION, MAX_DEVIATION) for u in (motion.x, motion.v)
@@ -298,7 +305,11 @@ class MeasuredLinear(RunLinearisation):
         return result
 
     def _compute_limit_jumps(self) -> Array:
-        """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
+        """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos.
+
+        A servo at its force limit follows the linearised model no longer; the jump is added to the
+        process noise of a filter. Z is the size of the state, positions and velocities.
+        """
         mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
         limits = mujoco_batch.force_limits
         state_changes = np.zeros((self.knots.size - 1, self._tangent.state_size))

@@ -143,7 +143,15 @@ class RunLinearisation:
         )
 
     def _compute_command_fields(self, inputs: BatchInputs) -> dict[str, Any]:
-        """Return the fields of a motion that follow from the commands of the run."""
+        """Return the fields of a motion that follow from the commands of the run.
+
+        Args:
+            inputs: Applied inputs of a batch of one run.
+
+        Returns:
+            Fields of the motion by name: controls, forces, inputs at the beginnings of steps, and
+            steps in which drives are off.
+        """
         return {
             "controls": inputs.controls[0],
             "forces": self._simulator.make_linearisation_batch(self._work.acting).map_forces(
@@ -155,7 +163,11 @@ class RunLinearisation:
         }
 
     def _get_floating_states(self, fields: Mapping[str, Array]) -> FloatingState:
-        """Return states of floating bodies, at the beginnings of steps and at the end."""
+        """Return states of floating bodies, at the beginnings of steps and at the end.
+
+        Args:
+            fields: State of MuJoCo after each step, `qpos` and `qvel`.
+        """
         start = self._simulator.get_floating_start(self._work)
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
         pose = fields["qpos"][0][:, floating.positions]
@@ -292,15 +304,20 @@ class RunLinearisation:
         )
 
     def compute_initial_state_responses(self) -> Array:
-        """Compute observation derivatives (2 D, T, C) by initial positions, then velocities."""
+        """Compute observation derivatives (2 D, T, C) by initial positions, then velocities.
+
+        Returns:
+            Derivatives by D initial positions, then by D initial velocities, of C channels at T
+            samples.
+        """
         with np.errstate(all="ignore"):
             states, readings = self._tangent.propagate_initial_state()
         # The changes are small enough for nonlinear sensor effects to be linear.
-        scale = 1e-4
+        small_change = 1e-4
         observations = self._compute_observations(
-            scale * states, scale * readings, [()] * len(states)
+            small_change * states, small_change * readings, [()] * len(states)
         )
-        result: Array = (observations - self.observed) / scale
+        result: Array = (observations - self.observed) / small_change
         velocity_column, joints = len(result) // 2, self._joints  # joints in series are left out
         return np.concatenate([result[:joints], result[velocity_column : velocity_column + joints]])
 
@@ -351,7 +368,15 @@ class RunLinearisation:
         return bool(rest == 0.0)
 
     def _get_inputs_with_effects(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
-        """Return the inputs of the run, with one more input effect in each batch element."""
+        """Return the inputs of the run, with one more input effect in each batch element.
+
+        The responses to input effects are computed together, with one batch element for each effect
+        and coefficient vector.
+
+        Args:
+            rows: For each batch element: an index that is not used here, the effect, and its
+                coefficients (K, 1).
+        """
         count = len(rows)
         acting: dict[str, tuple[Effect, Array]] = {}
         for e, c in self._work.acting:

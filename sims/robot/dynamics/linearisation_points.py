@@ -573,7 +573,10 @@ class LinearisationPoints:
 
     @cached_property
     def snapshot(self) -> RobotSnapshot:
-        """The whole motion as a snapshot of S batch elements, at the middle of each step."""
+        """The whole motion as a snapshot of S batch elements, at the middle of each step.
+
+        Positions and velocities are the means of both ends of a step.
+        """
         motion = self.motion
         steps = len(motion.controls)
         t: Array = motion.step * (np.arange(float(steps)) + 0.5)

@@ -152,6 +152,9 @@ class MidpointPredictor:
     ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
 
+        The load at the middle is d_k + (d_{k-1, end} - d_{k-1}) / 2 (2), so that a jump with a
+        command appears in d_k alone.
+
         Args:
             has_new_command: (L,) whether the command changes at the beginning of the step.
             first: whether it is the first step.
@@ -227,6 +230,8 @@ def advance_state(
     phi(z) = (e^z - 1) / z, which is exact if the rate is linear in w. The derivative dr/dw is a
     difference quotient.
 
+    With the rate r(w), w(t + h) = w + h phi(h dr/dw) r(w), phi(z) = (e^z - 1) / z (3).
+
     Args:
         effect: effect with the hidden state.
         c: (K, L, 1) coefficients of the effect.
@@ -286,6 +291,8 @@ def integrate_state(
 
 def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array) -> HiddenState:
     """Integrate a hidden state whose rate is linear in the state throughout the motion.
+
+    The step is w + h phi(z) r(w), phi(z) = (e^z - 1) / z, z = h dr/dw (3).
 
     Args:
         state: initial state, (1, 1).

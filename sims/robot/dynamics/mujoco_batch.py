@@ -77,7 +77,14 @@ class JointAddresses:
     """
 
     def __init__(self, robot: RobotModel, series: bool = False, both: bool = False) -> None:
-        """Collect the addresses of the selected hinge and slide joints, in file order."""
+        """Collect the addresses of the selected hinge and slide joints, in file order.
+
+        Args:
+            robot: Robot whose compiled model has the joints.
+            series: Whether to select the second joints of flexible drives, instead of the joints of
+                the file.
+            both: Whether to select both; series joints come last.
+        """
         one_coordinate_joints = [joint for joint in robot.joints if joint.has_one_coordinate]
         file_joints = [joint for joint in one_coordinate_joints if joint.name not in robot.series]
         series_joints = [robot.joint(name) for name in robot.series]

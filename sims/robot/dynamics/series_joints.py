@@ -272,6 +272,10 @@ def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> No
 
     They are multiplied by the inverse inertia that MuJoCo has derived.
 
+    A limit of MuJoCo with impedance s exerts -(K e + C d') / (A + R), R = (1 - s) A0 / s (6), with
+    the excess e over the gap, the inverse inertia A along the joint, and A0 its value in the pose
+    of the file.
+
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.

@@ -412,13 +412,18 @@ class TangentModel:
 
     @property
     def motion_readings(self) -> Array:
-        """Readings (S, O) of the motion at the beginnings of steps, as computed by the model."""
+        """Readings (S, O) of the motion at the beginnings of steps, as computed by the model.
+
+        Returns:
+            (S, O) values of O sensor outputs, with the command of that time instead of the step's
+            mean.
+        """
         motion, points = self._motion, self._at.point_of_step
         with self._at.at_steps(np.arange(self._steps)):
-            _, read = self._at.compute_accelerations(self._at.acting)
+            _, step_readings = self._at.compute_accelerations(self._at.acting)
         # A step applies the mean of a command, while a sensor shows its value at the beginning.
         difference = motion.instant - motion.controls
-        result: Array = read + np.einsum(
+        result: Array = step_readings + np.einsum(
             "sou,su->so", self.quotients.read_controls[points], difference
         )
         return result

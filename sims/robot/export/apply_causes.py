@@ -326,7 +326,12 @@ class SpecElements:
     """The elements of a spec by their numbers in the compiled model."""
 
     def __init__(self, spec: Any, robot: RobotModel) -> None:
-        """Index the joints, bodies, actuators, geoms and pairs of a spec, after a compilation."""
+        """Index the joints, bodies, actuators, geoms and pairs of a spec, after a compilation.
+
+        Args:
+            spec: Editable model of MuJoCo (`MjSpec`).
+            robot: Robot whose compiled model has the same elements.
+        """
         self.spec = spec
         # Elements have numbers only after compilation.
         spec.compile()

@@ -428,7 +428,13 @@ class _Actuator:
         return self._get_integer_field("actuator_dyntype") in kinds and not self.clamped
 
     def shift(self, force: float) -> None:
-        """Add a constant force in N or N m to the force that the actuator computes."""
+        """Add a constant force in N or N m to the force that the actuator computes.
+
+        In MuJoCo the force is gain * control + bias; the constant is the first bias parameter.
+
+        Args:
+            force: Force that is added.
+        """
         import mujoco
 
         if self._get_integer_field("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):

@@ -88,7 +88,15 @@ class XmlText:
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
-        """Parse the text with Expat, which gives the byte position of each element."""
+        """Parse the text with Expat, which gives the byte position of each element.
+
+        Positions allow edits of single attributes that leave the rest of the file unchanged,
+        comments included.
+
+        Args:
+            text: Content of the file, UTF-8.
+            path: File name for messages.
+        """
         self.text, self.path = text, path
         self._open: list[XmlElement] = []
         self._top: XmlElement | None = None
@@ -140,7 +148,11 @@ class XmlText:
         return self.text[tag.inside - 2 : tag.inside] == b"/>"
 
     def _end_of(self, begin: int) -> int:
-        """Return the offset after a start tag, at the first ``>`` outside of quotes."""
+        """Return the offset after a start tag, at the first ``>`` outside of quotes.
+
+        Args:
+            begin: Offset of the ``<`` of the tag.
+        """
         quote = b""
         for i in range(begin, len(self.text)):
             character = self.text[i : i + 1]
@@ -422,7 +434,15 @@ class MjcfDocument:
     def _collect_bodies(
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
     ) -> None:
-        """Collect bodies depth first, and the joints of each body before those of its children."""
+        """Collect bodies depth first, and the joints of each body before those of its children.
+
+        MuJoCo numbers bodies and joints in this order.
+
+        Args:
+            tag: Body whose children are collected.
+            bodies: List to which bodies are appended.
+            joints: List to which joints are appended.
+        """
         child_bodies: list[XmlElement] = []
         self._append_children(tag, child_bodies, joints)
         for body in child_bodies:

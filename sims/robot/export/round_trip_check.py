@@ -188,7 +188,11 @@ def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
 
 
 def displace_reference_pose(model: Any) -> Array:
-    """Return a pose (nq,) near the reference pose, with different displacements of all joints."""
+    """Return a pose (nq,) near the reference pose, with different displacements of all joints.
+
+    Args:
+        model: Compiled model of MuJoCo.
+    """
     import mujoco
 
     # Different values detect swapped coordinates.

@@ -60,7 +60,11 @@ class UrdfWriter:
         self.joints = {tag.get_attribute("name"): tag for tag in top if tag.name == "joint"}
 
     def write(self, cause: FittedCause) -> str | None:
-        """Write a cause; return the reason if a URDF cannot express it, else None."""
+        """Write a cause; return the reason if a URDF cannot express it, else None.
+
+        Args:
+            cause: Effect at a place with its fitted numbers.
+        """
         writers_by_effect: Mapping[str, Callable[[FittedCause], str | None]] = {
             "drag.linear": lambda cause: self._write_dynamics(cause, "damping"),
             "friction.coulomb": lambda cause: self._write_dynamics(cause, "friction"),
@@ -335,7 +339,11 @@ def _get_link_name(joint: XmlElement, end: str) -> str:
 
 
 def _has_mass(inertial: XmlElement) -> bool:
-    """Return whether an inertial specifies a nonzero mass or moment of inertia."""
+    """Return whether an inertial specifies a nonzero mass or moment of inertia.
+
+    Args:
+        inertial: Element ``<inertial>`` of a link.
+    """
     stated_values = (
         (_find_child(inertial, "mass"), ("value",)),
         (_find_child(inertial, "inertia"), _TENSOR_ATTRIBUTES),
@@ -348,7 +356,14 @@ def _has_mass(inertial: XmlElement) -> bool:
 def _scale_attributes(
     inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float
 ) -> None:
-    """Multiply stated attributes of an inertial's child element (mass, inertia) by a factor."""
+    """Multiply stated attributes of an inertial's child element (mass, inertia) by a factor.
+
+    Args:
+        inertial: Element ``<inertial>`` of a link.
+        name: Name of the child element.
+        attributes: Attributes of the child to multiply.
+        factor: Factor; attributes that are not stated stay so.
+    """
     child = _find_child(inertial, name)
     for attribute in attributes:
         value = child.get_attribute(attribute) if child else None

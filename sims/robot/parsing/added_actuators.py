@@ -133,7 +133,13 @@ def _has_one_degree_of_freedom(joint: Any) -> bool:
 
 
 def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
-    """Add an actuator to the spec from its checked table: motor, position, velocity or PID."""
+    """Add an actuator to the spec from its checked table: motor, position, velocity or PID.
+
+    Args:
+        spec: Editable model of MuJoCo (`MjSpec`).
+        name: Name of the actuator.
+        table: Table ``[actuators.NAME]`` of the description: kind, joint, gains, gear and ranges.
+    """
     import mujoco
 
     actuator = spec.add_actuator(

@@ -180,7 +180,14 @@ class CollisionShapes:
         )
 
     def write(self, model: Any) -> None:
-        """Write the data into a model with meshes of `add_hull` and `add_memory_reserve`."""
+        """Write the data into a model with meshes of `add_hull` and `add_memory_reserve`.
+
+        The stored hulls replace those that the compiler would compute from the meshes, which takes
+        long.
+
+        Args:
+            model: Compiled model of MuJoCo; changed in place.
+        """
         write_hulls(model, self.hulls)
         for name, fields in self.geoms.items():
             for field, values in fields.items():

@@ -36,7 +36,14 @@ def compute_triangle_violation(moments: Array) -> float:
 
 
 def find_nearest_valid_moments(moments: Array) -> Array:
-    """Return the nearest physically valid moments, in kg m^2: positive, with A + B >= C."""
+    """Return the nearest physically valid moments, in kg m^2: positive, with A + B >= C.
+
+    Principal moments A <= B <= C of a rigid body satisfy A + B >= C. A violation A + B < C is
+    divided equally: the largest moment is decreased and both others are increased by a third of it.
+
+    Args:
+        moments: (3,) principal moments in kg m^2.
+    """
     raised_moments: Array = np.maximum(
         moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0)
     )

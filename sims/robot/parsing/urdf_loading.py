@@ -356,7 +356,13 @@ def _get_link_name(files: ModelFileReader, joint: Element, tag: str) -> str:
 def _find_parent_links(
     files: ModelFileReader, links: Mapping[str, Element], joints: Sequence[Element]
 ) -> dict[str, tuple[str, Element]]:
-    """Return the parent link and the joint of each link; raise an error if links form no tree."""
+    """Return the parent link and the joint of each link; raise an error if links form no tree.
+
+    Args:
+        files: Reader of the model file, which locates errors.
+        links: Elements ``<link>`` by name.
+        joints: Elements ``<joint>``.
+    """
     parents: dict[str, tuple[str, Element]] = {}
     for joint in joints:
         label, kind = truncate_text(joint.get("name") or ""), joint.get("type") or ""
@@ -431,7 +437,14 @@ def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
 
 
 def _remove_repeated_elements(parts: Sequence[Element]) -> list[str]:
-    """Remove repeated elements in a link or a joint, except for the first of each kind."""
+    """Remove repeated elements in a link or a joint, except for the first of each kind.
+
+    Args:
+        parts: Links and joints of the file; changed in place.
+
+    Returns:
+        A note that names what was removed; empty if nothing was.
+    """
     repeated = []
     for part in parts:
         seen_tags: set[str] = set()
@@ -444,7 +457,14 @@ def _remove_repeated_elements(parts: Sequence[Element]) -> list[str]:
 
 
 def read_velocity_limits(root: Element) -> dict[str, float]:
-    """Return the velocity limits of joints, rad/s or m/s, where the file specifies them."""
+    """Return the velocity limits of joints, rad/s or m/s, where the file specifies them.
+
+    Args:
+        root: Element ``<robot>``.
+
+    Returns:
+        Limits by joint name.
+    """
     limits = {}
     for joint in find_children(root, "joint"):
         for limit in find_children(joint, "limit"):

@@ -191,7 +191,16 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the forces (L, D) along the joints, each from the total load of the supply."""
+        """Compute the forces (L, D) along the joints, each from the total load of the supply.
+
+        A supply is shared by several drives, so its voltage sags with the sum of their forces.
+        `joints` and `effect` are bound by the enclosing function.
+
+        Args:
+            self: Effect at the place.
+            c: (K, L, 1) coefficients.
+            moment: State of the robot.
+        """
         robot = cast(RobotSnapshot, moment)
         total_load = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
         result = np.zeros_like(moment.x)
@@ -463,7 +472,11 @@ def make_effect_classes(
 
 
 def _needs_no_engine_support(effect: type[Effect]) -> bool:
-    """Return whether an effect can act at one of several places without the engine's support."""
+    """Return whether an effect can act at one of several places without the engine's support.
+
+    Args:
+        effect: Effect class that may act at joints, actuators or sensors.
+    """
     if issubclass(effect, Input | Sensor):
         return True
     # A force that needs more than its own joint is undefined at one of several joints.

@@ -247,7 +247,14 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
 
 
 def has_radius(robot: RobotModel, geom: int) -> bool:
-    """Return whether a geom of a moving body is a sphere, capsule, ellipsoid or cylinder."""
+    """Return whether a geom of a moving body is a sphere, capsule, ellipsoid or cylinder.
+
+    Only the radius of such a shape can be wrong in the model file and be visible in the motion.
+
+    Args:
+        robot: Robot with its compiled model.
+        geom: Index of the geom.
+    """
     import mujoco
 
     kinds = mujoco.mjtGeom
