@@ -18,7 +18,11 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.prediction_error.identification_without_simulation import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.diagnosis.prediction_error.regression_selection import compute_p_value_of_gain
-from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
+from bench.diagnosis.search.alternative_causes import (
+    AlternativeFinder,
+    CauseEvidence,
+    select_preferred_model,
+)
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
@@ -86,11 +90,15 @@ class Confirmation(Inquiry):
         self._model = search.fit_to_convergence(self._model)
         lack_of_fit = assess_lack_of_fit(search, self._model)
         search_control.begin_question("alternatives")
-        causes = self.alternative_finder(
-            search, self._trial, lack_of_fit.has_structure
-        ).collect_evidence(self._model)
+        found, trial = self._model, self._trial
+        model, causes = select_preferred_model(
+            self.alternative_finder(search, trial, lack_of_fit.has_structure), found
+        )
+        if model is not found:
+            model = search.fit_to_convergence(model)
+            if trial is not None:
+                trial.evaluate_models([model])
         search_control.check_not_stopped()
-        model, trial = self._model, self._trial
         state = DiagnosisState(
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),

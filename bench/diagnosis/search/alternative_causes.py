@@ -32,6 +32,11 @@ from bench.diagnosis.search.verdict_rules import (
 
 MAX_COMPETITOR_DISTANCE = 30.0
 """Maximum difference in twice the log-likelihood (merit) of competing models that are refitted."""
+MAX_RANGE_EXCESS = 10.0
+"""Maximum coefficient of an alternative to a plausible effect, in half plausible ranges.
+
+An inertia that is a hundred times that of the model file is no alternative to an armature.
+"""
 MAX_COMPETITOR_EXCESS_RATIO = 1.5
 """Maximum excess of refitted competing models, as a multiple of the excess of the model."""
 
@@ -233,7 +238,7 @@ class CauseEvidence:
         p_value: p-value of its gain under the hypothesis that it is absent.
         gain: loss of twice the log-likelihood without it.
         preferred: effect to report for the set: the likeliest one, including held-out runs, among
-            those with plausible coefficients.
+            those with the most plausible coefficients.
     """
 
     effect: str
@@ -275,9 +280,16 @@ class AlternativeFinder:
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._compute_p_value(reduced_model, effect, gain)
         competing_effects = self._list_competing_effects(model, effect)
-        # Effects with implausible coefficients come last in their set.
-        competing_effects.sort(key=lambda pair: (not self._is_plausible(pair[1]), pair))
-        ordered_effects = [name for _, name in competing_effects]
+        # Effects with implausible coefficients come last in their set, the least plausible at the
+        # end.
+        excesses = {name: self._compute_range_excess(name) for _, name in competing_effects}
+        competing_effects.sort(key=lambda pair: (excesses[pair[1]], pair))
+        is_one_plausible = min(excesses.values()) <= 1.0
+        ordered_effects = [
+            name
+            for _, name in competing_effects
+            if name == effect or not (is_one_plausible and excesses[name] > MAX_RANGE_EXCESS)
+        ]
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.
@@ -464,20 +476,46 @@ class AlternativeFinder:
                 null_penalties += self.search.get_effect_penalty(name)
         return model.penalised_log_likelihood + null_penalties
 
-    def _is_plausible(self, effect: str) -> bool:
-        """Return whether the best fit of an effect has coefficients in their plausible ranges.
+    def _compute_range_excess(self, effect: str) -> float:
+        """Return how far the coefficients of an effect are outside their plausible ranges.
 
-        The best fit is the model with the effect that has the highest penalised log-likelihood.
+        They are those of the model with the effect that has the highest penalised log-likelihood.
+
+        Returns:
+            The largest distance of a coefficient from the middle of its range, in half ranges; 1 if
+            all are within their ranges, and infinity if no model with the effect was fitted.
         """
         evaluator = self.search.evaluator
         models_with_effect = [m for m in self.search.models.values() if effect in m.effects]
         if not models_with_effect:
-            return False
+            return float("inf")
         best = max(models_with_effect, key=lambda m: m.penalised_log_likelihood)
         parameters = evaluator.parameters[evaluator.coefficient_slices[effect]]
-        values = best.fit.theta[evaluator.coefficient_slices[effect]]
+        values = best.fit.theta[evaluator.coefficient_slices[effect]].tolist()
+        distances = [1.0]
         for parameter, value in zip(parameters, values, strict=True):
             low, high = parameter.bounds
             if not low <= value <= high:
-                return False
-        return True
+                distances.append(2.0 * abs(value - 0.5 * (low + high)) / (high - low))
+        return max(distances)
+
+
+def select_preferred_model(
+    finder: AlternativeFinder, model: FittedModel
+) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
+    """Replace each effect by the preferred one of its indistinguishable alternatives.
+
+    Args:
+        finder: finds the alternatives.
+        model: the model found.
+
+    Returns:
+        The model with the preferred effects if it was fitted, else the given one, and the evidence
+        for its effects.
+    """
+    causes = finder.collect_evidence(model)
+    names = frozenset(cause.preferred for cause in causes)
+    preferred_model = finder.search.models.get(names, model)
+    if preferred_model is model:
+        return model, causes
+    return preferred_model, finder.collect_evidence(preferred_model)

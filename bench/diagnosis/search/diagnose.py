@@ -23,6 +23,7 @@ from bench.diagnosis.search.alternative_causes import (
     list_competing_models,
     refine_best_model,
     select_decisive,
+    select_preferred_model,
 )
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
@@ -146,7 +147,9 @@ class Inquiry:
         if search.thorough and self._accept_larger_model(lack_of_fit):
             lack_of_fit = assess_lack_of_fit(search, self._model)
         self._search_control.begin_question("alternatives")
-        model, causes = _select_preferred_model(search, self._trial, self._model, lack_of_fit)
+        model, causes = select_preferred_model(
+            AlternativeFinder(search, self._trial, lack_of_fit.has_structure), self._model
+        )
         validation = self._trial
         if model.effects != validated_effects:
             model = search.fit_to_convergence(model)
@@ -361,33 +364,6 @@ def _validate_on_held_out(
         [search.base_model, model, *competing_models, *submodels, *singles[:MAX_VALIDATED_SINGLES]]
     )
     return validation
-
-
-def _select_preferred_model(
-    search: EffectSearch,
-    validation: HeldOutValidation | None,
-    model: FittedModel,
-    lack_of_fit: LackOfFitResult,
-) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
-    """Replace each effect by the preferred one of its indistinguishable alternatives.
-
-    Args:
-        search: the search.
-        validation: held-out predictions; None if no run can be held out.
-        model: the model found.
-        lack_of_fit: lack-of-fit result of this model.
-
-    Returns:
-        The model with the preferred effects if it was fitted, else the given one, and the evidence
-        for its effects.
-    """
-    alternatives = AlternativeFinder(search, validation, lack_of_fit.has_structure)
-    causes = alternatives.collect_evidence(model)
-    names = frozenset(cause.preferred for cause in causes)
-    preferred_model = search.models.get(names, model)
-    if preferred_model is model:
-        return model, causes
-    return preferred_model, alternatives.collect_evidence(preferred_model)
 
 
 def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:

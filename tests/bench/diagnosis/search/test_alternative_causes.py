@@ -19,7 +19,7 @@ def placed(place="", contains=(), coordinate=None):
 
 def evidence(
     monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, sizes=(1, 1, 1),
-    loops=(), **excess,
+    loops=(), excess_of_ranges=None, **excess,
 ):  # fmt: skip
     scores = SimpleNamespace(
         effects=("a", "b", "c"), null_quantiles=np.full(3, luck), null_scores=np.zeros((3, 40))
@@ -41,8 +41,9 @@ def evidence(
         has_linearisation=False,
         simulator=SimpleNamespace(system=SimpleNamespace(loops=loops)),
     )
+    ranks = {name: 1.0 if name in plausible else 2.0 for name in "abc"} | (excess_of_ranges or {})
     monkeypatch.setattr(
-        AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
+        AlternativeFinder, "_compute_range_excess", lambda self, effect: ranks[effect]
     )
     (found,) = AlternativeFinder(search, trial, structure).collect_evidence(BEST)
     return found
@@ -80,6 +81,22 @@ def test_the_refit_or_the_best_score_may_see_that_it_is_no_chance(monkeypatch, l
 
 def test_a_competitor_with_plausible_coefficients_is_preferred(monkeypatch):
     assert evidence(monkeypatch, plausible="bc").preferred == "b"
+
+
+def test_of_two_implausible_effects_that_nearer_to_its_range_is_preferred(monkeypatch):
+    found = evidence(monkeypatch, excess_of_ranges={"a": 200.0, "b": 1.5, "c": 1.2})
+    assert found.preferred == "b", "c is distinguishable"
+
+
+@pytest.mark.parametrize(("excess", "alternatives"), [(9.0, ("b",)), (11.0, ())])
+def test_an_effect_far_outside_its_range_is_no_alternative_to_a_plausible_one(
+    monkeypatch, excess, alternatives
+):
+    found = evidence(monkeypatch, excess_of_ranges={"b": excess})
+    assert (found.preferred, found.alternatives) == ("a", alternatives)
+    # It is one if no effect is plausible.
+    found = evidence(monkeypatch, excess_of_ranges={"a": 2.0, "b": excess})
+    assert found.alternatives == ("b",)
 
 
 def test_held_out_runs_have_a_voice(monkeypatch):
@@ -125,7 +142,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     search = search_of(model(), BEST, INDISTINGUISHABLE, DISTINGUISHABLE)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.evaluator = SimpleNamespace(available_effects=effects, has_linearisation=False)
-    monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(AlternativeFinder, "_compute_range_excess", lambda self, effect: 1.0)
     monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
     assert found.alternatives == kept
@@ -147,7 +164,7 @@ def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
         coefficient_slices={"a": slice(0, 1), "b": slice(1, 2)},
     )
     search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
-    monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(AlternativeFinder, "_compute_range_excess", lambda self, effect: 1.0)
     monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
     assert found.alternatives == alternatives
