@@ -24,22 +24,10 @@ class MuJoCoSysId(Tuner):
     stochastic: ClassVar[bool] = False
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Pass the toolbox's points to the harness, finite differences in one batch.
-
-        Args:
-            task: Task with the start, the dimension and the residuals.
-            rng: Not used, because the method is deterministic.
-        """
+        """Pass the toolbox's points to the harness, finite differences in one batch."""
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
-            """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns.
-
-            Args:
-                residuals: Function of the harness that simulates points.
-
-            Returns:
-                Reason for which it stopped.
-            """
+            """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""
             # MuJoCo would look for a display in another process.
             os.environ.setdefault("MUJOCO_GL", "disable")
             sysid = importlib.import_module("mujoco.sysid")  # it has no types

@@ -22,12 +22,7 @@ class DualAnnealing(Tuner):
     requires: ClassVar[tuple[str, ...]] = ("scipy",)
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Pass SciPy's points to the harness one by one.
-
-        Args:
-            task: Task with the start and the dimension.
-            rng: Random generator of the run.
-        """
+        """Pass SciPy's points to the harness one by one."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
             """Minimise the loss over the unit cube with dual annealing; return why it stopped."""

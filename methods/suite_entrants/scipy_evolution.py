@@ -24,12 +24,7 @@ class DifferentialEvolution(Tuner):
     }
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Pass SciPy's points to the harness one by one.
-
-        Args:
-            task: Task with the start and the dimension.
-            rng: Random generator of the run.
-        """
+        """Pass SciPy's points to the harness one by one."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
             """Minimise the loss by differential evolution in the unit cube; return why it stops."""

@@ -1,0 +1,125 @@
+"""Rounds of sequential neural posterior estimation on one target, by sbi.
+
+A simulation enters as its residuals, reduced to their principal components: with some hundred
+simulations, a network cannot read thousands of samples.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from methods.learning.library_isolation import NullTracker, isolated_library_call
+from methods.tuner import Array, Evaluation, Task
+
+_MAX_COMPONENTS = 10
+"""Maximum number of principal components of the residuals that the network reads."""
+_POSTERIOR_DRAWS = 1000
+"""Number of posterior samples of which the mean is the recommendation."""
+_MIN_SINGULAR_VALUE = 1e-9
+"""Singular value, relative to the largest one, below which a component is a rounding error."""
+
+
+class PosteriorRounds:
+    """Posterior of one target's parameters, improved round by round.
+
+    Args:
+        task: task of the target.
+
+    Attributes:
+        mean: (dim,) posterior mean; None before the first update.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Begin without simulations; the network is made with the first round's components.
+
+        `_trainer` and `_posterior` are objects of sbi. `_components` (N, P) are the P principal
+        components of the N residuals, `_centre` (N,) their mean, `_widths` (P,) the spread along
+        each component.
+        """
+        self.mean: Array | None = None
+        self._task = task
+        self._trainer: Any = None
+        self._posterior: Any = None
+        self._components: Array | None = None
+        self._centre: Array = np.zeros(0)
+        self._widths: Array = np.ones(0)
+
+    def update(self, evaluation: Evaluation, count: int, rng: np.random.Generator) -> Array:
+        """Train on one more round of simulations, and draw the points of the next.
+
+        With too few successful simulations the points are uniformly random.
+
+        Args:
+            evaluation: evaluation of the round's points.
+            count: number of points to draw.
+            rng: random generator.
+
+        Returns:
+            (count, dim) points drawn from the posterior.
+        """
+        residuals = self._task.residuals(evaluation.observations)
+        usable = np.isfinite(residuals).all(axis=1)
+        # Two simulations are the minimum for a training and a validation set.
+        if usable.sum() < 2 + 2 * (self._components is None):
+            return rng.uniform(size=(count, self._task.dim))
+        points, residuals = evaluation.proposals[usable], residuals[usable]
+        if self._components is None:
+            self._fit_components(residuals)
+        with isolated_library_call(rng):
+            return self._train_round(points, self._compute_features(residuals), count)
+
+    def _fit_components(self, residuals: Array) -> None:
+        """Compute the principal components of the first round's residuals (n, N).
+
+        Later rounds use the same components, so that the network's inputs keep their meaning. At
+        most `_MAX_COMPONENTS` are used; those without variance (rounding errors) are left out.
+        """
+        self._centre = residuals.mean(axis=0)
+        _, singular, directions = np.linalg.svd(residuals - self._centre, full_matrices=False)
+        component_count = max(
+            int((singular[:_MAX_COMPONENTS] > _MIN_SINGULAR_VALUE * singular[0]).sum()), 1
+        )
+        self._components = directions[:component_count].T
+        spread = ((residuals - self._centre) @ self._components).std(axis=0)
+        self._widths = np.where(spread > 0, spread, 1.0)
+
+    def _compute_features(self, residuals: Array) -> Array:
+        """Return the scaled components of residuals (n, N); a perfect simulation has residual 0."""
+        assert self._components is not None
+        features: Array = (residuals - self._centre) @ self._components / self._widths
+        return features
+
+    def _train_round(self, points: Array, features: Array, count: int) -> Array:
+        """Add one round of simulations, train the posterior, and draw `count` points (count, dim).
+
+        The posterior is that of a residual of zero, the features of a perfect simulation. It is
+        also the proposal of the next round, by which sbi weights the next simulations.
+
+        Args:
+            points: (n, dim) simulated points.
+            features: (n, P) scaled principal components of their residuals.
+            count: number of points to draw.
+        """
+        import torch
+        from sbi.inference import NPE
+        from sbi.utils import BoxUniform
+
+        dim = self._task.dim
+        if self._trainer is None:
+            prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
+            self._trainer = NPE(prior=prior, tracker=NullTracker(), show_progress_bars=False)
+        self._trainer.append_simulations(
+            torch.as_tensor(points, dtype=torch.float32),
+            torch.as_tensor(features, dtype=torch.float32),
+            proposal=self._posterior,
+        )
+        self._trainer.train(training_batch_size=min(50, len(points)))
+        zero = self._compute_features(np.zeros((1, len(self._centre))))
+        target = torch.as_tensor(zero, dtype=torch.float32)
+        self._posterior = self._trainer.build_posterior().set_default_x(target)
+        draws = self._posterior.sample((max(count, _POSTERIOR_DRAWS),)).numpy().astype(np.float64)
+        self.mean = draws.mean(axis=0)
+        drawn_points: Array = np.clip(draws[:count], 0.0, 1.0)
+        return drawn_points
