@@ -69,6 +69,8 @@ MIN_REPORTED_CHANGE = 1e-3
 """Minimum relative change of a parameter that can be reported as absorption, however narrow its
 interval.
 """
+MAX_SENTENCES_ON_PARAMETERS = 3
+"""Maximum number of parameters that get a sentence each."""
 NOISE_TOLERANCE = 0.02
 """Relative difference up to which two noise levels are printed as one."""
 
@@ -118,8 +120,7 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
         unit = "RMS in units of the noise (1 is the noise floor)"
         yield f"Where the gap is largest, {unit}: {'; '.join(gap_texts)}."
     if report.parameters:
-        sentences = [format_parameter_shift(report, p) for p in report.parameters]
-        yield "Parameters: " + " ".join(sentences)
+        yield "Parameters: " + format_parameter_shifts(report)
     # For a single log with consistent runs there is nothing to report.
     if any(
         not spread.is_consistent or spread.by == "log"
@@ -610,6 +611,28 @@ def format_largest_gap(report: DiagnosisReportData, kind: str) -> str:
     worst: GapLocation = max(locations, key=lambda location: location.before)
     after = f" before, {format_number(worst.after, 2)} after" if report.verdict.causes else ""
     return f"{kind} {sanitise(worst.label, 60)} ({format_number(worst.before, 2)}{after})"
+
+
+def format_parameter_shifts(report: DiagnosisReportData) -> str:
+    """Format how far the parameters move once the cause is in the model.
+
+    A few get a sentence each; more are listed without intervals, which the page contains.
+
+    Args:
+        report: Report data.
+    """
+    shifts = [p for p in report.parameters if p.is_sensitive]
+    if not report.verdict.causes or len(shifts) <= MAX_SENTENCES_ON_PARAMETERS:
+        return " ".join(format_parameter_shift(report, p) for p in report.parameters)
+    count = sum(has_absorbed_gap(p) for p in shifts)
+    absorbed = f"{count} of {len(shifts)} had absorbed part of the gap" if count else "as before"
+    values = [
+        f"{sanitise(p.name, 60)} {format_number(p.before[0], 2)} → "
+        + (format_tuned_value(p, 1) if p.bounds[1] else format_number(p.after[0], 2) + p.in_file)
+        for p in shifts
+    ]
+    fixed = [format_parameter_shift(report, p) for p in report.parameters if not p.is_sensitive]
+    return " ".join([f"{absorbed} (before → after): {'; '.join(values)}.", *fixed])
 
 
 def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> str:

@@ -19,6 +19,7 @@ from bench.diagnosis.report.report_data import ParameterChange
 from bench.diagnosis.report.summary_text import (
     format_headline,
     format_parameter_shift,
+    format_parameter_shifts,
     format_shift,
     format_summary,
     has_absorbed_gap,
@@ -207,6 +208,25 @@ def test_a_partial_verdict_for_a_bound_says_which():
 def test_a_parameter_at_its_bound_is_said_to_be_there():
     p = ParameterChange("mass", "kg", (1.0, 0.9, 1.1), (10.0, np.nan, np.nan), True, (None, "high"))
     assert "10 kg (upper bound of its range) after" in format_parameter_shift(make_report(), p)
+
+
+def test_many_parameters_are_listed_without_intervals():
+    in_file = ", in the model file 20 → 21 N·m/rad"
+    stiff = ParameterChange(
+        "kp", "1", (-0.3, -0.4, -0.2), (0.05, 0.04, 0.06), True, in_file=in_file
+    )
+    still = ParameterChange("kv", "1", (0.1, 0.0, 0.2), (0.1, 0.0, 0.2), True)
+    mass = ParameterChange(
+        "mass", "kg", (1.0, 0.9, 1.1), (9.0, np.nan, np.nan), True, (None, "high")
+    )
+    report = make_report("named", causes=[DRAG])
+    three = format_parameter_shifts(replace(report, parameters=[stiff, still, mass]))
+    assert three.count("before") == 3
+    four = format_parameter_shifts(replace(report, parameters=[stiff, still, still, mass]))
+    assert four == (
+        "2 of 4 had absorbed part of the gap (before → after): kp −0.3 → 0.05, in the model file "
+        "20 → 21 N·m/rad; kv 0.1 → 0.1; kv 0.1 → 0.1; mass 1 → 9 kg (upper bound of its range)."
+    )
 
 
 def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
