@@ -29,11 +29,12 @@ from bench.diagnosis.pipeline.recording_errors import (
     refuse_broken_conventions,
 )
 from bench.diagnosis.pipeline.recording_preparation import RecordingSource, prepare_runs
+from bench.diagnosis.pipeline.report_data_builder import DiagnosisReportDataBuilder
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext, SimulatedRuns
 from bench.diagnosis.pipeline.solver_option_choice import SolverOptionChoice
 from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
-from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
+from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
 from bench.diagnosis.verdict import Cause
 from sims.core.simulator import InputError
 
@@ -220,19 +221,11 @@ def _build_explanation(result: SearchResult, numerics_causes: Sequence[Cause]) -
         result: result of the search.
         numerics_causes: wrong numerical settings of the model file.
     """
-    runs, search, finding = result.runs, result.search, result.finding
-    context, builder = runs.context, runs.verdict_builder
-    verdict = replace(
-        builder.build_verdict(search, finding, result.rng, context.started),
-        recording_faults=result.errors,
-        recording_notes=runs.recording.notes,
-    )
-    verdict = add_numerics_causes(verdict, numerics_causes)
-    theta = finding.model.fit.theta
-    notes = *describe_unusual_values(runs.fitting, theta, context.wider), *context.notes
-    report_data = DiagnosisReportDataBuilder(
-        builder, search, result.base.fit, finding, notes
-    ).build_report_data(verdict)
+    verdict = add_numerics_causes(VerdictBuilder(result).build_verdict(), numerics_causes)
+    runs, theta = result.runs, result.finding.model.fit.theta
+    unusual_values = describe_unusual_values(runs.fitting, theta, runs.context.wider)
+    notes = *unusual_values, *runs.context.notes
+    report_data = DiagnosisReportDataBuilder(result, notes).build_report_data(verdict)
     return Explanation(verdict, report_data, build_extended_simulator(result))
 
 
@@ -247,11 +240,6 @@ def _design_next_run(result: SearchResult, seconds: float, longest: float) -> Ne
         seconds: Duration of the run in seconds.
         longest: Maximum duration in seconds, if `seconds` do not suffice.
     """
-    search, finding = result.search, result.finding
-    for cause in finding.causes:
-        other_causes = {name for name in finding.model.effects if name != cause.effect}
-        keys = [frozenset({*other_causes, effect}) for effect in cause.alternatives]
-        competing_models = [search.models[key] for key in keys if key in search.models]
-        if competing_models:
-            return design_next_run(search, finding.model, competing_models, seconds, longest)
-    return design_next_run(search, finding.model, (), seconds, longest)
+    competing_models = result.list_competing_models()
+    model = result.finding.model
+    return design_next_run(result.search, model, competing_models, seconds, longest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -54,6 +55,11 @@ class BaseModel:
             np.isfinite(self.fit.fit.cost)
         )
 
+    def join_names(self, indices: Iterable[int]) -> str:
+        """Join the names of parameters with these indices in theta."""
+        parameters = self.runs.fitting.parameters
+        return ", ".join(parameters[i].name for i in sorted(indices))
+
     def rate(self) -> tuple[float, float]:
         """Return twice the log-likelihood and the RMS residual in units of the noise."""
         search = self.runs.create_search(self.fit)
@@ -90,10 +96,7 @@ class BaseModel:
             return self
         runs = self.runs
         fit = freeze_unidentified_parameters(runs.fitting, runs.noise, self.fit, runs.create_search)
-        if fit.unidentified_parameters:
-            names = ", ".join(
-                runs.fitting.parameters[i].name for i in sorted(fit.unidentified_parameters)
-            )
+        if names := self.join_names(fit.unidentified_parameters):
             runs.context.say(
                 "kept at the nominal value, because the recording does not identify it "
                 f"together with the others: {names}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
 from sims import extended_simulator as extend
 from sims.extended_simulator import ExtendedSimulator
 
@@ -15,8 +16,8 @@ def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
     """
     runs, model = result.runs, result.finding.model
     evaluator, recording = runs.fitting, runs.recording
-    builder = runs.verdict_builder
-    estimates = builder.collect_parameter_estimates(result.search, model)
+    builder = VerdictBuilder(result)
+    estimates = builder.collect_parameter_estimates(model)
     base_values = {
         p.name: estimates[i]
         for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])

@@ -61,6 +61,21 @@ class SearchResult:
         is_stopped = self.finding.early_stop is not None
         return bool(self.errors) or is_stopped or self.runs.context.search_control.is_over()
 
+    def list_competing_models(self) -> list[FittedModel]:
+        """Return the models with an alternative in place of the strongest cause that has some.
+
+        The most plausible alternative comes first.
+        """
+        for cause in self.finding.causes:
+            others = {name for name in self.finding.model.effects if name != cause.effect}
+            keys = [frozenset({*others, effect}) for effect in cause.alternatives]
+            competing_models = [
+                self.search.models[key] for key in keys if key in self.search.models
+            ]
+            if competing_models:
+                return competing_models
+        return []
+
     def rate(self) -> tuple[float, float]:
         """Return the penalised log-likelihood and the excess RMS residual of the found model."""
         return rate_model(self.search, self.finding.model)

@@ -22,7 +22,6 @@ from bench.diagnosis.pipeline.contact_conditions import ContactConditions
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns, Validation
-from bench.diagnosis.verdict_builder import VerdictBuilder
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
@@ -180,11 +179,9 @@ class SimulatedRuns:
         return FollowedRuns.follow(self.fitting, self.fitting.get_nominal_theta(), self.noise)
 
     @property
-    def verdict_builder(self) -> VerdictBuilder:
-        """Builder of the verdict on these runs."""
-        return VerdictBuilder(
-            self.recording, self.fitting, self.validation, self.floor, self.engine, self.before
-        )
+    def predicted(self) -> RunEvaluator | None:
+        """Run evaluator of the runs that the validation predicts; all runs if it is by folds."""
+        return None if self.validation is None else self.validation.evaluator
 
     def make_rng(self) -> np.random.Generator:
         """Return the random numbers of a search, which depend on the seed alone."""

@@ -14,9 +14,9 @@ from bench.diagnosis.evaluation.noise_floor import (
     compute_value_range,
 )
 from bench.diagnosis.explain import explain
+from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
-from bench.diagnosis.verdict_builder import VerdictBuilder
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
 
 
@@ -108,11 +108,13 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     measured |= {
         (name,): SimpleNamespace(penalised_log_likelihood=m) for name, m in held_out.items()
     }
-    runs = SimpleNamespace(evaluator=SimpleNamespace(observed=np.zeros((1, 4, 1))))
-    floor = SimpleNamespace(sigma=np.ones(1))
+    runs = SimpleNamespace(
+        predicted=SimpleNamespace(observed=np.zeros((1, 4, 1))),
+        floor=SimpleNamespace(sigma=np.ones(1)),
+    )
     finding = DiagnosisResult("unknown", base, base, (), left, held_out_fits=measured)
-    assessor = VerdictBuilder(None, None, runs, floor, None)
-    return assessor._is_refuted(search, finding)
+    result = SimpleNamespace(runs=runs, search=search, finding=finding)
+    return VerdictBuilder(result)._is_refuted()
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
+from bench.diagnosis.pipeline.report_data_builder import DiagnosisReportDataBuilder
 from bench.diagnosis.report.explanation_figures import RenderedFigure
 from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
-from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
 from bench.pages.html_page import make_iframe
 from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
@@ -396,7 +396,7 @@ def test_the_track_of_a_film_is_drawn_next_to_the_curves(figures, tmp_path):
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
         return DiagnosisReportDataBuilder._read_track_figure(
-            SimpleNamespace(assessor=SimpleNamespace(recording=recording))
+            SimpleNamespace(result=SimpleNamespace(runs=SimpleNamespace(recording=recording)))
         )
 
     tracked = ("u", "v", "radius_px")

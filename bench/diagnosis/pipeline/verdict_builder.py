@@ -15,7 +15,6 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     get_bounds_by_index,
     is_unusual,
 )
-from bench.diagnosis.evaluation.noise_floor import NoiseFloor
 from bench.diagnosis.evaluation.run_data import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.discriminating_run import (
@@ -24,22 +23,20 @@ from bench.diagnosis.experiment_design.discriminating_run import (
 )
 from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
+from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
-from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.score_test import estimate_tail_p_value
 from bench.diagnosis.validation.gain_and_intervals import (
     HeldOutGain,
     compute_held_out_gain,
     compute_intervals,
 )
-from bench.diagnosis.validation.held_out_runs import Validation
 from bench.diagnosis.verdict import Candidate, Cause, HeldOutResult, Verdict, to_finite_or_none
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
-from sims.recording.recording import Recording
 from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated
 
 MIN_REPORTED_GAIN = -9.0
@@ -48,114 +45,81 @@ MIN_REPORTED_GAIN = -9.0
 
 @dataclass(frozen=True)
 class VerdictBuilder:
-    """Builds the verdict and its numbers from a finding.
+    """Builds the verdict and its numbers from the result of a search.
 
     Attributes:
-        recording: Recording that is explained.
-        fitting_evaluator: Run evaluator of the runs for fitting.
-        validation: Validation on held-out runs or by cross-validation; None without either.
-        noise_floor: Noise floor of each channel.
-        engine: Name of the engine; None for a simulator with its own integrator.
-        before: Base prediction of the held-out runs with the model file's own step, if that step
-            was found too coarse; otherwise None.
+        result: Result of the search.
     """
 
-    recording: Recording
-    fitting_evaluator: RunEvaluator
-    validation: Validation | None
-    noise_floor: NoiseFloor
-    engine: str | None
-    before: Array | None = None
+    result: SearchResult
 
     @property
-    def held_out_evaluator(self) -> RunEvaluator | None:
-        """Return the runs that the validation predicts; all runs if it is cross-validation."""
-        return None if self.validation is None else self.validation.evaluator
+    def _evaluator(self) -> RunEvaluator:
+        """Run evaluator of the runs for fitting."""
+        return self.result.runs.fitting
 
-    @property
-    def _resamples_segments(self) -> bool:
-        """Return whether gains are resampled by segments, because cross-validated runs are few."""
-        return self.validation is not None and self.validation.is_cross_validation
-
-    def build_verdict(
-        self,
-        search: EffectSearch,
-        finding: DiagnosisResult,
-        rng: np.random.Generator,
-        started: float,
-    ) -> Verdict:
-        """Build the verdict for a finding.
-
-        Args:
-            search: Search that produced the finding.
-            finding: Outcome of the search.
-            rng: Random generator of the bootstrap.
-            started: Value of `time.perf_counter` at the start of the diagnosis.
-        """
-        evaluator = self.fitting_evaluator
-        numbers = self.collect_parameter_estimates(search, finding.model)
-        causes = self.build_causes(search, finding)
+    def build_verdict(self) -> Verdict:
+        """Build the verdict."""
+        result, runs, evaluator = self.result, self.result.runs, self._evaluator
+        finding = result.finding
+        numbers = self.collect_parameter_estimates(finding.model)
+        causes = self.build_causes()
         parameters = {
             evaluator.parameters[i].name: numbers[i] for i in evaluator.base_indices.tolist()
         }
         # Simulations for the proposal of an experiment are not part of the answer.
         simulations = evaluator.simulation_count
-        if self.validation is not None:
-            simulations += self.validation.simulations
-        heldout = self._measure_held_out_gain(finding, rng)
-        candidates = self._list_candidates(search, finding)
-        next_run = self._propose_next_run(search, finding)
+        if runs.validation is not None:
+            simulations += runs.validation.simulations
+        heldout = self._measure_held_out_gain()
+        candidates = self._list_candidates()
+        next_run = self._propose_next_run()
         return Verdict(
             finding.verdict,
-            self.recording.system,
-            self.engine or "its own",
+            runs.recording.system,
+            runs.engine or "its own",
             causes,
             parameters,
             heldout,
             candidates,
             next_run,
             int(simulations),
-            time.perf_counter() - started,
+            time.perf_counter() - runs.context.started,
             finding.early_stop,
+            recording_faults=result.errors,
+            recording_notes=runs.recording.notes,
         )
 
-    def build_causes(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Cause, ...]:
+    def build_causes(self) -> tuple[Cause, ...]:
         """Build the causes of the verdict: those found, with values and intervals of coefficients.
-
-        Args:
-            search: Search that produced the finding.
-            finding: Outcome of the search; its causes have names and evidence only.
 
         Returns:
             One `Cause` of the verdict for each cause found, in the same order.
         """
-        numbers = self.collect_parameter_estimates(search, finding.model)
-        return tuple(self._build_cause(cause, numbers) for cause in finding.causes)
+        numbers = self.collect_parameter_estimates(self.result.finding.model)
+        return tuple(self._build_cause(cause, numbers) for cause in self.result.finding.causes)
 
-    def collect_parameter_estimates(
-        self, search: EffectSearch, model: FittedModel
-    ) -> dict[int, FittedValue]:
+    def collect_parameter_estimates(self, model: FittedModel) -> dict[int, FittedValue]:
         """Collect the estimates of all parameters and coefficients by index.
 
         Args:
-            search: Search that produced the model.
-            model: Fitted model.
+            model: Fitted model of the search.
 
         Returns:
             Estimates by index in the parameter vector; those that were not fitted have no interval.
         """
-        intervals = compute_intervals(search, model)
+        intervals = compute_intervals(self.result.search, model)
         ranges = self._get_bounds(model)
         estimates = {}
-        for index, parameter in enumerate(self.fitting_evaluator.parameters):
+        for index, parameter in enumerate(self._evaluator.parameters):
             # Insensitive parameters stay nominal; effects that are not in the model are zero.
             unfitted_estimate = float(model.fit.theta[index]), np.nan, np.nan
             value, low, high = intervals.get(index, unfitted_estimate)
             if is_instant(parameter):
                 # The time of an event is only known to one sample spacing.
                 low, high = (
-                    low - self.fitting_evaluator.sample_interval / 2,
-                    high + self.fitting_evaluator.sample_interval / 2,
+                    low - self._evaluator.sample_interval / 2,
+                    high + self._evaluator.sample_interval / 2,
                 )
             at_bound = bound_of(value, *ranges[index]) if index in intervals else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
@@ -178,10 +142,8 @@ class VerdictBuilder:
 
     def _get_plausible_range(self, index: int) -> tuple[float, float]:
         """Return the plausible range, narrower than the bounds for a robot's free numbers."""
-        parameter = self.fitting_evaluator.parameters[index]
-        is_free = (
-            self.fitting_evaluator.kind.has_model and index in self.fitting_evaluator.base_indices
-        )
+        parameter = self._evaluator.parameters[index]
+        is_free = self._evaluator.kind.has_model and index in self._evaluator.base_indices
         return parameter.training or parameter.bounds if is_free else parameter.bounds
 
     def _add_totals(
@@ -192,7 +154,7 @@ class VerdictBuilder:
         Numbers of effects that change no number of the file remain as they are. `numbers` is by
         index in the parameter vector.
         """
-        kind: Any = self.fitting_evaluator.kind
+        kind: Any = self._evaluator.kind
         if not kind.has_model:
             return numbers
         # This import is needed for robots only.
@@ -225,7 +187,7 @@ class VerdictBuilder:
 
         An effect that acts at all places is divided into its members.
         """
-        evaluator, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
+        evaluator, kind = self._evaluator, cast(Any, self._evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
         indices = iter(range(evaluator.system_parameter_count))
         for effect in kind.system.freed_effects:
@@ -243,25 +205,21 @@ class VerdictBuilder:
 
     def _get_bounds(self, model: FittedModel) -> dict[int, tuple[float, float]]:
         """Return the bounds of each fitted number, by index in the parameter vector."""
-        evaluator = self.fitting_evaluator
+        evaluator = self._evaluator
         ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base_indices.tolist()}
         return ranges | get_bounds_by_index(evaluator, model.effects)
 
-    def restrict_verdict(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
-        """Return the finding with the verdict that its numbers and the fitted models allow.
-
-        Args:
-            search: Search that produced the finding.
-            finding: Outcome of the search.
-        """
-        if finding.verdict == "unknown" and self._is_refuted(search, finding):
+    def restrict_verdict(self) -> DiagnosisResult:
+        """Return the finding with the verdict that its numbers and the fitted models allow."""
+        finding = self.result.finding
+        if finding.verdict == "unknown" and self._is_refuted():
             return replace(finding, verdict="adequate")
-        estimates = self.collect_parameter_estimates(search, finding.model)
+        estimates = self.collect_parameter_estimates(finding.model)
         unambiguous_causes = [cause for cause in finding.causes if not cause.alternatives]
         coefficient_indices = [
             i
             for cause in unambiguous_causes
-            for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
+            for i in self._evaluator.get_coefficient_indices(cause.effect)
         ]
         are_results = all(
             estimates[i].is_result for i in coefficient_indices
@@ -270,17 +228,14 @@ class VerdictBuilder:
             finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, are_results)
         )
 
-    def _is_refuted(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
+    def _is_refuted(self) -> bool:
         """Return whether fitted models refute a missing effect that only the linear score suggests.
 
         This is so if no fitted model with effects has a higher penalised log-likelihood than the
         base model, or none predicts the held-out runs better. In closed loops and at rest,
         derivatives may predict a gain that no fit achieves.
-
-        Args:
-            search: the search, with all fitted models.
-            finding: result of the diagnosis.
         """
+        search, finding = self.result.search, self.result.finding
         if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
             return False
         extended_models = [model for model in search.models.values() if model.effects]
@@ -290,7 +245,7 @@ class VerdictBuilder:
             if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
         ]
         held_out = finding.held_out_fits or {}
-        excess = self._compute_held_out_excess(finding)
+        excess = self._compute_held_out_excess()
         if not extended_models or (
             excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
         ):
@@ -301,12 +256,13 @@ class VerdictBuilder:
             for names in better_effects
         )
 
-    def _compute_held_out_excess(self, finding: DiagnosisResult) -> float | None:
+    def _compute_held_out_excess(self) -> float | None:
         """Return the excess RMS residual of the base model on held-out runs; None without them."""
-        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
         if runs is None or held_out_fits is None or () not in held_out_fits:
             return None
-        normalised_residual = (runs.observed - held_out_fits[()].simulated) / self.noise_floor.sigma
+        sigma = self.result.runs.floor.sigma
+        normalised_residual = (runs.observed - held_out_fits[()].simulated) / sigma
         return (
             float(np.sqrt(np.square(normalised_residual[np.isfinite(runs.observed)]).mean())) - 1.0
         )
@@ -316,26 +272,20 @@ class VerdictBuilder:
 
         A cause may then compensate for a value beyond the bound.
         """
-        base_estimates = [numbers[i] for i in self.fitting_evaluator.base_indices.tolist()]
+        base_estimates = [numbers[i] for i in self._evaluator.base_indices.tolist()]
         return any(n.at_bound is not None and not n.is_result for n in base_estimates)
 
-    def estimate_noise_sigma(self, finding: DiagnosisResult) -> Array:
+    def estimate_noise_sigma(self) -> Array:
         """Return the noise floor (C,).
 
         It is the specified noise, or else the residual of a model without lack of fit.
         """
+        finding, floor = self.result.finding, self.result.runs.floor
         residual_sigma = finding.model.likelihood.sigma
         # The noise estimate assumes white noise, so the residual of a good model may exceed it.
-        is_usable = (
-            ~self.noise_floor.is_stated
-            & np.isfinite(residual_sigma)
-            & (residual_sigma > self.noise_floor.sigma)
-        )
-        return np.where(
-            is_usable & (not finding.lack_of_fit.has_structure),
-            residual_sigma,
-            self.noise_floor.sigma,
-        )
+        is_usable = ~floor.is_stated & np.isfinite(residual_sigma) & (residual_sigma > floor.sigma)
+        has_no_structure = not finding.lack_of_fit.has_structure
+        return np.where(is_usable & has_no_structure, residual_sigma, floor.sigma)
 
     def _build_cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
         """Build a cause of the verdict from an effect found by the search.
@@ -347,7 +297,7 @@ class VerdictBuilder:
             evidence: the effect and its evidence.
             numbers: fitted values by their index in the parameter vector.
         """
-        evaluator = self.fitting_evaluator
+        evaluator = self._evaluator
         effect = evaluator.available_effects[evidence.effect]
         # A coefficient that cannot be observed is fixed at zero and is not a result.
         coefficients = effect.on(evaluator.simulator.system)
@@ -381,76 +331,69 @@ class VerdictBuilder:
             name: Name of the effect.
             estimates: Estimates by index in the parameter vector.
         """
-        evaluator = self.fitting_evaluator
+        evaluator = self._evaluator
         coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
         indices = evaluator.get_coefficient_indices(name)
         return {c.name: estimates[i] for c, i in zip(coefficients, indices, strict=True)}
 
     def _list_counted_channels(self) -> list[int]:
         """List the channels with the same unit as the channel that sensor effects act on."""
-        evaluator = self.fitting_evaluator
+        evaluator = self._evaluator
         units = [channel.unit for channel in evaluator.simulator.channels]
         reading = evaluator.simulator.system.reading(evaluator.channels)
         # Errors of different units cannot be added.
         unit = units[evaluator.channels.index(reading)]
         return [c for c, channel_unit in enumerate(units) if channel_unit == unit]
 
-    def _compute_noise_floor(self, finding: DiagnosisResult) -> float:
+    def _compute_noise_floor(self) -> float:
         """Compute the RMS of the noise floor over the channels that count."""
-        return float(
-            np.sqrt(
-                np.square(self.estimate_noise_sigma(finding)[self._list_counted_channels()]).mean()
-            )
-        )
+        sigma = self.estimate_noise_sigma()[self._list_counted_channels()]
+        return float(np.sqrt(np.square(sigma).mean()))
 
-    def _measure_held_out_gain(
-        self, finding: DiagnosisResult, rng: np.random.Generator
-    ) -> HeldOutResult | None:
+    def _measure_held_out_gain(self) -> HeldOutResult | None:
         """Measure by how much the causes improve the prediction of held-out runs.
 
         Return None if the prediction of the base model failed, or if no runs were predicted with
         both models.
-
-        Args:
-            finding: result of the diagnosis, with the held-out predictions.
-            rng: source of the bootstrap samples.
         """
-        runs, held_out_fits, names = (
-            self.held_out_evaluator,
-            finding.held_out_fits,
-            finding.model.effects,
-        )
+        runs, finding = self.result.runs.predicted, self.result.finding
+        held_out_fits, names = finding.held_out_fits, finding.model.effects
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
         before, after = held_out_fits[()].simulated, held_out_fits[names].simulated
-        before = before if self.before is None else self.before
+        if self.result.runs.before is not None:
+            before = self.result.runs.before
         # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
-        counted_channels = self._list_counted_channels()
-        gain_arguments = (
-            counted_channels,
-            self._compute_noise_floor(finding),
-            rng,
-            self._resamples_segments,
-        )
-        result = compute_held_out_gain(runs, before, after, *gain_arguments)
-        return _build_held_out_result(
-            result, self.fitting_evaluator.simulator.channels[counted_channels[0]].unit
-        )
+        gain = self._compute_gain(runs, before, after, self.result.rng)
+        channel = self._evaluator.simulator.channels[self._list_counted_channels()[0]]
+        return _build_held_out_result(gain, channel.unit)
 
-    def _list_candidates(
-        self, search: EffectSearch, finding: DiagnosisResult
-    ) -> tuple[Candidate, ...]:
+    def _compute_gain(
+        self, runs: RunEvaluator, before: Array, after: Array, rng: np.random.Generator
+    ) -> HeldOutGain:
+        """Compute the gain of a prediction over that of the base model.
+
+        Args:
+            runs: the predicted runs.
+            before: (R, T, C) prediction of the base model.
+            after: (R, T, C) the other prediction.
+            rng: source of the bootstrap samples.
+        """
+        validation = self.result.runs.validation
+        # Cross-validated runs are few, and gains are resampled by segments.
+        by_segments = validation is not None and validation.is_cross_validation
+        channels, floor = self._list_counted_channels(), self._compute_noise_floor()
+        return compute_held_out_gain(runs, before, after, channels, floor, rng, by_segments)
+
+    def _list_candidates(self) -> tuple[Candidate, ...]:
         """List all effects of the library with their scores about the base model, best first.
 
         A score is reduced by the price of each coefficient beyond the first, so that an effect
         precedes more general effects that contain it.
-
-        Args:
-            search: the search, with the scores about the base model.
-            finding: result of the diagnosis, with the held-out predictions.
         """
+        search = self.result.search
         scores = search.base_scores
         if scores is None:
             return ()
@@ -466,7 +409,7 @@ class VerdictBuilder:
             p_value = float(
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
             )
-            share = self._get_closed_share(finding, (effect,))
+            share = self._get_closed_share((effect,))
             coefficient_slice = search.evaluator.coefficient_slices[effect]
             score -= search.parameter_penalty * (
                 coefficient_slice.stop - coefficient_slice.start - 1
@@ -474,18 +417,17 @@ class VerdictBuilder:
             candidates.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(candidates, key=lambda row: -row.score))
 
-    def _get_closed_share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
+    def _get_closed_share(self, names: EffectNames) -> float | None:
         """Return the share of the held-out gap that a model closes; None if it is not measured.
 
         Args:
-            finding: result of the diagnosis, with the held-out predictions.
             names: names of the effects of the model.
         """
-        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
         counted_channels = self._list_counted_channels()
-        floor = self._compute_noise_floor(finding)
+        floor = self._compute_noise_floor()
         # As for the gain of the whole model, an error below the noise floor is not a gain.
         before = _compute_rmse(runs, held_out_fits[()].simulated, counted_channels)
         after = _compute_rmse(runs, held_out_fits[names].simulated, counted_channels)
@@ -495,62 +437,44 @@ class VerdictBuilder:
             share = (before - max(after, floor)) / (before - floor)
         return float(np.clip(share, MIN_REPORTED_GAIN, 1.0)) if np.isfinite(share) else None
 
-    def share_intervals(self, finding: DiagnosisResult) -> dict[str, tuple[float, float]]:
+    def share_intervals(self) -> dict[str, tuple[float, float]]:
         """Compute 95 % intervals of the share of the held-out gap that single effects close.
-
-        Args:
-            finding: Outcome of the search, with the simulated held-out runs.
 
         Returns:
             Low and high end by effect, for effects that were simulated alone on held-out runs.
         """
-        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
         if runs is None or held_out_fits is None:
             return {}
         before = held_out_fits[()].simulated
         intervals = {}
         for names, simulated in held_out_fits.items():
-            share = self._get_closed_share(finding, names)
+            share = self._get_closed_share(names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
                 continue
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
             rng = make_rng("held-out share", *names)
-            gain_arguments = (
-                self._list_counted_channels(),
-                self._compute_noise_floor(finding),
-                rng,
-                self._resamples_segments,
-            )
-            result = compute_held_out_gain(runs, before, simulated.simulated, *gain_arguments)
+            result = self._compute_gain(runs, before, simulated.simulated, rng)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 intervals[names[0]] = result.low, result.high
         return intervals
 
-    def _propose_next_run(
-        self, search: EffectSearch, finding: DiagnosisResult
-    ) -> DiscriminatingRun | None:
+    def _propose_next_run(self) -> DiscriminatingRun | None:
         """Propose a run that distinguishes the strongest cause from its most plausible alternative.
 
         If the base model is not identifiable, the run should identify its parameters. Return None
         if nothing is open, or if the search was stopped early.
-
-        Args:
-            search: the search, with all fitted models.
-            finding: result of the diagnosis.
         """
+        search, finding = self.result.search, self.result.finding
         if finding.early_stop is not None:
             return None
         if finding.verdict == "unidentifiable":
             return _propose_identifying_run(finding.unidentified_parameters)
-        # Causes come strongest first, and alternatives most plausible first.
-        for cause in finding.causes:
-            for alternative in cause.alternatives:
-                other_effects = {name for name in finding.model.effects if name != cause.effect}
-                competing_model = search.models.get(frozenset({*other_effects, alternative}))
-                if competing_model is not None:
-                    return propose_discriminating_run(search, finding.model, competing_model)
-        return None
+        competing_models = self.result.list_competing_models()
+        if not competing_models:
+            return None
+        return propose_discriminating_run(search, finding.model, competing_models[0])
 
 
 def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]) -> float:

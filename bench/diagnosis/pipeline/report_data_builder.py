@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.diagnosis import residual_analysis
-from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
+from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
 from bench.diagnosis.report.cause_text import format_effect_set
 from bench.diagnosis.report.effect_and_unit_text import END, format_file_change
 from bench.diagnosis.report.report_data import (
@@ -20,7 +21,6 @@ from bench.diagnosis.report.report_data import (
     ParameterChange,
 )
 from bench.diagnosis.search.diagnose import DiagnosisResult
-from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD
 from bench.diagnosis.validation.run_consistency import (
     ConsistencySummary,
@@ -28,7 +28,6 @@ from bench.diagnosis.validation.run_consistency import (
     assess_consistency,
 )
 from bench.diagnosis.verdict import Verdict
-from bench.diagnosis.verdict_builder import VerdictBuilder
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue as Estimate
 
@@ -45,18 +44,20 @@ class DiagnosisReportDataBuilder:
     """Builder of the report data of a finding.
 
     Attributes:
-        assessor: Builder of the verdict, with the recording, the run evaluators and the noise.
-        search: Search that produced the finding.
-        base: Fit of the base model.
-        finding: Outcome of the search.
+        result: Result of the search.
         notes: Further notes, one sentence each.
     """
 
-    assessor: VerdictBuilder
-    search: EffectSearch
-    base: BaseFit
-    finding: DiagnosisResult
+    result: SearchResult
     notes: tuple[str, ...] = ()
+
+    @property
+    def _finding(self) -> DiagnosisResult:
+        return self.result.finding
+
+    @property
+    def _builder(self) -> VerdictBuilder:
+        return VerdictBuilder(self.result)
 
     def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
         """Collect everything that text, figures and page of a report need, for a verdict.
@@ -64,12 +65,12 @@ class DiagnosisReportDataBuilder:
         Args:
             verdict: Verdict that the report explains.
         """
-        evaluator = self.assessor.fitting_evaluator
-        recording = self.assessor.recording
-        before = self.finding.base.fit.simulated
-        after = self.finding.model.fit.simulated
+        evaluator = self.result.runs.fitting
+        recording = self.result.runs.recording
+        before = self._finding.base.fit.simulated
+        after = self._finding.model.fit.simulated
         # The noise is that of the finding, because a good model estimates it better.
-        sigma = self.assessor.estimate_noise_sigma(self.finding)
+        sigma = self._builder.estimate_noise_sigma()
         held_out, held_out_locations = self._summarise_held_out(sigma)
         return DiagnosisReportData(
             # A recording without a title is identified by its file name.
@@ -87,7 +88,7 @@ class DiagnosisReportDataBuilder:
             tuple(self._list_parameter_changes()),
             () if verdict.recording_faults else tuple(self._list_unexplained()),
             () if verdict.recording_faults else tuple(self._list_verdict_reasons()),
-            self.finding.unidentified_parameters,
+            self._finding.unidentified_parameters,
             residual_analysis.get_robot(evaluator),
             identifiability=self._assess_identifiability(),
             consistency=ConsistencySummary()
@@ -95,14 +96,14 @@ class DiagnosisReportDataBuilder:
             else self._assess_consistency(),
             track=self._read_track_figure(),
             logs=max(1, len({run.log for run in recording.runs})),
-            thorough=self.search.thorough,
+            thorough=self.result.search.thorough,
             cross_validated=self._is_cross_validated,
-            share_intervals=self.assessor.share_intervals(self.finding),
+            share_intervals=self._builder.share_intervals(),
         )
 
     def _read_track_figure(self) -> bytes:
         """Return the PNG figure that film tracking saved next to the recording; empty if none."""
-        recording = self.assessor.recording
+        recording = self.result.runs.recording
         path = recording.path.with_suffix(".png")
         if not recording.extra.keys() >= TRACK_COLUMNS:
             return b""
@@ -122,12 +123,12 @@ class DiagnosisReportDataBuilder:
 
         Consistency means that groups of runs give the same parameters as all runs together.
         """
-        if self.finding.early_stop is not None or self.finding.unidentified_parameters:
+        if self._finding.early_stop is not None or self._finding.unidentified_parameters:
             return ConsistencySummary()
-        before = assess_consistency(self.search, self.finding.base)
+        before = assess_consistency(self.result.search, self._finding.base)
         after = (
-            assess_consistency(self.search, self.finding.model)
-            if self.finding.model.effects
+            assess_consistency(self.result.search, self._finding.model)
+            if self._finding.model.effects
             else before
         )
         return ConsistencySummary(before, after, self._estimate_parameters_by_group())
@@ -137,18 +138,18 @@ class DiagnosisReportDataBuilder:
 
         They let the report compare how consistent the cause and its best competitor are.
         """
-        if len(self.finding.causes) != 1:
+        if len(self._finding.causes) != 1:
             return ()
-        (cause,) = self.finding.causes
-        related_effects = {cause.effect, *cause.alternatives, *self.finding.model.effects}
-        singles = [m for m in self.search.models.values() if len(m.effects) == 1]
+        (cause,) = self._finding.causes
+        related_effects = {cause.effect, *cause.alternatives, *self._finding.model.effects}
+        singles = [m for m in self.result.search.models.values() if len(m.effects) == 1]
         other_models = [
             model
             for model in singles
             if not related_effects & set(model.effects)
             and np.isfinite(model.penalised_log_likelihood)
             # A trend of a coefficient is only visible in effects with a single coefficient.
-            and len(self.search.evaluator.get_coefficient_indices(model.effects[0])) == 1
+            and len(self.result.search.evaluator.get_coefficient_indices(model.effects[0])) == 1
         ]
         if not other_models:
             return ()
@@ -156,7 +157,7 @@ class DiagnosisReportDataBuilder:
         (name,) = best.effects
         group_estimates = [
             consistency
-            for consistency in assess_consistency(self.search, best)
+            for consistency in assess_consistency(self.result.search, best)
             if consistency.number.startswith(name)
         ]
         return tuple(group_estimates)
@@ -168,20 +169,19 @@ class DiagnosisReportDataBuilder:
         result is empty.
         """
         key: frozenset[str] = frozenset()
-        scan = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
-        directions = self.search.get_known_directions()
-        if directions is not None:
-            return assess_identifiability(self.search.evaluator, self.search.noise, *directions)
-        if scan is None:
-            return ()
-        return assess_identifiability(
-            self.search.evaluator, self.search.noise, scan.fit, scan.directions
-        )
+        search = self.result.search
+        directions = search.get_known_directions()
+        if directions is None:
+            scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
+            if scan is None:
+                return ()
+            directions = scan.fit, scan.directions
+        return assess_identifiability(search.evaluator, search.noise, *directions)
 
     @property
     def _is_cross_validated(self) -> bool:
         """True if the gain was measured by cross-validation instead of on held-out runs."""
-        validation = self.assessor.validation
+        validation = self.result.runs.validation
         return validation is not None and validation.is_cross_validation
 
     @property
@@ -194,9 +194,9 @@ class DiagnosisReportDataBuilder:
         Args:
             sigma: (C,) standard deviation of the noise of each channel.
         """
-        evaluator = self.assessor.held_out_evaluator
-        held_out_fits = self.finding.held_out_fits
-        names = self.finding.model.effects
+        evaluator = self.result.runs.predicted
+        held_out_fits = self._finding.held_out_fits
+        names = self._finding.model.effects
         # If the data do not identify the base model, it is not validated on held-out runs.
         if evaluator is None or held_out_fits is None or names not in held_out_fits:
             return None, []
@@ -214,9 +214,9 @@ class DiagnosisReportDataBuilder:
 
         `sigma` (C,) is the noise standard deviation of each channel in its unit.
         """
-        floor = self.assessor.noise_floor
+        floor = self.result.runs.floor
         rows = zip(
-            self.assessor.fitting_evaluator.simulator.channels,
+            self.result.runs.fitting.simulator.channels,
             sigma.tolist(),
             floor.is_stated.tolist(),
             floor.quantisation_step.tolist(),
@@ -233,12 +233,12 @@ class DiagnosisReportDataBuilder:
         A parameter is marked if the data do not determine it, so that it was kept at its nominal
         value.
         """
-        evaluator = self.assessor.fitting_evaluator
-        before = self.assessor.collect_parameter_estimates(self.search, self.finding.base)
-        after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
+        evaluator = self.result.runs.fitting
+        before = self._builder.collect_parameter_estimates(self._finding.base)
+        after = self._builder.collect_parameter_estimates(self._finding.model)
         for i in evaluator.base_indices.tolist():
             parameter = evaluator.parameters[i]
-            is_free = i not in self.base.fixed_parameters
+            is_free = i not in self.result.base.fit.fixed_parameters
             yield ParameterChange(
                 parameter.name,
                 parameter.unit,
@@ -254,25 +254,18 @@ class DiagnosisReportDataBuilder:
 
         The notes name parameters that the data do not determine, and bounds that a fit has reached.
         """
-        evaluator = self.assessor.fitting_evaluator
-        lack_of_fit = self.finding.lack_of_fit
+        evaluator = self.result.runs.fitting
+        lack_of_fit = self._finding.lack_of_fit
         for channel in lack_of_fit.channels_above_noise:
             times = lack_of_fit.excess[evaluator.channels.index(channel)]
             yield f"the residual of channel {channel} is {times:.3g} times its noise"
         # Without a result of the test for unmodelled forces there is no dependence to report.
         if lack_of_fit.has_structure and lack_of_fit.where:
             yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
-        insensitive = [
-            evaluator.parameters[i].name for i in sorted(self.base.insensitive_parameters)
-        ]
-        if insensitive:
-            names = ", ".join(insensitive)
+        base = self.result.base
+        if names := base.join_names(base.fit.insensitive_parameters):
             yield f"the data do not depend on {names}: kept at the nominal value"
-        unidentified = [
-            evaluator.parameters[i].name for i in sorted(self.base.unidentified_parameters)
-        ]
-        if unidentified:
-            names = ", ".join(unidentified)
+        if names := base.join_names(base.fit.unidentified_parameters):
             yield (
                 f"the data do not identify {names} together with the other parameters: kept at the "
                 "nominal value"
@@ -302,7 +295,7 @@ class DiagnosisReportDataBuilder:
 
         A search that was stopped early has no such reasons.
         """
-        finding = self.finding
+        finding = self._finding
         if finding.early_stop is not None:
             return
         if finding.verdict == "unknown" and finding.causes:
@@ -324,7 +317,7 @@ class DiagnosisReportDataBuilder:
 
     def _describe_residual_structure(self) -> str:
         """Say how the residual of the final model still differs from the noise of the sensors."""
-        p_value = self.finding.lack_of_fit.p_value
+        p_value = self._finding.lack_of_fit.p_value
         # Lack of fit is either a residual with a pattern, or one that is only too large.
         if p_value < STRUCTURE_P_VALUE_THRESHOLD:
             return (
