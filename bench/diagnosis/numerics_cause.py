@@ -5,9 +5,9 @@ They are a too coarse time step or integrator, and options of MuJoCo's solver.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,6 @@ from sims.extended_simulator import FittedValue
 if TYPE_CHECKING:
     from bench.diagnosis.evaluation.solver_options import StepRefinement
     from sims.robot.robot_simulator import RobotSimulator
-
-Item = TypeVar("Item")
 
 MIN_FINER_STEP_GAIN = 20.0
 """Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
@@ -45,25 +43,6 @@ MAX_P_VALUE_GAIN = 1400.0
 
 Beyond it, exp(-gain / 2) becomes zero by underflow.
 """
-
-
-class Reusable(Generic[Item]):
-    """Iterable that computes each item once, when it is first needed."""
-
-    def __init__(self, items: Iterator[Item]) -> None:
-        self._remaining_items, self._computed_items = items, list[Item]()
-
-    def __iter__(self) -> Iterator[Item]:
-        """Yield all items from the first; none is computed a second time."""
-        item_index = 0
-        while True:
-            if item_index == len(self._computed_items):
-                try:
-                    self._computed_items.append(next(self._remaining_items))
-                except StopIteration:
-                    return
-            yield self._computed_items[item_index]
-            item_index += 1
 
 
 def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:

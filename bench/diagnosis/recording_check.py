@@ -28,7 +28,6 @@ def check_identifiability(
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
-    jobs: int = 1,
 ) -> tuple[ParameterIdentifiability, ...]:
     """Assess which free numbers and which causes a recording can identify.
 
@@ -37,7 +36,6 @@ def check_identifiability(
         system: Name of the system to use instead of the one in the description.
         model: Model file of a robot to use instead of the one in the description.
         free: Numbers of a robot's model file, or constants of a system, that are estimated.
-        jobs: Number of worker processes.
 
     Returns:
         Identifiability of each free number, then of each cause.
@@ -52,7 +50,7 @@ def check_identifiability(
     recording, _ = segment_recording(recording, kind)
     engine = kind.default_engine if kind.own_engine else "batch"
     constants = () if kind.has_model else tuple(free)
-    with closing(ForkedWorkerPool(jobs)) as worker_pool:
+    with closing(ForkedWorkerPool(1)) as worker_pool:
         evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
         evaluator.worker_pool = worker_pool
         worker_pool.register(evaluator)

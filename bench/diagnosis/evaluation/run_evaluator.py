@@ -232,16 +232,11 @@ class RunEvaluator:
         # Channels follow the order of the simulator, not that of the columns of the log.
         recorded_channels = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded_channels]
-        default_settings: dict[str, Any] = {}
-        fine_settings: dict[str, Any] = {}
-        # The other engines choose their steps themselves.
-        if self.engine == "batch":
-            default_settings = {
-                "time_step": MAX_TIME_STEP,
-                "turn": MAX_PHASE_PER_STEP,
-                "patience": MAX_STEP_COUNT_FACTOR,
-            }
-            fine_settings = {**default_settings, "time_step": MAX_TIME_STEP_FILTERED}
+        default_settings = self._engine_settings
+        fine_settings = default_settings and {
+            **default_settings,
+            "time_step": MAX_TIME_STEP_FILTERED,
+        }
 
         def make_simulator(settings: dict[str, Any]) -> SystemSimulator:
             """Create a simulator of the recorded channels with all effects."""
@@ -249,6 +244,17 @@ class RunEvaluator:
             return kind(constants, observe, engine=self.engine, effects=effects, **settings)
 
         return make_simulator(default_settings), make_simulator(fine_settings)
+
+    @property
+    def _engine_settings(self) -> dict[str, Any]:
+        """Settings of the batch engine; the other engines choose their steps themselves."""
+        if self.engine != "batch":
+            return {}
+        return {
+            "time_step": MAX_TIME_STEP,
+            "turn": MAX_PHASE_PER_STEP,
+            "patience": MAX_STEP_COUNT_FACTOR,
+        }
 
     def _pad_observations(self) -> Array:
         """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
@@ -472,26 +478,15 @@ class RunEvaluator:
         It shares the parameters, the grids of shape parameters, the search control and the worker
         pool.
         """
-        evaluator = RunEvaluator(
-            self.kind,
-            self.recording,
-            runs,
-            engine=self.engine,
-            extra=self.extra_effects,
-            free=[p.name for p in self.freed_constants],
-            candidates=self.library,
-        )
+        evaluator = self._copy(self.kind, runs)
         # Periodic effects continue from segment to segment, and a value found in one segment holds
         # in all of them.
         evaluator.longest_duration = self.longest_duration
-        evaluator.parameters = self.parameters
         evaluator.time_span = self.time_span
         # Ranges are computed now, because those of segments would differ.
         for name in self.channels:
             self._get_channel_range(name)
         evaluator._channel_ranges = self._channel_ranges
-        evaluator.search_control = self.search_control
-        evaluator.worker_pool = self.worker_pool
         return evaluator
 
     def with_kind(self, kind: type[SystemSimulator]) -> RunEvaluator:
@@ -499,17 +494,7 @@ class RunEvaluator:
 
         Parameters keep their indices, so that fitted models can be compared between the simulators.
         """
-        evaluator = RunEvaluator(
-            kind,
-            self.recording,
-            self.runs,
-            engine=self.engine,
-            extra=self.extra_effects,
-            free=[p.name for p in self.freed_constants],
-            candidates=self.library,
-        )
-        evaluator.parameters = self.parameters
-        evaluator.search_control, evaluator.worker_pool = self.search_control, self.worker_pool
+        evaluator = self._copy(kind, self.runs)
         evaluator.filtered_runs, evaluator.initial_state_guesses = (
             self.filtered_runs,
             self.initial_state_guesses,
@@ -521,6 +506,26 @@ class RunEvaluator:
         evaluator.state_prior = self.state_prior
         evaluator.is_in_contact = self.is_in_contact
         self.worker_pool.register(evaluator)
+        return evaluator
+
+    def _copy(self, kind: type[SystemSimulator], runs: Sequence[Run]) -> RunEvaluator:
+        """Return a run evaluator with the same parameters, search control and worker pool.
+
+        Args:
+            kind: class of its simulator.
+            runs: its runs.
+        """
+        evaluator = RunEvaluator(
+            kind,
+            self.recording,
+            runs,
+            engine=self.engine,
+            extra=self.extra_effects,
+            free=[p.name for p in self.freed_constants],
+            candidates=self.library,
+        )
+        evaluator.parameters = self.parameters
+        evaluator.search_control, evaluator.worker_pool = self.search_control, self.worker_pool
         return evaluator
 
     def make_simulator(self, kind: type[SystemSimulator]) -> SystemSimulator:
@@ -652,16 +657,13 @@ class RunEvaluator:
         effect_types: list[str | type[Effect]] = [
             next((e for e in self.extra_effects if e.name == name), name) for name in effects
         ]
-        settings: dict[str, Any] = {}
-        if self.engine == "batch":
-            settings = {
-                "time_step": MAX_TIME_STEP,
-                "turn": MAX_PHASE_PER_STEP,
-                "patience": MAX_STEP_COUNT_FACTOR,
-            }
         constants = self.recording.constants
         return self.kind(
-            constants, list(observe), engine=self.engine, effects=effect_types, **settings
+            constants,
+            list(observe),
+            engine=self.engine,
+            effects=effect_types,
+            **self._engine_settings,
         )
 
     def follow(self, filtered_runs: Any) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, tee
 from typing import TYPE_CHECKING, Any
 
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
@@ -11,7 +13,6 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.numerics_cause import (
     CoarseStepFinding,
-    Reusable,
     is_finer_model_better,
     is_finer_step_better,
 )
@@ -42,7 +43,8 @@ class TimeStepChoice:
     def __init__(self) -> None:
         """Begin with the step of the model file."""
         self.finding: CoarseStepFinding | None = None
-        self._refinements: Reusable[StepRefinement] | None = None
+        # Each refinement is simulated when it is first needed; iterations need a copy.
+        self._refinements: Iterator[StepRefinement] | None = None
         self._file_runs: SimulatedRuns | None = None
 
     def choose(self, model: BaseModel) -> BaseModel:
@@ -57,10 +59,10 @@ class TimeStepChoice:
         from bench.diagnosis.evaluation.solver_options import find_step_refinements
 
         runs = model.runs
-        self._refinements = Reusable(find_step_refinements(runs.fitting, runs.noise))
+        (self._refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         file_log_likelihood, residual = model.rate()
         gap = residual - 1.0
-        for refinement in self._refinements:
+        for refinement in copy(self._refinements):
             # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
             if not refinement.is_accurate_enough(residual):
                 continue
@@ -105,7 +107,8 @@ class TimeStepChoice:
             )
             self.finding = None
             return cause_search.search(model.refit(self._file_runs).finish())
-        refinement = next((one for one in self._refinements if one.is_accurate_enough(0.0)), None)
+        refinements = copy(self._refinements)
+        refinement = next((one for one in refinements if one.is_accurate_enough(0.0)), None)
         # The residual of a model that stays incomplete is far larger than an error of the step.
         if refinement is None or finding.is_incomplete:
             return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -507,12 +507,5 @@ def _build_held_out_result(gain: HeldOutGain, unit: str) -> HeldOutResult:
         gain: errors before and after, and the share of the gap closed.
         unit: unit of the errors.
     """
-    return HeldOutResult(
-        to_finite_or_none(gain.base),
-        to_finite_or_none(gain.extended),
-        to_finite_or_none(gain.floor),
-        to_finite_or_none(gain.gap_closed),
-        to_finite_or_none(gain.low),
-        to_finite_or_none(gain.high),
-        unit,
-    )
+    base, extended, floor, share, low, high = map(to_finite_or_none, astuple(gain))
+    return HeldOutResult(base, extended, floor, share, low, high, unit)

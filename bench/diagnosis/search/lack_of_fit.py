@@ -23,9 +23,8 @@ with correlation phi, its relative standard error is (formula of M. S. Bartlett,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -103,70 +102,6 @@ class JointHatForce(Force):
         return result
 
 
-class JointHatFamily(NamedTuple):
-    """Hats over the range of one variable of one joint, with one direction."""
-
-    label: str
-    joint: int
-    variable: int
-    direction: int
-    low: float
-    high: float
-    slow: float
-
-
-def list_joint_families(evaluator: RunEvaluator, speed_share: float) -> Iterator[JointHatFamily]:
-    """Yield every family of hats that the recording can show.
-
-    Args:
-        evaluator: the runs.
-        speed_share: speed over which dry friction reverses its sign, as a share of the high speed
-            of a joint.
-    """
-    longest_run = evaluator.longest_duration
-    for joint, name in enumerate(evaluator.simulator.system.coordinates):
-        if name not in evaluator.channels:
-            continue
-        values = evaluator.observed[:, :, evaluator.channels.index(name)]
-        # Quantiles instead of extremes, so that single outliers do not widen the range.
-        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
-        speed = _compute_high_speed(evaluator, evaluator.channels.index(name))
-        reversal_speed = speed_share * speed
-        yield JointHatFamily(
-            f"time, along {name}", joint, TIME, ALONG, 0.0, longest_run, reversal_speed
-        )
-        if high > low:
-            for direction, direction_text in (
-                (ALONG, "along it"),
-                (AGAINST, "against it"),
-                (DRY, "dry"),
-            ):
-                label = f"position {name}, {direction_text}"
-                yield JointHatFamily(label, joint, POSITION, direction, low, high, reversal_speed)
-        if speed > 0:
-            for direction, direction_text in ((AGAINST, "against it"), (DRY, "dry")):
-                label = f"speed of {name}, {direction_text}"
-                yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, reversal_speed)
-
-
-def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
-    """Return the 98 % quantile of the speed of a joint, from differences of its recorded position.
-
-    The quantile is used instead of the maximum, because single differences may be noise.
-
-    Args:
-        evaluator: the runs.
-        channel: index of the channel with the position of the joint.
-    """
-    rates = [np.zeros(1)]
-    for run_data in evaluator.prepared_runs:
-        if len(run_data.observed) > 3:
-            # Use every third sample, because differences of neighbours are mostly noise.
-            step = np.diff(run_data.scenario.times[::3])
-            rates.append(np.diff(run_data.observed[::3, channel]) / step)
-    return float(np.nanquantile(np.abs(np.concatenate(rates)), HIGH_SPEED_QUANTILE))
-
-
 HAT_COUNT = 7
 """Number of hats over the range of a variable."""
 SURROGATE_COUNT = 150
@@ -178,12 +113,12 @@ HAT_STRENGTH_SHARE = 1e-4
 TYPICAL_FORCES = {"point": 2.0, "linear": 5.0, "rotary": 0.5}
 """Typical force of each kind of system: m/s^2 for point, N for linear, N m for rotary."""
 
-VISCOUS_DIRECTION = 0
-"""Direction of a hat: against the motion, proportional to speed."""
-DRY_FRICTION_DIRECTION = 1
-"""Direction of a hat: against the motion, independent of speed."""
 AXIS_DIRECTION = 2
-"""Direction of a hat: along the first axis; larger numbers are the other axes."""
+"""Direction of a hat: along the first axis; larger numbers are the other axes.
+
+Direction 0 is against the motion, proportional to speed; direction 1 is against it, independent of
+speed.
+"""
 
 TIME_VARIABLE = 0
 """Variable of a hat: time."""
@@ -385,175 +320,132 @@ def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], 
     All hats of a family have the same label, because they form one hypothesis and act together.
     """
     size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
+    is_robot = JointHatForce.name in evaluator.coefficient_slices
     probes = []
-    for label, low, high, coefficients in _iterate_hat_families(evaluator, size):
+    for family in (_iterate_joint_families if is_robot else _iterate_families)(evaluator):
         # With this spacing, each hat extends to the centres of its neighbours.
-        width = (high - low) / (HAT_COUNT - 1)
-        for centre in np.linspace(low, high, HAT_COUNT):
-            _, c = coefficients(centre, width)
+        width = (family.high - family.low) / (HAT_COUNT - 1)
+        for centre in np.linspace(family.low, family.high, HAT_COUNT):
+            coefficients = np.array([size, *family.variable, centre, width, *family.direction])
             probes.append(
-                CandidateDirection(
-                    label, grid_point=0, coefficient_index=0, coefficients=c, can_be_negative=True
-                )
+                CandidateDirection(family.label, 0, 0, coefficients, can_be_negative=True)
             )
     return probes, size
 
 
-HatFactory = Callable[[float, float], tuple[str, Array]]
-"""Function from the centre and width of a hat to the name of its effect and its coefficients."""
+class _HatFamily(NamedTuple):
+    """Hats over the range of one variable, with one direction.
 
-
-def _iterate_hat_families(
-    evaluator: RunEvaluator, size: float
-) -> Iterator[tuple[str, float, float, HatFactory]]:
-    """Yield each family of hats: label, lowest and highest centre, function that makes a hat.
-
-    Args:
-        evaluator: the runs.
-        size: strength of a hat, in the unit of the force.
+    Attributes:
+        label: name of the family.
+        variable: coefficients of the effect that name the variable: its index, and before it that
+            of the joint of a robot.
+        low: lowest centre of a hat, in s, m, rad or their rates.
+        high: highest centre.
+        direction: index of the direction, and the speed over which dry friction reverses its sign.
     """
-    if JointHatForce.name in evaluator.coefficient_slices:
-        for joint in list_joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
-            yield joint.label, joint.low, joint.high, partial(_make_joint_hat, joint, size)
-        return
-    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _compute_high_speed_quantile(evaluator)
-    for family in _iterate_families(evaluator):
-        yield (
-            family.label,
-            family.low,
-            family.high,
-            partial(_make_hat_without_joint, family, size, reversal_speed),
-        )
-
-
-def _make_joint_hat(
-    family: JointHatFamily, size: float, centre: float, width: float
-) -> tuple[str, Array]:
-    """Return the name of the effect and the coefficients of one hat force at a joint of a robot.
-
-    Args:
-        family: joint, variable and direction of the hat.
-        size: strength of the hat, in the unit of the force.
-        centre: value of the variable (s, or the unit of the joint) at which the force is largest.
-        width: distance from the centre at which the force is zero.
-    """
-    other_coefficients = family.joint, family.variable, centre, width, family.direction, family.slow
-    return JointHatForce.name, np.array([size, *other_coefficients])
-
-
-def _make_hat_without_joint(
-    family: _Family, size: float, reversal_speed: float, centre: float, width: float
-) -> tuple[str, Array]:
-    """Return effect name and coefficients of one hat force on a system without joints.
-
-    Args:
-        family: variable and direction of the hat.
-        size: strength of the hat.
-        reversal_speed: speed over which dry friction reverses.
-        centre: value of the variable at which the force is largest.
-        width: distance from the centre at which the force is zero.
-    """
-    return HatForce.name, np.array(
-        [size, family.variable, centre, width, family.direction, reversal_speed]
-    )
-
-
-class _Family(NamedTuple):
-    """Hats over the range of one variable, with one direction."""
 
     label: str
-    variable: int
-    direction: int
+    variable: tuple[int, ...]
     low: float
     high: float
+    direction: tuple[int, float]
 
 
-def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
+def _iterate_joint_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
+    """Yield every family of hats at the joints of a robot that the recording can show."""
+    for joint, name, low, high in _iterate_positions(evaluator):
+        speeds = np.abs(_compute_rates(evaluator, evaluator.channels.index(name)))
+        speed = float(np.nanquantile(speeds, HIGH_SPEED_QUANTILE))
+        reversal_speed = SIGN_CHANGE_SPEED_SHARE * speed
+        duration = evaluator.longest_duration
+        along = f"time, along {name}"
+        yield _HatFamily(along, (joint, TIME), 0.0, duration, (ALONG, reversal_speed))
+        directions = {ALONG: "along it", AGAINST: "against it", DRY: "dry"}
+        for direction, text in directions.items():
+            acting = direction, reversal_speed
+            if high > low:
+                label = f"position {name}, {text}"
+                yield _HatFamily(label, (joint, POSITION), low, high, acting)
+        for direction, text in directions.items():
+            acting = direction, reversal_speed
+            if speed > 0 and direction != ALONG:
+                yield _HatFamily(f"speed of {name}, {text}", (joint, SPEED), 0.0, speed, acting)
+
+
+def _iterate_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
     """Yield every family of hat forces, eq. (1), whose variable the recording shows.
 
     A hat is a triangular basis function max(1 - |z - m| / w, 0) of time, position or speed z (1).
-    """
-    yield from _iterate_hats_over_time(evaluator)
-    yield from _iterate_hats_over_positions(evaluator)
-    yield from _iterate_hats_over_speed(evaluator)
-
-
-def _iterate_hats_over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hat forces over time, along each coordinate and against the motion.
-
-    A hat is a triangular basis function; a family has hats over the whole of the longest run.
-
-    Args:
-        evaluator: Run evaluator of the recording.
-    """
-    durations = []
-    for run_data in evaluator.prepared_runs:
-        times = run_data.scenario.times
-        durations.append(float(times[-1] - times[0]))
-    longest_run = max(durations)
-    for axis, name in enumerate(evaluator.simulator.system.coordinates):
-        if name in evaluator.channels:
-            yield _Family(
-                f"time, along {name}", TIME_VARIABLE, AXIS_DIRECTION + axis, 0.0, longest_run
-            )
-    yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest_run)
-
-
-def _iterate_hats_over_positions(evaluator: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hat forces over each coordinate, from its 1 % to its 99 % quantile.
-
-    The forces act along the last coordinate, against the motion, or as dry friction.
+    Over time they act along each coordinate and against the motion. Over a position they act along
+    the last coordinate, against the motion, or as dry friction; over the speed against the motion,
+    or as dry friction. A bouncing body flies freely and slides on nothing.
     """
     system = evaluator.simulator.system
-    # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
-    is_bouncing, last_axis = system.bounces, len(system.coordinates) - 1
-    for axis, name in enumerate(system.coordinates):
-        if name not in evaluator.channels:
-            continue
-        values = evaluator.observed[:, :, evaluator.channels.index(name)]
-        # Quantiles instead of extremes, so that single outliers do not widen the range.
-        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+    speed = _compute_high_speed(evaluator)
+    against, dry, *axes = [
+        (direction, SIGN_CHANGE_SPEED_SHARE * speed)
+        for direction in range(AXIS_DIRECTION + len(system.coordinates))
+    ]
+    spans = [run_data.scenario.times[[0, -1]] for run_data in evaluator.prepared_runs]
+    longest_run = max(float(last - first) for first, last in spans)
+    positions = list(_iterate_positions(evaluator))
+    for axis, name, _, _ in positions:
+        yield _HatFamily(f"time, along {name}", (TIME_VARIABLE,), 0.0, longest_run, axes[axis])
+    yield _HatFamily("time, against the motion", (TIME_VARIABLE,), 0.0, longest_run, against)
+    # The last coordinate of a bouncing body is the height.
+    last_axis = len(system.coordinates) - 1
+    for axis, name, low, high in positions:
         if not high > low:
             continue
-        position = POSITION_VARIABLE + axis
-        if not (is_bouncing and axis == last_axis):
+        variable = (POSITION_VARIABLE + axis,)
+        if not (system.bounces and axis == last_axis):
             along = f"position {name}, along {system.coordinates[last_axis]}"
-            yield _Family(along, position, AXIS_DIRECTION + last_axis, low, high)
-        yield _Family(
-            f"position {name}, against the motion", position, VISCOUS_DIRECTION, low, high
-        )
-        if not is_bouncing:
-            yield _Family(f"position {name}, dry", position, DRY_FRICTION_DIRECTION, low, high)
-
-
-def _iterate_hats_over_speed(evaluator: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hat forces over the speed: against the motion, or dry friction."""
-    speed = _compute_high_speed_quantile(evaluator)
+            yield _HatFamily(along, variable, low, high, axes[last_axis])
+        yield _HatFamily(f"position {name}, against the motion", variable, low, high, against)
+        if not system.bounces:
+            yield _HatFamily(f"position {name}, dry", variable, low, high, dry)
     if speed > 0:
-        yield _Family("speed, against the motion", SPEED_VARIABLE, VISCOUS_DIRECTION, 0.0, speed)
-    if speed > 0 and not evaluator.simulator.system.bounces:
-        yield _Family("speed, dry", SPEED_VARIABLE, DRY_FRICTION_DIRECTION, 0.0, speed)
+        yield _HatFamily("speed, against the motion", (SPEED_VARIABLE,), 0.0, speed, against)
+    if speed > 0 and not system.bounces:
+        yield _HatFamily("speed, dry", (SPEED_VARIABLE,), 0.0, speed, dry)
 
 
-def _compute_high_speed_quantile(evaluator: RunEvaluator) -> float:
-    """Return the 98 % quantile of the speed, from differences of the recorded coordinates.
+def _iterate_positions(evaluator: RunEvaluator) -> Iterator[tuple[int, str, float, float]]:
+    """Yield index and name of each recorded coordinate, and its 1 % and 99 % quantile.
+
+    Quantiles are used instead of extremes, so that single outliers do not widen the range.
+    """
+    for axis, name in enumerate(evaluator.simulator.system.coordinates):
+        if name in evaluator.channels:
+            values = evaluator.observed[:, :, evaluator.channels.index(name)]
+            low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+            yield axis, name, low, high
+
+
+def _compute_rates(evaluator: RunEvaluator, channel: int) -> Array:
+    """Return the rates of a channel in all runs, from differences of its recorded values."""
+    rates = [np.zeros(1)]
+    for run_data in evaluator.prepared_runs:
+        if len(run_data.observed) > 3:
+            # Use every third sample, because differences of neighbours are mostly noise.
+            step = np.diff(run_data.scenario.times[::3])
+            rates.append(np.diff(run_data.observed[::3, channel]) / step)
+    return np.concatenate(rates)
+
+
+def _compute_high_speed(evaluator: RunEvaluator) -> float:
+    """Return the 98 % quantile of the speed, from the rates of the recorded coordinates.
 
     It is the upper end of the hats over speed; a quantile, because single differences may be noise.
+    Without recorded coordinates there is no speed.
     """
-    squares = []
-    for name in evaluator.simulator.system.coordinates:
-        if name not in evaluator.channels:
-            continue
-        c = evaluator.channels.index(name)
-        rates = [np.zeros(1)]
-        for run_data in evaluator.prepared_runs:
-            if len(run_data.observed) > 3:
-                # Use every third sample, because differences of neighbours are mostly noise.
-                step = np.diff(run_data.scenario.times[::3])
-                rates.append(np.diff(run_data.observed[::3, c]) / step)
-        squares.append(np.square(np.concatenate(rates)))
-    # Without recorded coordinates there is no speed.
+    channels = evaluator.channels
+    squares = [
+        np.square(_compute_rates(evaluator, channels.index(name)))
+        for name in evaluator.simulator.system.coordinates
+        if name in channels
+    ]
     if not squares:
         return 0.0
-    speed = np.nanquantile(sum(squares), HIGH_SPEED_QUANTILE)
-    return float(np.sqrt(speed))
+    return float(np.sqrt(np.nanquantile(sum(squares), HIGH_SPEED_QUANTILE)))

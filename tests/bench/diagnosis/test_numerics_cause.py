@@ -13,7 +13,6 @@ from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.numerics_cause import (
     MIN_FINER_STEP_GAIN,
-    Reusable,
     is_finer_model_better,
     is_finer_step_better,
 )
@@ -148,15 +147,6 @@ def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
 )
 def test_when_a_finer_step_is_better_once_causes_are_known(file, finer, better):
     assert is_finer_model_better(file, finer) is better
-
-
-def test_steps_are_simulated_once_and_only_as_far_as_needed():
-    made = []
-    steps = Reusable(made.append(i) or i for i in range(5))
-    assert next(iter(steps)) == 0
-    assert [next(iter(steps)), made] == [0, [0]]
-    assert [one for one in steps if one > 2] == [3, 4]
-    assert made == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.slow
