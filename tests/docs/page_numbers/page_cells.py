@@ -112,7 +112,7 @@ def exam_seconds(row, heading):
         "a foreign cause": "foreign",
     }  # fmt: skip
     graded = exam_report.graded(answers("exam/items.csv", kind=names[row[""]]))
-    seconds = graded.wall_s
+    seconds = graded.cpu_s
     numbers = {
         "questions": len(seconds), "median, s": seconds.median(),
         "95th percentile": seconds.quantile(0.95), "most": seconds.max(),
