@@ -155,6 +155,8 @@ class TrainingSimulator(Protocol):
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
         """Simulate points, all in one scenario that is drawn in the same way as those of targets.
 
+        Shapes: T samples, C channels.
+
         Args:
             rng: random generator.
             points: (n, dim) points of the unit cube.

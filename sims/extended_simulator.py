@@ -397,7 +397,7 @@ def _make_subclass(
     """Make a subclass of `kind` with all fitted values as defaults.
 
     Args:
-        extended: the extended simulator.
+        extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         kind: simulator class of its system.
         parameters: parameters with the fitted values as nominal ones.
     """
@@ -467,7 +467,7 @@ def _list_coefficients(
     """Return all coefficients in the order of the simulator's parameters; zero if not stated.
 
     Args:
-        extended: the extended simulator.
+        extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         kind: simulator class of its system.
     """
     values = []
@@ -544,7 +544,7 @@ def list_effect_coefficients(
     """List the coefficients of an extended simulator by effect, in the order of the effect.
 
     Args:
-        extended: the extended simulator.
+        extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         kind: class of the simulator.
 
     Raises:

@@ -92,6 +92,8 @@ class OwnSimulatorSystem(System):
     ) -> dict[str, Array]:
         """Return the channels, which are the motion that a user-defined simulator returns.
 
+        Shapes: L batch elements, T samples, C channels.
+
         Args:
             x: (L, T, C) values of the channels.
             v: unused.

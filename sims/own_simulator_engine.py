@@ -94,6 +94,8 @@ class OwnSimulatorEngine:
 
         There is one row before the first step, and one after every `batch.every` steps.
 
+        Shapes: L batch elements, C channels.
+
         Raises:
             InputError: A method of the simulator raised an exception or returned a wrong value.
         """
@@ -140,20 +142,20 @@ class OwnSimulatorEngine:
         moving = steps > 0
         steps[moving] = equalise_steps(steps[moving], batch.steps_per_sample)
         sample = self._row(system)
-        t = 0.0
+        time = 0.0
         has_moved = False
         samples = [sample]
-        for i, seconds in enumerate(steps.tolist()):
+        for step_index, seconds in enumerate(steps.tolist()):
             if seconds > 0:
-                inputs = {name: float(u[element, i]) for name, u in batch.inputs.items()}
+                inputs = {name: float(u[element, step_index]) for name, u in batch.inputs.items()}
                 if forces.any:
-                    world.apply_force(forces.at(t, inputs, seconds))
+                    world.apply_force(forces.at(time, inputs, seconds))
                 world.step(inputs, seconds)
                 rims.keep()
-                t = t + seconds
+                time = time + seconds
                 has_moved = True
             # Without a step, the previous row is still valid.
-            if (i + 1) % batch.steps_per_sample == 0:
+            if (step_index + 1) % batch.steps_per_sample == 0:
                 sample = self._row(system) if has_moved else sample
                 has_moved = False
                 samples.append(sample)
@@ -169,7 +171,7 @@ def _make_simulator_error(world: SteppableSimulator, error: Exception) -> InputE
     """Make the error for an exception in the simulator's code, with its line.
 
     Args:
-        world: the user's simulator.
+        world: simulator that a user has written, stepped in time.
         error: the exception.
     """
     frames = traceback.extract_tb(error.__traceback__)
@@ -216,7 +218,7 @@ def _make_unobserved_error(world: SteppableSimulator, observation: object, name:
     """Make the error for a value that `observe` did not return.
 
     Args:
-        world: the user's simulator.
+        world: simulator that a user has written, stepped in time.
         observation: what `observe` returned.
         name: name of the value.
     """
@@ -235,6 +237,8 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
 
     It is needed to find the dry friction that stops the motion in the next step.
 
+    Shapes: D coordinates.
+
     Returns:
         A number, which applies to every coordinate, or a matrix (D, D).
 
@@ -244,18 +248,19 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
     inertia = world.inertia()
     if isinstance(inertia, float):
         return float(inertia)
-    d = len(world.coordinates)
+    coordinate_count = len(world.coordinates)
     try:
         matrix = np.asarray(inertia, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
     if not matrix.shape:
         return float(matrix)
-    if matrix.shape == (d, d):
+    if matrix.shape == (coordinate_count, coordinate_count):
         return matrix
     joints = ", ".join(world.coordinates)
     raise InputError(
-        f"simulator {world.name}: inertia: expected shape {(d, d)} (joints × joints; here: "
+        f"simulator {world.name}: inertia: expected shape "
+        f"{(coordinate_count, coordinate_count)} (joints × joints; here: "
         f"{joints}) or a number, found {matrix.shape}"
     )
 
@@ -267,6 +272,8 @@ class _LevelLimits:
         """Select the effects that limit a level of this element, with coefficients (K, 1, 1).
 
         An effect without a place limits the first level of the system.
+
+        Shapes: K coefficients.
         """
         self.acting = []
         for effect, c in batch.effects:
@@ -297,6 +304,8 @@ class _Forces:
 
         `_last` holds velocity, forces and length of the previous step, from which (1) estimates
         the simulator's own force; None at the first step.
+
+        Shapes: K coefficients.
         """
         element_effects = [(effect, c[:, element : element + 1]) for effect, c in batch.effects]
         active_effects = [(effect, c) for effect, c in element_effects if c.any()]
@@ -315,6 +324,8 @@ class _Forces:
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
         """Return the sum (D,) of the effects' forces for the next step.
+
+        Shapes: D coordinates.
 
         Args:
             t: Time since the start of the run, s.
@@ -342,6 +353,8 @@ class _Forces:
         The simulator's own force is P = M (v - v_before) / h_before - F_before (1), the stopping
         force S = -(M v / h + P + F) (2), and friction is S where |S| <= L, else L S / |S| (3).
 
+        Shapes: D coordinates.
+
         Args:
             moment: state of the simulator.
             force: (D,) sum of the other effects' forces.
@@ -362,6 +375,8 @@ class _Forces:
 
     def _read_state(self, observation: Mapping[str, float], names: Sequence[str]) -> Array:
         """Return numbers of an observation as an array (1, D).
+
+        Shapes: D coordinates.
 
         Args:
             observation: what `observe` returned.
@@ -402,7 +417,7 @@ def _convert_to_level_size(c: Coefficient, unit: str, scale: float) -> Coefficie
     """Convert a coefficient to the unit and size of a level.
 
     Args:
-        c: the coefficient.
+        c: coefficient of the effect: name, units and plausible ranges.
         unit: unit of the level.
         scale: typical size of the level, in this unit.
     """
@@ -414,7 +429,7 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
     """Return the effect with a name such as ``state.overflow@upper``; None if it is not on levels.
 
     Args:
-        name: Name of the effect.
+        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
         system: System of a user-defined simulator.
 
     Raises:

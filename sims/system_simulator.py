@@ -52,15 +52,6 @@ MAX_STORED_NUMBERS = 2_000_000
 class SystemSimulator(Simulator):
     """Base class of the simulators of declared systems; a subclass sets `system`.
 
-    Args:
-        constants: Values of `constants` that differ from their defaults.
-        observe: Channels to return, in order (default: all).
-        engine: Name of the engine: pybullet, mujoco or batch.
-        effects: Effects whose coefficients are parameters after the system's own, in the order in
-            which a signal passes them: registered names, or classes, which need not be registered.
-        fixed: Effects with known coefficients: a number, or a list if an effect has several.
-        settings: Settings of the engine, e.g. ``time_step``.
-
     Raises:
         InputError: A name is unknown, the system cannot have an effect, or the engine does not
             support it.
@@ -81,7 +72,18 @@ class SystemSimulator(Simulator):
         fixed: Mapping[str, float | Sequence[float]] | None = None,
         **settings: Any,
     ) -> None:
-        """Create engine and effects, and append the effects' coefficients to the parameters."""
+        """Create engine and effects, and append the effects' coefficients to the parameters.
+
+        Args:
+            constants: Values of `constants` that differ from their defaults.
+            observe: Channels to return, in order (default: all).
+            engine: Name of the engine: pybullet, mujoco or batch.
+            effects: Effects whose coefficients are parameters after the system's own, in the order
+                in which a signal passes them: registered names, or classes, which need not be
+                registered.
+            fixed: Effects with known coefficients: a number, or a list if an effect has several.
+            settings: Settings of the engine, e.g. ``time_step``.
+        """
         super().__init__(constants, observe)
         self._declared = self.system()
         self._stored_steps: dict[tuple[object, ...], tuple[TimeGrid, dict[str, Array]]] = {}
@@ -152,6 +154,8 @@ class SystemSimulator(Simulator):
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
         """Simulate each parameter vector in one scenario; see `Simulator.simulate`.
 
+        Shapes: T samples, C channels.
+
         Args:
             theta: Parameter vectors (n, dim), physical units.
             scenario: Conditions of the run.
@@ -170,6 +174,8 @@ class SystemSimulator(Simulator):
         """Simulate each parameter vector in its own scenario, all in one call of the engine.
 
         This is fastest if batch elements share scenario objects.
+
+        Shapes: L batch elements, C channels.
 
         Args:
             theta: Parameter vectors (L, dim): physical parameters, then coefficients of effects.
@@ -200,6 +206,8 @@ class SystemSimulator(Simulator):
 
         The steps are: time grid, effects on inputs, integration by the engine, effects on
         sensors.
+
+        Shapes: T samples, C channels.
 
         Args:
             theta: (L, P) parameters, including the effects' coefficients.
@@ -260,6 +268,8 @@ class SystemSimulator(Simulator):
         A search simulates the same runs thousands of times. Without effects on inputs and without
         shifts of time, steps and inputs depend only on the scenarios, and are stored.
 
+        Shapes: L batch elements, S steps.
+
         Args:
             runs: Scenarios of the batch elements.
             commands: Inputs of each distinct scenario.
@@ -301,6 +311,8 @@ class SystemSimulator(Simulator):
         """Return the effects with their coefficients (K, L, 1): tuned ones, then fixed ones.
 
         Coefficients that the system does not have, or that were not given, are zero.
+
+        Shapes: L batch elements, K coefficients.
         """
         active_effects = []
         place = len(self.system.parameters)
@@ -319,6 +331,8 @@ class SystemSimulator(Simulator):
         self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> tuple[dict[str, Array], Array, Array]:
         """Return constants (L, 1) by name, and initial positions and velocities (L, D).
+
+        Shapes: D coordinates.
 
         Args:
             scenarios: scenario of each of L batch elements.
@@ -343,6 +357,8 @@ class SystemSimulator(Simulator):
         clock: Array,
     ) -> Array:
         """Return the sensor readings of a simulation, after the sensor effects.
+
+        Shapes: L batch elements, T samples, C channels.
 
         Args:
             motion: Result of the engine.
@@ -385,6 +401,8 @@ def apply_sensor_effects(
 
     Each effect gets the output of the previous one, also for the value at the start.
 
+    Shapes: L batch elements.
+
     Args:
         sensors: Sensor effects with their coefficients.
         values: (L, R) values of the channel.
@@ -416,6 +434,8 @@ def apply_sensor_effects(
 def _compute_state_times(plan: TimeGrid, steps_per_state: int) -> Array:
     """Return the times (L, R) since the start of the states that the engine stores, s.
 
+    Shapes: L batch elements.
+
     Args:
         plan: time grid of the batch.
         steps_per_state: number of steps between two stored states.
@@ -445,10 +465,10 @@ def make_effect_parameters(
     """
     parameters = []
     coefficients = effect.on(system)
-    for c in coefficients:
-        name = effect.name if len(coefficients) == 1 else f"{effect.name}.{c.name}"
-        low, high = c.range(system.kind)
-        unit = c.unit_on(system, observed) or ""
+    for coefficient in coefficients:
+        name = effect.name if len(coefficients) == 1 else f"{effect.name}.{coefficient.name}"
+        low, high = coefficient.range(system.kind)
+        unit = coefficient.unit_on(system, observed) or ""
         nominal = min(max(0.0, low), high)  # zero, or the nearest value of the range
         parameters.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
     return tuple(parameters)
@@ -489,7 +509,7 @@ def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
     """Return the coefficients of a fixed effect as a tuple of numbers.
 
     Args:
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         value: a number, or a list of numbers.
 
     Raises:
@@ -508,7 +528,7 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
     """Check that coefficients have plausible sizes.
 
     Args:
-        effect: the effect.
+        effect: effect: a force, friction, input, sensor or contact law.
         system: the system on which it acts.
         values: its coefficients in order.
 
@@ -527,6 +547,8 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
 
 def _expand_coefficients(effect: Effect, rows: Array) -> Array:
     """Extend coefficients to (K, L, 1) with zeros.
+
+    Shapes: L batch elements.
 
     Args:
         effect: the effect, with K coefficients.

@@ -285,7 +285,7 @@ def _report_study(started_study: Study, outcome: StudyOutcome) -> ComparisonResu
     """Write the tables and figures of a study that has been run, and return its results.
 
     Args:
-        started_study: the study.
+        started_study: study in its result folder.
         outcome: how its runs ended.
 
     Raises:
@@ -344,7 +344,11 @@ class ComparisonResult:
             problem.close()
 
     def _read_csv_table(self, name: str) -> pd.DataFrame:
-        """Read a table file of a bounce shot or of a study of two comparisons."""
+        """Read a table file of a bounce shot or of a study of two comparisons.
+
+        Args:
+            name: Name of the table without its suffix, such as "hits".
+        """
         remedy = f"write it again with simgap plot {self.folder}"
         path = self.folder / f"{name}.csv"
         columns = (
@@ -373,6 +377,9 @@ class ComparisonResult:
 
         They use the simulator before and after its extension; the new first column ``model`` says
         which.
+
+        Args:
+            rows: Function that returns the table of one comparison.
         """
         import pandas as pd
 

@@ -125,6 +125,9 @@ class ComparisonView:
 
         Errors along stiff directions are those of parameter combinations that the data determine,
         sloppy ones those of the others.
+
+        Args:
+            metric: Column of the run table, such as "param_error" or "obs_error".
         """
         channel, parameter = self.labels
         return {
@@ -195,6 +198,9 @@ def make_misfit_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the misfit, if the targets come from another simulator.
 
     The smallest possible misfit is unknown; the smallest that any tuner reached is an upper bound.
+
+    Args:
+        view: Comparison with its statistics and styles of tuners.
     """
     chart = _make_median_chart(view, "misfit", [("obs_error", kind) for kind in view.ranges])
     panels = []
@@ -231,7 +237,7 @@ def _make_median_chart(
     """Make panels of median errors against the number of simulations.
 
     Args:
-        view: the comparison.
+        view: comparison with its statistics, experiment and styles of tuners.
         table: name of the table of the panels.
         keys: metric and range of targets of each panel.
         side_by_side: facet whose panels are side by side.
@@ -285,13 +291,13 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
         "distance from the training range [range widths]", names=tuple(format_bin_labels(table))
     )
     panels = []
-    for k in select_distance_checkpoints(view.experiment.budget):
+    for simulations in select_distance_checkpoints(view.experiment.budget):
         series = tuple(
             Series(
                 name,
                 "median",
                 mark_style,
-                {"tuner": name, "simulations": str(k)},
+                {"tuner": name, "simulations": str(simulations)},
                 "low",
                 "high",
                 "points",
@@ -299,8 +305,8 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
             )
             for name, mark_style in view.get_tuner_styles(table["tuner"])
         )
-        facets = {"after": f"{k} simulations"}
-        title = f"After {k} simulations"
+        facets = {"after": f"{simulations} simulations"}
+        title = f"After {simulations} simulations"
         panels.append(Panel(title, "distance", "bin", series, x_axis, Axis(label, "log"), facets))
     return ComparisonChart(panels, {"distance": table}, "after", _make_notes(view))
 
@@ -474,7 +480,7 @@ def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], li
     """List the searching tuners, and the trained ones that reach an error in some range.
 
     Args:
-        view: The comparison.
+        view: Comparison with its statistics, experiment and styles of tuners.
         level: The error.
 
     Returns:
@@ -512,7 +518,7 @@ def _make_notes(
     """Make the notes of the legend, by tuner: failed runs and coinciding curves.
 
     Args:
-        view: the comparison.
+        view: comparison with its statistics, experiment and styles of tuners.
         coinciding: notes on tuners whose curves lie on those of others; None for none.
     """
     parts = (view.statistics.notes, coinciding or {})

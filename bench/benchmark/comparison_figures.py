@@ -75,7 +75,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     direction.
 
     Args:
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         table: Rows of identifiability.csv.
     """
     names = [c for c in table.columns if c not in IDENTIFIABILITY_COLUMNS]
@@ -315,7 +315,7 @@ def check_references_allowed(
     """Reject references that cannot be drawn in a figure.
 
     Args:
-        stored: The comparison.
+        stored: Comparison read from its result folder: configuration, runs and statuses.
         name: Name of the figure.
         references: Reference results.
 

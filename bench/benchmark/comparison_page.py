@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from bench.benchmark import headline
+from bench.benchmark import best_tuner_summary
 from bench.benchmark.comparison_charts import CHARTS, ComparisonView
 from bench.benchmark.comparison_figures import FIGURE_FILES, format_threshold_caption
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
@@ -83,7 +83,7 @@ class RangeResult(NamedTuple):
 
     where: str
     title: str
-    rankings: list[headline.TunerRanking]
+    rankings: list[best_tuner_summary.TunerRanking]
     has_failures: bool
     notes: list[str]
 
@@ -99,14 +99,14 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
     """
     results = []
     for kind in view.ranges:
-        rankings = headline.rank_at_checkpoints(view.statistics, kind)
+        rankings = best_tuner_summary.rank_at_checkpoints(view.statistics, kind)
         notes = (
-            headline.list_failed_runs(view.statistics, kind),
-            headline.explain_ranking(view.statistics, kind),
+            best_tuner_summary.list_failed_runs(view.statistics, kind),
+            best_tuner_summary.explain_ranking(view.statistics, kind),
         )
         results.append(
             RangeResult(
-                headline.RANGE_PHRASES[kind],
+                best_tuner_summary.RANGE_PHRASES[kind],
                 _format_title(view, kind),
                 rankings,
                 any(ranking.failed for ranking in rankings),
@@ -117,8 +117,9 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
 
 
 def _format_title(view: ComparisonView, kind: str) -> str:
-    text = headline.RANGE_PHRASES[kind]
-    return f"{text[0].upper()}{text[1:]} ({headline.format_target_count(view.statistics, kind)})"
+    text = best_tuner_summary.RANGE_PHRASES[kind]
+    count = best_tuner_summary.format_target_count(view.statistics, kind)
+    return f"{text[0].upper()}{text[1:]} ({count})"
 
 
 def write_conclusion(view: ComparisonView) -> list[str]:
@@ -132,10 +133,13 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
     Tuners that share the smallest error are not listed here.
 
     Args:
-        view: the comparison.
+        view: comparison with its statistics, experiment and styles of tuners.
         kind: range of the targets.
     """
-    rankings, title = headline.rank_at_checkpoints(view.statistics, kind), _format_title(view, kind)
+    rankings, title = (
+        best_tuner_summary.rank_at_checkpoints(view.statistics, kind),
+        _format_title(view, kind),
+    )
     if not rankings:
         return f"{title}: the errors on the targets do not decide."
     last_ranking = rankings[-1]
@@ -266,7 +270,9 @@ def list_failures(view: ComparisonView) -> list[Failure]:
 
 def list_small_samples(view: ComparisonView) -> list[str]:
     """List warnings about ranges with too few targets for a significant difference."""
-    texts = (headline.warn_about_target_count(view.statistics, kind) for kind in view.ranges)
+    texts = (
+        best_tuner_summary.warn_about_target_count(view.statistics, kind) for kind in view.ranges
+    )
     return list(dict.fromkeys(text for text in texts if text))
 
 
@@ -342,7 +348,7 @@ def render_page(results: ComparisonReportData) -> str:
             page.add_table(name, table, _DIGITS)
     range_results = list_range_results(view)
     rankings = [result.rankings for result in range_results]
-    equal_errors = headline.format_error_floor(view.statistics)
+    equal_errors = best_tuner_summary.format_error_floor(view.statistics)
     return page.render(
         _TEMPLATE,
         results=results,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.benchmark import comparison_figures, headline
+from bench.benchmark import best_tuner_summary, comparison_figures
 from bench.benchmark.comparison_charts import AxisLabels, ComparisonView, make_axis_labels
 from bench.benchmark.comparison_page import (
     ComparisonReportData,
@@ -154,7 +154,7 @@ def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:
 
     Args:
         folder: result folder, which contains the plan while runs are missing.
-        stored: its content.
+        stored: comparison read from its result folder: configuration, runs and statuses.
     """
     plan = read_plan(folder) if (folder / SEGMENTS_FOLDER).exists() else None
     return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
@@ -183,23 +183,25 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     label = view.format_metric_label(view.shown_metric)
     for kind in view.ranges:
         range_text = (
-            f"{headline.RANGE_PHRASES[kind]}, {headline.format_target_count(statistics, kind)}"
+            f"{best_tuner_summary.RANGE_PHRASES[kind]}, "
+            f"{best_tuner_summary.format_target_count(statistics, kind)}"
         )
         lines = [
-            f"\nbest tuners, {range_text} ({label}; {headline.format_error_floor(statistics)})"
+            f"\nbest tuners, {range_text} "
+            f"({label}; {best_tuner_summary.format_error_floor(statistics)})"
         ]
-        for ranking in headline.rank_at_checkpoints(statistics, kind):
+        for ranking in best_tuner_summary.rank_at_checkpoints(statistics, kind):
             lines += _format_ranking(ranking)
-        lines += [headline.list_failed_runs(statistics, kind)]
+        lines += [best_tuner_summary.list_failed_runs(statistics, kind)]
         lines += [
-            headline.warn_about_target_count(statistics, kind)
-            or headline.explain_ranking(statistics, kind)
+            best_tuner_summary.warn_about_target_count(statistics, kind)
+            or best_tuner_summary.explain_ranking(statistics, kind)
         ]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
+def _format_ranking(ranking: best_tuner_summary.TunerRanking) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out.
 
     Args:
@@ -340,6 +342,9 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
     """Format failures as lines, one for each tuner and status.
 
     Each line has the error of the first reason, and where it was raised.
+
+    Args:
+        failed: Rows of the failed runs, with tuner, status and reason.
     """
     lines = [
         (

@@ -49,10 +49,6 @@ if TYPE_CHECKING:
 class Comparison(Study):
     """Comparison of tuners x targets x seeds in a result folder; implements `study.Study`.
 
-    Args:
-        folder: result folder of a comparison, for status and report. Use `begin` or `resume` for a
-            comparison that can be run.
-
     Attributes:
         folder: result folder.
         configuration: configuration of the comparison.
@@ -63,7 +59,12 @@ class Comparison(Study):
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open a comparison for reading: its configuration is read, but no plan and no runs."""
+        """Open a comparison for reading: its configuration is read, but no plan and no runs.
+
+        Args:
+            folder: result folder of a comparison, for status and report. Use `begin` or `resume`
+                for a comparison that can be run.
+        """
         super().__init__(folder)
         self.results: ExperimentRun | None = None
 
@@ -168,6 +169,9 @@ class Comparison(Study):
     def _index_finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
         """Return the statuses of a finished comparison by their index in the plan.
 
+        Args:
+            ids: IDs of the planned runs, in the order of the plan.
+
         Raises:
             InputError: the folder has other runs than the plan, or is damaged.
         """
@@ -257,6 +261,9 @@ class Comparison(Study):
 
         It has one row per target and direction of the parameter space. There is no such file for a
         single parameter.
+
+        Args:
+            results: Runs of the experiment with the information spectrum of each target.
         """
         if results.spectra:
             from bench.benchmark.statistics.comparison_statistics import build_identifiability_table

@@ -98,7 +98,7 @@ def write_animation(
 
     Args:
         folder: result folder.
-        settings: the [shot] table.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         example: the shot and its methods.
         stored: stored results by name of the shot.
         trusted: whether tuners ran without isolation, which the title then says.
@@ -159,9 +159,9 @@ def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot
 
     Args:
         axis: axes to draw on.
-        setup: the shot.
+        setup: setup of the shot: its ball, drop, incline and hoop.
         method: label of the method.
-        shot: the executed example.
+        shot: executed example: a shot with the path that it took.
     """
     draw_shot_panel(axis, setup, method, shot)
     line = axis.lines[-1]
@@ -173,6 +173,8 @@ def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot
 
 def _draw_film_panel(axis: Any, film: FilmFrames) -> _Filmed:
     """Draw the panel of the film in its initial state: first frame, no track.
+
+    The panel shows one frame of the film, with the tracked path of the ball so far.
 
     Args:
         axis: axes to draw on.

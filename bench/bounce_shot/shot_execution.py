@@ -70,8 +70,8 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     """Execute a planned shot, with the shot's release error.
 
     Args:
-        setup: the shot.
-        settings: the [shot] table.
+        setup: setup of the shot: its ball, drop, incline and hoop.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         model: tuned model with the plan.
     """
     times = np.arange(round(MAX_SHOT_SECONDS * SAMPLING_RATE_HZ) + 1) / SAMPLING_RATE_HZ
@@ -122,11 +122,11 @@ def _find_descent_index(path: Array, height: float) -> int:
     Returns:
         Index of the sample; the last index if the path does not descend through the height.
     """
-    z = path[:, 2]
+    heights = path[:, 2]
     # Before its bounce, the ball falls through the same heights.
-    has_risen = np.logical_or.accumulate(z[1:] > z[:-1])
-    down = np.flatnonzero(has_risen & (z[:-1] > height) & (z[1:] <= height))
-    return int(down[0]) if down.size else len(z) - 1
+    has_risen = np.logical_or.accumulate(heights[1:] > heights[:-1])
+    down = np.flatnonzero(has_risen & (heights[:-1] > height) & (heights[1:] <= height))
+    return int(down[0]) if down.size else len(heights) - 1
 
 
 def build_shot_rows(
@@ -135,8 +135,8 @@ def build_shot_rows(
     """Execute the shot of each method, and build the result rows.
 
     Args:
-        setup: the shot.
-        settings: the [shot] table.
+        setup: setup of the shot: its ball, drop, incline and hoop.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         models: fields of the tuned model of each method.
     """
     return [
@@ -153,7 +153,7 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
     is kept as ``reason``.
 
     Args:
-        setup: the shot.
+        setup: setup of the shot: its ball, drop, incline and hoop.
         model: tuned model with the plan.
         result: result of the executed shot.
     """
@@ -192,7 +192,7 @@ def get_shot_path(folder: Path, setup: ShotSetup) -> Path:
 
     Args:
         folder: result folder of the study.
-        setup: the shot.
+        setup: setup of the shot: its ball, drop, incline and hoop.
     """
     return folder / SHOTS_FOLDER / f"{setup.name}.json"
 
@@ -235,7 +235,7 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
 
     Args:
         folder: result folder of the study.
-        setup: the shot.
+        setup: setup of the shot: its ball, drop, incline and hoop.
 
     Raises:
         InputError: the file is damaged.

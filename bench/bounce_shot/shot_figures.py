@@ -64,8 +64,8 @@ def draw_figures(
     """Draw all figures.
 
     Args:
-        experiment: the experiment.
-        settings: the [shot] table.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         setups: all shots.
         stored: stored results by name of the shot.
         rows: rows of shots.csv.
@@ -109,7 +109,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     """Draw the hit rate of each method over all balls and by ball, as the chart of the page.
 
     Args:
-        experiment: the experiment.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
     """
     panel, table = make_success_panel(lines)
@@ -133,7 +133,7 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     """Draw the legend of the groups that occur, below the figure.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         methods: labels of the methods that are drawn.
     """
     from matplotlib.lines import Line2D
@@ -153,7 +153,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     """Draw where shots met the hoop's plane (left) and the prediction error (right) as box plots.
 
     Args:
-        settings: the [shot] table.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         rows: rows of shots.csv.
     """
     methods = list(rows["method"].unique())
@@ -284,8 +284,8 @@ def execute_example(
     """Execute one shot again with each of some methods, because stored results contain no paths.
 
     Args:
-        settings: the [shot] table.
-        setup: the shot.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        setup: setup of the shot: its ball, drop, incline and hoop.
         methods: names of the methods.
         stored: stored results by name of the shot.
     """
@@ -302,7 +302,7 @@ def draw_shots_figure(
     """Draw example shots as planned and as flown.
 
     Args:
-        settings: the [shot] table.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         chosen: examples as returned by `select_example_shots`, one per row.
         stored: stored results by name of the shot.
     """
@@ -332,9 +332,9 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
 
     Args:
         axis: axes to draw on.
-        setup: the shot.
+        setup: setup of the shot: its ball, drop, incline and hoop.
         method: name of the method.
-        shot: the executed example.
+        shot: executed example: a shot with the path that it took.
     """
     scene, flight = setup.scene, shot.results[method]
     # Ends of the drawn incline in m: behind the release, and before the hoop.
@@ -372,9 +372,11 @@ def find_path_end(path: Array, scene: ShotGeometry) -> int:
     Returns:
         Index of the sample, or the number of samples.
     """
-    z = path[:, 2]
+    heights = path[:, 2]
     # Before the bounce, the ball falls through the same heights.
-    has_risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
-    is_falling = np.concatenate([[0], np.diff(z)]) < 0
-    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _MIN_DRAWN_DEPTH) & is_falling)
-    return int(indices_below[0]) if indices_below.size else len(z)
+    has_risen = np.concatenate([[False], np.logical_or.accumulate(heights[1:] > heights[:-1])])
+    is_falling = np.concatenate([[0], np.diff(heights)]) < 0
+    indices_below = np.flatnonzero(
+        has_risen & (heights < scene.hoop_z - _MIN_DRAWN_DEPTH) & is_falling
+    )
+    return int(indices_below[0]) if indices_below.size else len(heights)

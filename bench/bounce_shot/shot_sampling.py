@@ -125,7 +125,7 @@ def draw_shot(
 
     Args:
         experiment: the experiment; its name is part of the seed.
-        settings: the [shot] table.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         kind: kind of ball.
         index: index of the shot with this kind of ball.
         salt: salt from which the shot is drawn.
@@ -154,8 +154,8 @@ def draw_shots(experiment: Experiment, settings: ShotConfig, salt: str = "") -> 
     The kinds of balls alternate, so that an interrupted study has shots of each.
 
     Args:
-        experiment: the experiment.
-        settings: the [shot] table.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         salt: salt from which the shots are drawn.
     """
     return [
@@ -180,9 +180,9 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     """Record a drop of the ball on level ground, unless the recording exists already.
 
     Args:
-        experiment: the experiment.
-        setup: the shot.
-        settings: the [shot] table.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        setup: setup of the shot: its ball, drop, incline and hoop.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         path: CSV file of the recording.
     """
     if path.exists() and path.with_suffix(".toml").exists():
@@ -195,14 +195,14 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = setup.ball.radius, experiment.sampling
     times = np.arange(sampling.samples) / sampling.rate
-    z = simulate_shot(
+    heights = simulate_shot(
         setup.ball, InclinedGround(0.0, settings.friction), (0.0, 0.0, radius + drop_height), times
     )[:, 2]
     if settings.filmed:
-        film_and_track_drop(path, z, times, radius, round(settings.filmed), rng)
+        film_and_track_drop(path, heights, times, radius, round(settings.filmed), rng)
         return
     noise = experiment.noise.get("z", 0.0)
-    noisy_heights = z + noise * rng.standard_normal(z.shape)
+    noisy_heights = heights + noise * rng.standard_normal(heights.shape)
     # Rounded to 0.01 mm, far below any noise, to keep the file short.
     run = Run("1", times, {"z": np.round(noisy_heights, 5)}, {}, {}, {}, False)
     constants = {"radius": radius, "mass": setup.ball.mass, "gravity": GRAVITY}
@@ -218,8 +218,8 @@ def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Exper
     """Make the experiment for a ball in front of an unknown camera.
 
     Args:
-        experiment: the experiment.
-        settings: its [shot] table.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
     """
     radii = [get_ball_kind(name).radius for name in settings.balls]
     return experiment.chosen(
@@ -256,9 +256,9 @@ def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float
     is_inside = indices < times.size
     observed: Array = np.full((times.size, 2), np.nan)
     observed[indices[is_inside], 1] = run.extra[ROW_CHANNEL][is_inside]
-    z = run.channels["z"]
-    first = int(np.flatnonzero(np.isfinite(z))[0])
+    heights = run.channels["z"]
+    first = int(np.flatnonzero(np.isfinite(heights))[0])
     gravity = recording.constants["gravity"]
     # Released at rest at t = 0, and possibly first seen later: z(t) = z(0) - g t^2 / 2.
-    height = float(z[first] + 0.5 * gravity * run.times[first] ** 2)
+    height = float(heights[first] + 0.5 * gravity * run.times[first] ** 2)
     return ObservedRuns((Scenario(times, {"z": height}, {}, {"radius": radius}),), observed)

@@ -188,13 +188,7 @@ class BounceShotStudy(Study):
 
 
 class _ShotStages:
-    """Execution of the missing shots in stages: record drops, train tuners, tune, plan and shoot.
-
-    Args:
-        study: the study.
-        missing_shots: the missing shots.
-        progress: makes progress callbacks.
-    """
+    """Execution of the missing shots in stages: record, train tuners, tune, plan and shoot."""
 
     def __init__(
         self, study: BounceShotStudy, missing_shots: list[ShotSetup], progress: ProgressFactory
@@ -204,6 +198,11 @@ class _ShotStages:
         Tuners that are trusted run in the worker processes and need no specification. The hidden
         folders, which isolated tuners must not read, are the result folder and the cache of trained
         weights.
+
+        Args:
+            study: bounce-shot study in its result folder.
+            missing_shots: the missing shots.
+            progress: makes progress callbacks.
         """
         self._study, self._missing_shots, self._progress = study, missing_shots, progress
         self._experiment, self._settings = study.experiment, study.config

@@ -97,19 +97,18 @@ def simulate_shot(
 
 
 class _Flight:
-    """Simulation of one ball by MuJoCo, with drag, lift and friction of this module.
-
-    Args:
-        ball: properties of the ball.
-        ground: inclined plane.
-        air: density of the air, kg/m^3.
-    """
+    """Simulation of one ball by MuJoCo, with drag, lift and friction of this module."""
 
     def __init__(self, ball: BallKind, ground: InclinedGround, air: float) -> None:
         """Build the MuJoCo model, and compute the factors of drag (1) and lift (2).
 
         `_normal` is the x and z part of the unit vector normal to the ground, and `_touches` tells
         whether the ball is in contact.
+
+        Args:
+            ball: properties of the ball.
+            ground: inclined plane.
+            air: density of the air, kg/m^3.
         """
         import mujoco
 

@@ -107,8 +107,8 @@ def tune_and_plan(
     """Tune all methods to a recording, and plan a shot with each.
 
     Args:
-        experiment: the experiment.
-        settings: its [shot] table.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         inputs: input of the methods.
 
     Returns:
@@ -152,9 +152,9 @@ def _tune_model(
     """Run a tuner on the recorded drop, in the simulator with given effects.
 
     Args:
-        experiment: the experiment.
-        settings: its [shot] table.
-        entry: the tuner.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        entry: entry of the tuner: registered name, label and options.
         inputs: input of the methods.
         recording: recording of the ball's drop.
         effects: coefficients of the effects that explain found; empty for the original simulator.
@@ -204,9 +204,9 @@ def make_tuning_experiment(
     """Adapt the experiment to a tuner: to pixel rows if the tuner uses them.
 
     Args:
-        experiment: the experiment.
-        settings: its [shot] table.
-        entry: the tuner.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        entry: entry of the tuner: registered name, label and options.
     """
     return (
         make_pixel_experiment(experiment, settings) if entry.label in settings.rows else experiment
@@ -221,7 +221,7 @@ def _make_observed_runs(recording: Recording, experiment: Experiment) -> Observe
 
     Args:
         recording: recording of the ball's drop.
-        experiment: the experiment.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
     """
     (run,) = recording.runs
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
@@ -329,7 +329,7 @@ def get_planning_constants(settings: ShotConfig, radius: float) -> dict[str, flo
     """Return the constants of a ball that the planner assumes.
 
     Args:
-        settings: the [shot] table.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         radius: radius of the ball, m.
     """
     return {
@@ -350,8 +350,8 @@ def plan_shot_in_model(
     """Plan a shot in a model.
 
     Args:
-        model: the tuned model.
-        settings: the [shot] table.
+        model: simulator with the parameters that a tuner has found.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         scene: incline and hoop.
         radius: radius of the ball, m.
     """
@@ -374,8 +374,8 @@ def _plan_shot(
     hoop from no height gets the status "no plan".
 
     Args:
-        model: the tuned model.
-        settings: the [shot] table.
+        model: simulator with the parameters that a tuner has found.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
         scene: incline and hoop.
         radius: radius of the ball, m.
     """

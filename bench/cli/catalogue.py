@@ -354,13 +354,14 @@ def _format_system(system: JsonDocument) -> list[str]:
     lines = [f"{system['name']}: {_format_sentence(system)}"]
     if system["skipped"]:
         return lines
-    for p in system["parameters"]:
-        low, high = p["bounds"]
-        training = p["training"]
+    for parameter in system["parameters"]:
+        low, high = parameter["bounds"]
+        training = parameter["training"]
         training_text = f", training {training[0]:g} to {training[1]:g}" if training else ""
         lines.append(
-            f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{training_text}; "
-            f"nominal {p['nominal']:g}  {p['says']}"
+            f"  parameter {parameter['name']:18} {parameter['unit']:12} "
+            f"{low:g} to {high:g}{training_text}; "
+            f"nominal {parameter['nominal']:g}  {parameter['says']}"
         )
     lines += [
         f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
@@ -385,11 +386,12 @@ def _format_effect(effect: JsonDocument) -> list[str]:
     if effect["skipped"]:
         return [f"{effect['name']}: {_format_sentence(effect)}"]
     result = [f"{effect['name']} ({effect['hook']}): {effect['says']}"]
-    for c in effect["coefficients"]:
-        for application in c["on"]:
+    for coefficient in effect["coefficients"]:
+        for application in coefficient["on"]:
             spread = f"{application['low']:g} to {application['high']:g}"
             result.append(
-                f"  {c['name']:14} {application['kind']:7} {application['unit']:18} {spread}"
+                f"  {coefficient['name']:14} {application['kind']:7} "
+                f"{application['unit']:18} {spread}"
             )
     return result
 

@@ -82,12 +82,7 @@ BAR_WIDTH = 10
 
 
 class SearchProgress:
-    """The state of a running search: a `ProgressListener` that stores the latest events.
-
-    Args:
-        clock: Returns the time in seconds.
-        budget: Seconds after which the search ends; None without such a limit.
-    """
+    """The state of a running search: a `ProgressListener` that stores the latest events."""
 
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, budget: float | None = None
@@ -96,6 +91,10 @@ class SearchProgress:
 
         `_share` is the share of the search that is done, `_best` the effects of the best model so
         far and the percentage of the gap that it closes, both as text.
+
+        Args:
+            clock: Returns the time in seconds.
+            budget: Seconds after which the search ends; None without such a limit.
         """
         self._clock = clock
         self._budget = budget
@@ -256,13 +255,6 @@ class ProgressDisplay(SearchProgress):
     most every `LOG_INTERVAL` seconds. Events only store values and read the clock, so that the
     search is not slowed down. A timer signal redraws between events instead of a thread, because a
     process with threads cannot fork workers safely.
-
-    Args:
-        budget: Seconds after which the search ends; None without such a limit.
-        silent: Whether to show nothing.
-        hint: Whether to print `BUDGET_HINT` in a long search without a budget.
-        stream: Output stream; stderr if None.
-        clock: Returns the time in seconds.
     """
 
     def __init__(
@@ -278,6 +270,13 @@ class ProgressDisplay(SearchProgress):
 
         `_shown` is the live line now on the terminal, `_shown_at` the time of the last output, and
         `_waiting` has permanent lines that are still to be printed.
+
+        Args:
+            budget: Seconds after which the search ends; None without such a limit.
+            silent: Whether to show nothing.
+            hint: Whether to print `BUDGET_HINT` in a long search without a budget.
+            stream: Output stream; stderr if None.
+            clock: Returns the time in seconds.
         """
         super().__init__(clock, budget)
         self._stream = sys.stderr if stream is None else stream

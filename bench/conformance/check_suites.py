@@ -133,7 +133,7 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
     """Bind a check to its subject, as a test without arguments.
 
     Args:
-        check: the check.
+        check: check function; its docstring is its title.
         subject: a class.
         failed: failed checks of this subject; this check is added if it fails.
     """

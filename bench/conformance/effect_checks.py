@@ -113,6 +113,10 @@ def _make_parameters(simulator: SystemSimulator, share: float) -> Array:
 
     The system's own parameters are nominal; each coefficient of the effect is at the fraction
     `share` (0 to 1) of its plausible range.
+
+    Args:
+        simulator: Simulator with the effect.
+        share: Fraction of the plausible range of each coefficient, 0 to 1.
     """
     # The coefficients of the effect follow the parameters of the system.
     base_count = len(simulator.system.parameters)
@@ -138,10 +142,13 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
         location,
     )
     check(bool(effect.coefficients), "at least one coefficient", "none", location)
-    for c in effect.coefficients:
-        for unit, (low, high) in zip(c.units, c.plausible, strict=True):
+    for coefficient in effect.coefficients:
+        for unit, (low, high) in zip(coefficient.units, coefficient.plausible, strict=True):
             check(
-                unit is None or low < high, f"a plausible range for {c.name}", (low, high), location
+                unit is None or low < high,
+                f"a plausible range for {coefficient.name}",
+                (low, high),
+                location,
             )
     has_host = any(True for _ in _find_supporting_systems(effect)) or bool(
         list_effect_places(effect)

@@ -42,12 +42,18 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
         check(
             effect_class.name == expected_name, f"name {expected_name}", effect_class.name, location
         )
-        for c in effect_class.coefficients:
+        for coefficient in effect_class.coefficients:
             finite = all(
-                np.isfinite(limits).all() and limits[0] < limits[1] for limits in c.plausible
+                np.isfinite(limits).all() and limits[0] < limits[1]
+                for limits in coefficient.plausible
             )
-            check(finite, f"a finite range for {c.name}", c.plausible, location)
-            check(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, location)
+            check(finite, f"a finite range for {coefficient.name}", coefficient.plausible, location)
+            check(
+                all(coefficient.units),
+                f"a unit for {coefficient.name} ('1' for a number)",
+                coefficient.units,
+                location,
+            )
     if not classes:
         return NO_PLACE
     places = [effect_class.place for effect_class in classes if effect_class.place]
@@ -241,7 +247,7 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     """Return what an effect at one place changes.
 
     Args:
-        effect: the effect.
+        effect: effect: a force, friction, input, sensor or contact law.
         c: coefficients, (K, 2, 1).
         kind: simulator class of the robot.
 

@@ -156,7 +156,7 @@ def run_tuner(
     """Run a tuner on the toy problem.
 
     Args:
-        tuner: the tuner.
+        tuner: instance of the tuner.
         dim: number of parameters.
         budget: maximum number of simulations.
         seed: seed of the run.
@@ -172,7 +172,7 @@ def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) ->
     """Make the function that simulates and evaluates points on a task.
 
     Args:
-        task: the task.
+        task: task of the tuner: dimension, start, observations and budget.
         fails: returns whether simulation number k fails.
     """
     simulated = 0

@@ -369,6 +369,8 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     def compare(observations: Array, after: str) -> None:
         """Raise an error unless observations equal those of the first call bit for bit.
 
+        Shapes: T samples, C channels.
+
         Args:
             observations: (n, T, C) observations of the same points and scenario.
             after: what was different in this call, for the message.
@@ -394,6 +396,8 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
 
 def _describe_first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
     """Describe where two observations (n, T, C) first differ in time.
+
+    Shapes: T samples, C channels.
 
     Args:
         kind: class of the simulator, with the names of its channels.

@@ -412,12 +412,14 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
         ]
         tuner_logs, random = np.array(logs).T
         is_different = (tuner_logs != random).any()  # the test is undefined without a difference
-        p = float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if is_different else 1.0
+        p_value = (
+            float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if is_different else 1.0
+        )
         # Bonferroni correction: three looks at 5 % in total.
-        if p < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
+        if p_value < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
             return
     medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random)]
-    found_text = f"p = {p:.2g}, median error {' against '.join(medians)}"
+    found_text = f"p = {p_value:.2g}, median error {' against '.join(medians)}"
     level = _SIGNIFICANCE_LEVEL / len(_SEQUENTIAL_TEST_TARGETS)
     expected = f"errors below random search's (p < {level:.2g})"
     raise CheckError(f"expected {expected}; found {found_text}; see {kind.__name__}.tune")

@@ -92,6 +92,9 @@ class Answer:
     def of(cls, given: object) -> Answer:
         """Convert what a diagnoser returned into an answer.
 
+        Args:
+            given: Answer, verdict alone, or mapping with the keys of an answer.
+
         Raises:
             InputError: it is not a valid answer.
         """
@@ -252,7 +255,7 @@ def list_observable_effects(
 
     Args:
         kind: class of the simulator.
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
     """
     signals = {*recording.runs[0].channels, *(channel.name for channel in kind.inputs)}
     usable = effects_library.list_effects_for(kind.system)

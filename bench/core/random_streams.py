@@ -85,16 +85,16 @@ class TargetStreams:
     With a secret salt each quantity is drawn from its own stream. A quantity that a tuner knows,
     such as its start, therefore gives no information about another one. With a public salt there is
     one stream for all quantities, as in the published experiments.
-
-    Args:
-        salt: salt of the comparison.
-        names: names of the target: experiment, range and number.
     """
 
     def __init__(self, salt: str, *names: str | int) -> None:
         """Prepare the streams; `names` are the experiment, then the range and number of the target.
 
         `_one` is the stream that all quantities share when the salt is public.
+
+        Args:
+            salt: salt of the comparison.
+            names: names of the target: experiment, range and number.
         """
         self._salt, self._names = salt, names
         self._public = salt in ("", PUBLIC_SALT)

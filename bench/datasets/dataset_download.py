@@ -57,6 +57,12 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
     arrays of (2, T) angles (pi is hanging) and rates. The pieces are joined, every fifth sample is
     kept, and the angle is measured from hanging. Runs from number 7 on are held out.
 
+    Args:
+        files: Contents of the downloaded files by name.
+
+    Returns:
+        Table (CSV) and description (TOML) by file name.
+
     Raises:
         InputError: the file does not have this form.
     """
@@ -126,7 +132,7 @@ def download(
     """Write a data set into the folder NAME below `folder`.
 
     Args:
-        data_set: the data set.
+        data_set: data set of the catalogue: its files, source and licence.
         folder: parent folder of the data sets of this kind; created if it does not exist.
         source: source of the files instead of their public repository: a folder that contains them,
             such as a clone at the data set's commit, or an address that serves the repository's

@@ -61,7 +61,7 @@ def get_friction_form(evaluator: RunEvaluator, name: str) -> str | None:
 
     Args:
         evaluator: Run evaluator with the effect.
-        name: Name of the effect.
+        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     is_soft = has_soft_form(evaluator) and _is_dry_friction(type(evaluator.available_effects[name]))
     return "soft" if is_soft else None
@@ -74,7 +74,7 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
 
     Args:
         evaluator: Run evaluator with the effect.
-        name: Name of the effect.
+        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
         description: Description of the effect.
     """
     robot: Any = evaluator.kind
@@ -174,7 +174,7 @@ def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
 
     Args:
         evaluator: Run evaluator with the effect.
-        name: Name of the effect.
+        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     effect = evaluator.available_effects[name]
     if effect.hook != "hidden":
@@ -188,6 +188,8 @@ def replace_by_stateless_friction(
     evaluator: RunEvaluator, names: Iterable[str], theta: Array
 ) -> tuple[tuple[str, ...], Array]:
     """Replace effects with a state by the dry friction that they contain.
+
+    Shapes: P parameters.
 
     Args:
         evaluator: Run evaluator of the runs.

@@ -126,6 +126,14 @@ class _IdentifiabilityAssessment:
         `states` (R, n, s) has the scaled derivatives by the initial states, where n = T · C is
         the number of samples times channels of a run. `parameters` (R · n, q) has those by the q
         free parameters, without the part that a change of the initial states can reproduce.
+
+        Shapes: R runs, s states of a run.
+
+        Args:
+            evaluator: Run evaluator of the recording.
+            noise: Noise of each channel.
+            fit: Fitted model, with the derivatives of the runs.
+            direction_set: Directions of all candidate effects.
         """
         self.evaluator, self.noise, self.fit, self.found = evaluator, noise, fit, direction_set
         self.seen = np.isfinite(evaluator.observed)
@@ -145,7 +153,10 @@ class _IdentifiabilityAssessment:
         return (*free, *causes)
 
     def _project_out_states(self, columns: Array) -> Array:
-        """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
+        """Project the initial states of each run out of columns (R, n, k); return (N, k).
+
+        Shapes: R runs.
+        """
         state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
         normal = np.matmul(state_jacobian.transpose(0, 2, 1), state_jacobian) + precision
@@ -183,13 +194,20 @@ class _IdentifiabilityAssessment:
             scale[is_sensitive], scale[is_sensitive]
         )
         assessments = []
-        for i, index in enumerate(self.fit.free_indices.tolist()):
+        for column, index in enumerate(self.fit.free_indices.tolist()):
             parameter = self.evaluator.parameters[index]
-            standard_error = np.sqrt(max(float(covariance[i, i]), 0.0))
+            standard_error = np.sqrt(max(float(covariance[column, column]), 0.0))
             confounders = []
-            for j, other_index in enumerate(self.fit.free_indices.tolist()):
-                if i != j and np.isfinite(covariance[i, j]) and is_sensitive[i] and is_sensitive[j]:
-                    corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
+            for other_column, other_index in enumerate(self.fit.free_indices.tolist()):
+                if (
+                    column != other_column
+                    and np.isfinite(covariance[column, other_column])
+                    and is_sensitive[column]
+                    and is_sensitive[other_column]
+                ):
+                    corr = covariance[column, other_column] / np.sqrt(
+                        covariance[column, column] * covariance[other_column, other_column]
+                    )
                     confounders.append(
                         (self.evaluator.parameters[other_index].name, float(abs(corr)))
                     )

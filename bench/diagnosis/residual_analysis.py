@@ -36,6 +36,8 @@ IMPACT_MARGIN_SAMPLES = 2
 def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> DataSplit:
     """Return the runs of a run evaluator with two simulations of them.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: Run evaluator of the runs.
         before: (R, T, C) simulated by the base model.
@@ -50,6 +52,8 @@ def compute_gap_locations(
     evaluator: RunEvaluator, before: Array, after: Array, sigma: Array, mark: str = ""
 ) -> list[GapLocation]:
     """Compute the RMS residual in units of the noise, by run, channel and phase.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -81,6 +85,8 @@ def _list_parts(
 
     Each has its kind, its label and the mask (R, T, C) of its samples.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: run evaluator with the recorded runs.
         simulated: (R, T, C) simulated runs, which determine the phases of the motion.
@@ -107,6 +113,8 @@ def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
 
     They are flight, impact and at rest for a system that bounces; motion, reversal and at rest for
     others; and saturated input.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -136,6 +144,8 @@ def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
 def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     """Compute the speed (R, T) of the simulated motion along the recorded coordinates.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: Run evaluator of the runs.
         simulated: (R, T, C) simulated motion.
@@ -149,12 +159,12 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     ]
     for name in recorded_coordinates:
         values = simulated[:, :, evaluator.channels.index(name)]
-        for r, run_data in enumerate(evaluator.prepared_runs):
+        for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = len(run_data.observed)
             # A single sample has no slope.
             if size > 1:
-                slope = np.gradient(values[r, :size], run_data.scenario.times)
-                squares[r, :size] += np.square(slope)
+                slope = np.gradient(values[run_index, :size], run_data.scenario.times)
+                squares[run_index, :size] += np.square(slope)
     return np.sqrt(np.nan_to_num(squares)) if recorded_coordinates else None
 
 
@@ -172,6 +182,8 @@ def _find_lasting_stretches(mask: Mask) -> Mask:
 
 def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
     """Return the mask (R, T) of the samples around each minimum of the simulated height.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: the runs of a ball.
@@ -197,6 +209,11 @@ def _find_saturation(evaluator: RunEvaluator) -> Mask:
     """Return the mask (R, T) of samples at which the first input stays near its largest magnitude.
 
     It is empty for an input that is there most of the time, such as a square wave.
+
+    Shapes: R runs, T samples.
+
+    Args:
+        evaluator: Run evaluator of the recording.
     """
     mask = np.zeros(evaluator.observed.shape[:2], dtype=bool)
     for r, run_data in enumerate(evaluator.prepared_runs):
@@ -216,6 +233,8 @@ def compute_residual_profiles(
 
     The channel is the one that sensor effects act on. For a robot it is the one with the largest
     gap, against the variables of its joint.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -264,15 +283,17 @@ def get_robot(evaluator: RunEvaluator) -> RobotModel | None:
 def _find_largest_residual_channel(evaluator: RunEvaluator, before: Array, sigma: Array) -> str:
     """Return the channel with the largest residual in units of its noise.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         before: (R, T, C) channels simulated with the base model.
         sigma: (C,) standard deviation of the noise of each channel.
     """
     squares = np.square((evaluator.observed - before) / sigma)
     sizes = []
-    for c in range(len(evaluator.channels)):
-        channel_squares = squares[:, :, c][np.isfinite(squares[:, :, c])]
+    for channel_index in range(len(evaluator.channels)):
+        channel_squares = squares[:, :, channel_index][np.isfinite(squares[:, :, channel_index])]
         sizes.append(float(channel_squares.mean()) if channel_squares.size else 0.0)
     return evaluator.channels[int(np.argmax(sizes))]
 
@@ -295,8 +316,10 @@ def _iterate_variables(
 
     They are the time, the position, the speed, and each recorded input.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         simulated: (R, T, C) simulated channels, from which position and speed are taken.
     """
     times = _compute_run_times(evaluator)
@@ -328,8 +351,10 @@ def _iterate_inputs(
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield name, unit and values (R, T) of the recorded inputs with these names.
 
+    Shapes: R runs, T samples.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         names: names of the inputs.
     """
     for channel in evaluator.kind.inputs:
@@ -349,8 +374,10 @@ def _iterate_joint_variables(
 
     The velocity has its sign, because friction acts against it.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         simulated: (R, T, C) simulated channels.
         channel: name of the channel, such as ``q.elbow``.
     """
@@ -367,10 +394,12 @@ def _iterate_joint_variables(
         values = simulated[:, :, evaluator.channels.index(position)]
         yield f"position of {joint.name}", unit, values
         slopes = np.full_like(values, np.nan)
-        for r, run_data in enumerate(evaluator.prepared_runs):
+        for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = len(run_data.observed)
             if size > 1:
-                slopes[r, :size] = np.gradient(values[r, :size], run_data.scenario.times)
+                slopes[run_index, :size] = np.gradient(
+                    values[run_index, :size], run_data.scenario.times
+                )
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
     elif rate in evaluator.channels:
         values = simulated[:, :, evaluator.channels.index(rate)]

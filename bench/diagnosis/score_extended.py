@@ -163,7 +163,7 @@ def _check_system(recording: Path, system: str, extended: ExtendedSimulator, mod
     Args:
         recording: path of the recording, for messages.
         system: name of its system.
-        extended: the extended simulator.
+        extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         model: path of its file, for messages.
 
     Raises:
@@ -189,6 +189,8 @@ def _check_channels(
 def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
     """Build the parameter vector (P,) of an extended simulator; missing numbers are nominal.
 
+    Shapes: P parameters.
+
     Args:
         evaluator: Run evaluator with the effects of the extended simulator.
         extended: Extended simulator.
@@ -212,8 +214,10 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
 def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
     """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         extended: extended simulator, with its parameters and coefficients.
         sigma: (C,) standard deviation of the noise, which weights the channels.
     """
@@ -226,8 +230,10 @@ def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: 
 def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
     """Compute the squared errors (R, T, C); zero where no sample was observed.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         simulated: (R, T, C) simulated channels.
     """
     observed_mask = np.isfinite(evaluator.observed)
@@ -239,6 +245,8 @@ def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
 def _summarise_errors(evaluator: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
     """Summarise the RMS error of each channel, and that of all in units of the noise.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: run evaluator with the recorded runs.
         squares: (R, T, C) squared errors, zero where no sample exists.
@@ -247,11 +255,11 @@ def _summarise_errors(evaluator: RunEvaluator, squares: Array, sigma: Array) -> 
     observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))
     rmse = {}
-    for c, name in enumerate(evaluator.channels):
+    for channel_index, name in enumerate(evaluator.channels):
         # A channel without samples has no error.
-        if counts[c]:
-            total = squares[:, :, c].sum()
-            rmse[name] = float(np.sqrt(total / counts[c]))
+        if counts[channel_index]:
+            total = squares[:, :, channel_index].sum()
+            rmse[name] = float(np.sqrt(total / counts[channel_index]))
     # Errors of different channels can be added in units of their noise.
     normalised_squares = squares / np.square(sigma)
     normalised = np.sqrt(normalised_squares.sum() / counts.sum())

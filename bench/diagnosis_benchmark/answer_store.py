@@ -20,9 +20,6 @@ ANSWERS_FILE = "answers.jsonl"
 class AnswerStore:
     """Store of the answers in a result folder, opened for appending.
 
-    Args:
-        folder: result folder of the study.
-
     Attributes:
         answered: by case name, the case ({} if it could not be drawn) and one row per diagnoser.
 
@@ -34,6 +31,9 @@ class AnswerStore:
         """Open the file of the answers for appending, lock it, and read its answers.
 
         The lock prevents two processes from appending to the same file.
+
+        Args:
+            folder: result folder of the study.
         """
         self._path = folder / ANSWERS_FILE
         self._file = open_locked(self._path, folder)

@@ -112,7 +112,7 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
     """List the names of an effect's coefficients, in the order of the numbers in a case.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         name: name of the effect, with or without a place.
     """
     effect = library.get_effect(name.partition("@")[0])
@@ -383,7 +383,7 @@ def _list_hidden_effects(request: CaseRequest, system: str) -> list[str | None]:
 
     Args:
         request: kind and number of cases, and effects that are named.
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
 
     Raises:
         InputError: an effect is unknown, or effects are named for clean or double cases.

@@ -258,18 +258,20 @@ def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     shares = 100.0 * counts.to_numpy() / np.maximum(totals, 1)[:, None]
     axis.imshow(shares, cmap="Greys", vmin=0, vmax=100, aspect="auto")
     answer_labels = list(counts.columns)
-    for i, family in enumerate(counts.index):
+    for row, family in enumerate(counts.index):
         for right_answer in _CORRECT_ANSWERS.get(family, (family,)):
             if right_answer in answer_labels:
-                corner = answer_labels.index(right_answer) - 0.5, i - 0.5
+                corner = answer_labels.index(right_answer) - 0.5, row - 0.5
                 axis.add_patch(
                     Rectangle(corner, 1, 1, fill=False, edgecolor=style.NEUTRAL_MARK, linewidth=1.0)
                 )
-        for j, share in enumerate(shares[i]):
+        for column, share in enumerate(shares[row]):
             if share >= _MIN_LABELLED_PERCENT:
                 # White text on dark cells.
                 ink = "white" if share > 55 else style.NEUTRAL_MARK
-                axis.text(j, i, f"{share:.0f}", ha="center", va="center", fontsize=5.5, color=ink)
+                axis.text(
+                    column, row, f"{share:.0f}", ha="center", va="center", fontsize=5.5, color=ink
+                )
     axis.set_title(name, fontsize=9)
     axis.set_xticks(range(len(answer_labels)), answer_labels, rotation=90, fontsize=6.5)
     labels = [f"{family} {n}" for family, n in zip(counts.index, totals, strict=True)]

@@ -166,7 +166,7 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     ``place`` with the number of the category.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
 
     Returns:
         Tables by name; those without data are empty.
@@ -202,7 +202,7 @@ def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
     """Make the panels of every chart by name; a chart without data has none.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
     """
     tables = build_chart_tables(data)
     return {
@@ -239,7 +239,7 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
     """Make the chart of the fractions in table.csv that have answers, one category per metric.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
         table: rows of table.csv of these metrics.
     """
     counts = table.groupby("metric")["of"].max()
@@ -271,7 +271,7 @@ def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
     For a calibrated p-value the fraction equals the level; a grey line shows this ideal.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
     """
     ideal_series = Series(
         "calibrated p-value", "share", make_mark_style(GREY, (4.0, 3.0)), {"diagnoser": ""}
@@ -290,7 +290,7 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
     A set contains the effects that an answer cannot distinguish.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
     """
     x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
     correct = data.make_interval_series("share", is_shifted=True)
@@ -462,7 +462,7 @@ def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
     skipped diagnosers.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
     """
     if data.experiment.trusted:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
@@ -508,7 +508,7 @@ def render_page(data: DiagnoserReportData) -> str:
     The tables are embedded in the page for its charts; the numbers of the text are computed here.
 
     Args:
-        data: the data of the report.
+        data: graded answers and result tables of all diagnosers.
     """
     page = HtmlPage()
     failures = build_failure_table(data.rows, data.order)

@@ -405,7 +405,7 @@ def _make_failed_answers(
     """Make failed answers for a case whose worker died or exceeded its time limit.
 
     Args:
-        question: the case.
+        question: specification of a case: system, hidden cause, size and seed.
         labels: labels of the diagnosers.
         error: error of the worker.
 

@@ -69,7 +69,7 @@ def train_or_load(
     Args:
         code: where its code is.
         source: hash of its code.
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         budget: maximum number of simulations.
         seconds: maximum time.
         hidden: folders that the diagnoser's process must not read.

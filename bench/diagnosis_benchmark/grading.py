@@ -134,7 +134,7 @@ def _grade_library(
     Args:
         effects: the hidden effects.
         word: the verdict.
-        sets: the named sets.
+        sets: sets of effects that an answer names; those of one set are alternatives.
         equivalents: returns an effect and all effects that are equivalent to it.
 
     Returns:
@@ -167,7 +167,7 @@ def _match_sets_to_effects(
 
     Args:
         effects: the hidden effects, at most two.
-        sets: the named sets.
+        sets: sets of effects that an answer names; those of one set are alternatives.
         is_in_set: returns whether a set contains an effect.
 
     Returns:

@@ -35,7 +35,7 @@ def _warm_up_search(system: str) -> None:
     The result is discarded: the call makes Python import and compile what every diagnosis needs.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
     """
     specification = SimulationSpec(
         system=system, noise={"*": _NOISE_SIGMA}, runs=2, seconds=0.5, rate=50.0, engine="batch"

@@ -72,9 +72,21 @@ def _compute_camera_axes(azimuth: float, elevation: float) -> Array:
         azimuth: angle in degrees, by the convention of MuJoCo's free camera.
         elevation: angle in degrees, by the same convention.
     """
-    a, e = np.deg2rad([azimuth, elevation])
-    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])
+    azimuth_angle, elevation_angle = np.deg2rad([azimuth, elevation])
+    forward = np.array(
+        [
+            np.cos(elevation_angle) * np.cos(azimuth_angle),
+            np.cos(elevation_angle) * np.sin(azimuth_angle),
+            np.sin(elevation_angle),
+        ]
+    )
+    up = np.array(
+        [
+            -np.sin(elevation_angle) * np.cos(azimuth_angle),
+            -np.sin(elevation_angle) * np.sin(azimuth_angle),
+            np.cos(elevation_angle),
+        ]
+    )
     return np.stack([np.cross(forward, up), up, forward])
 
 
@@ -82,7 +94,7 @@ def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
     """Compute the robot's mujoco.MjData at a pose.
 
     Args:
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         positions: Positions by joint, rad or m; other joints keep the position of the model file.
     """
     import mujoco
@@ -106,7 +118,7 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     moving parts and of the static parts close to them.
 
     Args:
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         data: MuJoCo data at the pose.
     """
     azimuth, elevation = _choose_view_angles(robot, data)
@@ -180,7 +192,7 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
     """
     normal = _find_motion_plane_normal(robot, data)
     if normal is not None and abs(normal[2]) > 1 - PARALLEL_SINE_TOLERANCE:
-        return 90.0, -90.0
+        return 90.0, -90.0  # Azimuth and elevation in degrees: from above.
     if normal is not None:
         azimuth = float(np.rad2deg(np.arctan2(normal[1], normal[0]))) % 360
         elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
@@ -240,14 +252,14 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
     corners = np.array(list(product((-1, 1), repeat=3)))
     points_by_mobility: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
     shaped = set()
-    for g in range(model.ngeom):
-        if int(model.geom_type[g]) in floor_types:
+    for geom in range(model.ngeom):
+        if int(model.geom_type[geom]) in floor_types:
             continue
-        body = int(model.geom_bodyid[g])
+        body = int(model.geom_bodyid[geom])
         shaped.add(body)
-        box = model.geom_aabb[g, :3] + corners * model.geom_aabb[g, 3:]
-        turn = data.geom_xmat[g].reshape(3, 3)
-        points_by_mobility[_is_static_body(model, body)].append(data.geom_xpos[g] + box @ turn.T)
+        box = model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:]
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        points_by_mobility[_is_static_body(model, body)].append(data.geom_xpos[geom] + box @ turn.T)
     for body in range(1, model.nbody):
         if body not in shaped:
             points_by_mobility[_is_static_body(model, body)].append(data.xipos[body][None])

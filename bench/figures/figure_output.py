@@ -83,7 +83,7 @@ def render_png(figure: Figure, dpi: int = DPI) -> bytes:
     """Render a figure as the bytes of a PNG file.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         dpi: resolution in pixels per inch.
     """
     file = _Pixels()
@@ -138,7 +138,7 @@ def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | N
     """Render a figure as PNG, and as PDF if requested (`bench.figures.figure_settings`).
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         dpi: resolution of the PNG in pixels per inch.
 
     Returns:
@@ -152,7 +152,7 @@ def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
     """Render a figure as PNG, as SVG for a page, and as PDF if requested.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         dpi: resolution of the PNG in pixels per inch.
     """
     with _lay_out_once(figure, dpi):
@@ -178,7 +178,7 @@ def _lay_out_once(figure: Figure, dpi: int) -> Iterator[None]:
     """Compute the layout of a figure once for all files that are written in the `with` block.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         dpi: resolution for which text is measured, in pixels per inch.
     """
     engine, screen = figure.get_layout_engine(), figure.dpi

@@ -191,7 +191,7 @@ def _hide_floors(mujoco: Any, model: Any) -> None:
         model: compiled model, changed in place.
     """
     floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-    for g in range(model.ngeom):
-        if int(model.geom_type[g]) in floor_types:
-            model.geom_matid[g] = -1
-            model.geom_rgba[g, 3] = 0.0
+    for geom in range(model.ngeom):
+        if int(model.geom_type[geom]) in floor_types:
+            model.geom_matid[geom] = -1
+            model.geom_rgba[geom, 3] = 0.0

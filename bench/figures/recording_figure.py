@@ -201,7 +201,7 @@ def _make_mark_legend(recording: Recording, placed_runs: Sequence[_PlacedRun]) -
     """Make the legend entries for the marks that are present.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         placed_runs: the runs that are drawn.
     """
     from matplotlib.lines import Line2D
@@ -272,10 +272,10 @@ def _draw_scene(axis: Axes, track: BallTrack) -> None:
     axis.imshow(_overlay_balls(track), interpolation="nearest")
     axis.plot(track.u, track.v, "-", color="white", linewidth=2.4)
     axis.plot(track.u, track.v, ".-", color=_DETECTED_COLOUR, linewidth=0.8, markersize=2.5)
-    for k in _choose_frames(track):
-        middle = (track.u[k], track.v[k])
+    for frame in _choose_frames(track):
+        middle = (track.u[frame], track.v[frame])
         for colour, width in (("black", 1.6), ("white", 0.8)):
-            outline = Circle(middle, track.radius[k], fill=False, color=colour, linewidth=width)
+            outline = Circle(middle, track.radius[frame], fill=False, color=colour, linewidth=width)
             axis.add_patch(outline)
     axis.set(xlabel="u [px]", ylabel="v [px]", title="the track; circles: outlines found")
 
@@ -327,8 +327,11 @@ def _overlay_balls(track: BallTrack) -> RgbImage:
     picture = track.background.copy()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     # Only the disc of the ball is copied from each stored frame.
-    for k, frame in track.pictures.items():
-        if 0 <= k < len(track.u) and np.isfinite(track.u[k]):
-            ball = np.hypot(u - track.u[k], v - track.v[k]) <= track.radius[k]
+    for frame_index, frame in track.pictures.items():
+        if 0 <= frame_index < len(track.u) and np.isfinite(track.u[frame_index]):
+            ball = (
+                np.hypot(u - track.u[frame_index], v - track.v[frame_index])
+                <= track.radius[frame_index]
+            )
             picture[ball] = frame[ball]
     return picture

@@ -43,7 +43,7 @@ def draw_skeleton(axis: Axes, robot: RobotModel, data: Any, view: Projection) ->
 
     Args:
         axis: Axes to draw on.
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         data: MuJoCo data at the pose.
         view: Camera view.
     """
@@ -71,7 +71,7 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
     to the end of the last body.
 
     Args:
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         data: MuJoCo data at the pose.
     """
     model = robot.compiled
@@ -118,12 +118,12 @@ def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
         start: (3,) anchor of its first joint, m.
     """
     points = [2 * data.xipos[body] - start]
-    for g in range(model.ngeom):
-        if int(model.geom_bodyid[g]) != body:
+    for geom in range(model.ngeom):
+        if int(model.geom_bodyid[geom]) != body:
             continue
-        turn = data.geom_xmat[g].reshape(3, 3)
-        middle = data.geom_xpos[g] + turn @ model.geom_aabb[g, :3]
-        half_extents = turn * model.geom_aabb[g, 3:]
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        middle = data.geom_xpos[geom] + turn @ model.geom_aabb[geom, :3]
+        half_extents = turn * model.geom_aabb[geom, 3:]
         points += [*(middle + half_extents.T), *(middle - half_extents.T)]
     shapes = points[1:] or points
     return np.array(max(shapes, key=lambda p: round(float(np.linalg.norm(p - start)), 9)))
@@ -156,6 +156,12 @@ def _draw_joint(axis: Axes, joint: Joint, data: Any, view: Projection) -> None:
 
     `data` is the mujoco.MjData of the pose: `xanchor` and `xaxis` have the position (m) and the
     axis of each joint in the world.
+
+    Args:
+        axis: Axes to draw on.
+        joint: Joint of the robot.
+        data: State of MuJoCo in the drawn pose.
+        view: Projection to the picture.
     """
     anchor = data.xanchor[joint.id]
     x, y = view.project(anchor[None])[0]
@@ -318,7 +324,7 @@ def compute_joint_positions(
 
     Args:
         figure: Figure made by `draw_robot_figure`.
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         positions: Positions by joint of that figure.
 
     Returns:
@@ -429,13 +435,13 @@ def arrange_labels(
     """
     middles = np.array(wanted_positions, dtype=np.float64)
     ceiling = high
-    for i, size in enumerate(sizes):
-        middles[i] = min(middles[i], ceiling - size / 2)
-        ceiling = middles[i] - size / 2
+    for label_index, size in enumerate(sizes):
+        middles[label_index] = min(middles[label_index], ceiling - size / 2)
+        ceiling = middles[label_index] - size / 2
     floor = low
-    for i in reversed(range(len(middles))):
-        middles[i] = max(middles[i], floor + sizes[i] / 2)
-        floor = middles[i] + sizes[i] / 2
+    for label_index in reversed(range(len(middles))):
+        middles[label_index] = max(middles[label_index], floor + sizes[label_index] / 2)
+        floor = middles[label_index] + sizes[label_index] / 2
     return middles
 
 
@@ -551,7 +557,7 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
     """Return (3,) the position of a place of the robot in metres.
 
     Args:
-        robot: The robot.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         data: MuJoCo data at the pose.
         kind: ``joint``, ``actuator``, ``body`` or ``channel``.
         name: Name of the place.

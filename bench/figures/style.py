@@ -333,7 +333,7 @@ def style_of(
     """Return the styles of a comparison's tuners, in the order of its ranking.
 
     Args:
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         statistics: Its statistics.
         references: Reference results drawn behind the curves.
         panels: Metric and range of each panel of curves against simulations; the legend says which
@@ -406,7 +406,7 @@ def finish_figure(
     """Add legend, title and caption to a figure.
 
     Args:
-        figure: The figure.
+        figure: Figure of Matplotlib.
         axes: Its panels.
         style: Styles of the tuners.
         experiment: The experiment, which gives the title.
@@ -455,7 +455,7 @@ def _make_reference_entries(
     Args:
         axes: all panels.
         style: line style of each tuner.
-        reference: the reference results.
+        reference: stored comparison that is drawn in grey.
     """
     from matplotlib.lines import Line2D
 
@@ -481,7 +481,7 @@ def make_reference_id(reference: ReferenceResult, tuner: str) -> str:
     """Return the identifier of a reference's line in a figure.
 
     Args:
-        reference: the reference results.
+        reference: stored comparison that is drawn in grey.
         tuner: label of the tuner.
     """
     return f"behind {reference.name} {tuner}"
@@ -503,7 +503,7 @@ def add_trust_note(figure: Figure, trusted: bool) -> Figure:
     """Mark a figure in its title and caption if its tuners were not isolated, and return it.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         trusted: whether the tuners ran without isolation.
     """
     if trusted:

@@ -113,9 +113,9 @@ def compute_heights_by_scale(
     Raises:
         InputError: The film does not show what the method needs.
     """
-    q = _compute_fall_position(track) / _smooth_radius(track)
-    arcs = _fit_free_flights(track.times, q)
-    ground = _estimate_ground_position(track, q, arcs)
+    distance_ratio = _compute_fall_position(track) / _smooth_radius(track)
+    arcs = _fit_free_flights(track.times, distance_ratio)
+    ground = _estimate_ground_position(track, distance_ratio, arcs)
     fallen = _compute_gravity_scale(arcs)
     notes = []
     if diameter is None or scale == "fall":
@@ -136,13 +136,18 @@ def compute_heights_by_scale(
                 f"the fall gives {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
                 "or gravity is not 9.81 m/s²; the scale 'fall' uses the fall"
             )
-    return BallHeights(ball + factor * (ground - q), ball, method, tuple(notes))  # Equation (2).
+    return BallHeights(
+        ball + factor * (ground - distance_ratio), ball, method, tuple(notes)
+    )  # Equation (2).
 
 
 def _compute_fall_position(track: BallTrack) -> Array:
     """Return the position along the line of the fall, downwards positive, in pixels.
 
     The perspective along that line is described by `_smooth_radius`.
+
+    Args:
+        track: Centres (u, v) of the ball in the frames.
     """
     visible_frames = track.visible_frames
     points = np.stack([track.u[visible_frames], track.v[visible_frames]], axis=1)
@@ -162,6 +167,9 @@ def _smooth_radius(track: BallTrack) -> Array:
     """Smooth the radius (T,) of the ball in pixels, as a linear function of its position.
 
     The outline in a single frame is too noisy. Frames far from the line get a small weight.
+
+    Args:
+        track: Centres and radii of the ball in the frames.
     """
     fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
     positions, radii = fall_position[visible_frames], track.radius[visible_frames]
@@ -197,13 +205,24 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
         flight_frames = visible_frames[a + (a > 0) : b - (b < last_index) + 1]
         if len(flight_frames) < _MIN_FLIGHT_FRAMES or np.ptp(q[flight_frames]) < _MIN_FLIGHT_EXTENT:
             continue
-        t = times[flight_frames]
-        curve, squared_residuals, *_ = np.polyfit(t, q[flight_frames], 2, full=True)
-        scatter = float(np.sqrt(squared_residuals[0] / len(t))) if len(squared_residuals) else 0.0
+        flight_times = times[flight_frames]
+        curve, squared_residuals, *_ = np.polyfit(flight_times, q[flight_frames], 2, full=True)
+        scatter = (
+            float(np.sqrt(squared_residuals[0] / len(flight_times)))
+            if len(squared_residuals)
+            else 0.0
+        )
         # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
         if scatter < 0.05 * np.ptp(q[flight_frames]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
-            arcs.append(_Flight(curve, t[0], t[-1], len(t) * float(t[-1] - t[0]) ** 4))
+            arcs.append(
+                _Flight(
+                    curve,
+                    flight_times[0],
+                    flight_times[-1],
+                    len(flight_times) * float(flight_times[-1] - flight_times[0]) ** 4,
+                )
+            )
     return arcs
 
 
@@ -235,6 +254,7 @@ def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -
             earlier_arc.end - _BOUNCE_SEARCH_SECONDS,
             later_arc.begin + _BOUNCE_SEARCH_SECONDS,
         )
+        # Roots with a smaller imaginary part are real up to rounding.
         real_roots = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
         crossings += [float(np.polyval(earlier_arc.curve, r)) for r in real_roots[:1]]
     if crossings:

@@ -154,10 +154,14 @@ def _estimate_height_noise(
         heights: heights of the ball, m.
         part: frames that are recorded.
     """
-    z = heights.z[part]
+    heights_of_part = heights.z[part]
     noise = float(
         np.nanmax(
-            [estimate_roughness(z), ball_heights.estimate_height_noise(track.times[part], z), 0.0]
+            [
+                estimate_roughness(heights_of_part),
+                ball_heights.estimate_height_noise(track.times[part], heights_of_part),
+                0.0,
+            ]
         )
     )
     if noise > 0:

@@ -107,7 +107,7 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
     stated; steps are quantisation steps.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class, which declares the signals.
     """
     for channel, role in list_recorded_signals(recording, kind):
@@ -130,7 +130,7 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
     """Yield a line for each constant of the system, and one for the stated initial states.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: class of the simulator, which declares the constants.
     """
     for constant in kind.constants:
@@ -148,7 +148,7 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
     """Describe a constant's value, and list the runs with each value if it differs.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         name: name of the constant.
         default: value if the recording states none.
         unit: unit of the value.
@@ -250,7 +250,7 @@ def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[s
     """Yield a line for each signal that leaves its range.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         robot: model of the robot, with its ranges.
     """
     model = robot.path.name
@@ -277,7 +277,7 @@ def _format_exceeded_range(
     The line has the runs and the extreme values.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         name: name of the channel or input.
         limits: range of the model file; None if it states none.
         unit: unit of signal and range.

@@ -158,7 +158,7 @@ def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
     """Return the beginning of a run, the only part with a known pose of floating bodies.
 
     Args:
-        run: the run.
+        run: recorded run: times, channels and inputs.
         seconds: length of the beginning.
         _: unused.
     """
@@ -171,7 +171,14 @@ def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
 
 
 def _compute_command_changes(run: Run) -> Array:
-    """Return (T,) the change of the commands before each sample, relative to their range."""
+    """Return (T,) the change of the commands before each sample, relative to their range.
+
+    It sums the absolute changes of all commands within the last `QUIET_LEAD_SECONDS`; 0 means that
+    the commands were constant.
+
+    Args:
+        run: Run with its inputs.
+    """
     lead_places = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
     total = np.zeros(run.times.size)
     for values in run.inputs.values():

@@ -427,7 +427,7 @@ def _make_coefficients(
     """Return an effect's coefficients in order; coefficients that are not named are zero.
 
     Args:
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         stated_values: one coefficient, several in order, or some by name.
         kind: class of the simulator.
     """

@@ -279,7 +279,7 @@ def _finish_figure(figure: Figure, panel: Axes, heading: str, caption: str) -> F
     """Add legend, heading and caption to a figure, and return it.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         panel: a panel whose legend entries serve for all panels.
         heading: title of the figure.
         caption: text below the figure.
@@ -457,7 +457,7 @@ def _format_verdict(scores: misspecification_scores.StudyScores, folder: Path) -
     """Format which effects the true system has, and which verdict and causes explain gave.
 
     Args:
-        scores: the scores of the study.
+        scores: scores of a misspecification study: the runs of both simulators.
         folder: its result folder, with the verdict of explain.
     """
     hidden = scores.experiment.world.get("fixed", {})
@@ -475,7 +475,7 @@ def _format_error_table(scores: misspecification_scores.StudyScores, lines: pd.D
     """Format the errors of parameters and of prediction by tuner, in both simulators.
 
     Args:
-        scores: the scores of the study.
+        scores: scores of a misspecification study: the runs of both simulators.
         lines: score table of this study, or of several.
     """
     study_lines = lines[

@@ -206,7 +206,7 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
     """Build the table of means over targets with 95 % bootstrap intervals.
 
     Args:
-        scores: the scores of a study.
+        scores: scores of a misspecification study: the runs of both simulators.
 
     Returns:
         One row per simulator, tuner, metric and parameter; columns as in `SCORE_COLUMNS`.
@@ -247,7 +247,7 @@ def build_rank_table(scores: StudyScores) -> pd.DataFrame:
     columns are `RANK_COLUMNS`.
 
     Args:
-        scores: the scores of a study.
+        scores: scores of a misspecification study: the runs of both simulators.
     """
     tuners, targets = scores.list_tuners(), scores.list_targets()
     lines = []
@@ -270,7 +270,7 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     p-value that the ranking does not change. Friedman's p-values tell whether tuners differ at all.
 
     Args:
-        scores: the scores of a study.
+        scores: scores of a misspecification study: the runs of both simulators.
     """
     tuners, targets = scores.list_tuners(), scores.list_targets()
     lines = []

@@ -170,17 +170,16 @@ _SCRIPTS = (
 
 
 class HtmlPage:
-    """A page whose template asks it for sections, charts, figures and grids.
-
-    Args:
-        style: CSS rules in addition to those of every page.
-    """
+    """A page whose template asks it for sections, charts, figures and grids."""
 
     def __init__(self, style: str = "") -> None:
         """Start an empty page; rendering the template adds its sections, charts and grids.
 
         `_tables` has each table as CSV text for the browser, `_frames` the tables from which the
         rows of grids are selected, and `_parts` the macros of the template `parts.html`.
+
+        Args:
+            style: CSS rules in addition to those of every page.
         """
         self._own_style = style
         self._sections: list[tuple[str, str]] = []

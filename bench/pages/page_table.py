@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 class Table:
     """Named columns of equal length.
 
-    Args:
-        columns: Values by column name, in the order of the columns; None and NaN are missing.
-
     Raises:
         ValueError: The columns differ in length.
     """
 
     def __init__(self, columns: Mapping[str, Sequence[Any]]) -> None:
-        """Copy the columns, and check that all have the same length."""
+        """Copy the columns, and check that all have the same length.
+
+        Args:
+            columns: Values by column name, in the order of the columns; None and NaN are missing.
+        """
         self._columns = {name: list(values) for name, values in columns.items()}
         lengths = {len(values) for values in self._columns.values()}
         if len(lengths) > 1:

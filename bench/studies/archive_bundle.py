@@ -185,7 +185,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
 
     Args:
         archive: path of the archive, for messages.
-        packed: the open archive.
+        packed: archive, open for reading.
 
     Raises:
         InputError: One cannot.
@@ -291,7 +291,7 @@ def _unpack_file(
 
     Args:
         archive: path of the archive, for messages.
-        packed: the open archive.
+        packed: archive, open for reading.
         entry: entry of the file.
         path: path to which it is written.
 

@@ -339,7 +339,7 @@ def _verify_tables(
 
     Args:
         folder: folder of the comparison.
-        stored: its content.
+        stored: comparison read from its result folder: configuration, runs and statuses.
         print_line: prints one line of text.
     """
     path = folder / "table.csv"

@@ -144,9 +144,11 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
     Returns:
         One sentence per number of simulations (checkpoint).
     """
-    for k in tables.checkpoints:
+    for simulations in tables.checkpoints:
         pair_rows = tables.pairs
-        pair_rows = pair_rows[(pair_rows["training"] == FREE) & (pair_rows["simulations"] == k)]
+        pair_rows = pair_rows[
+            (pair_rows["training"] == FREE) & (pair_rows["simulations"] == simulations)
+        ]
         if pair_rows.empty:
             continue
         best = str(pair_rows["best"].iloc[0])
@@ -158,10 +160,13 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
             str(name) for name in pair_rows["tuner"] if name not in set(significant["tuner"])
         ]
         if significant.empty:
-            yield f"After {k}: none of the {len(pair_rows)} differences from {best} is significant."
+            yield (
+                f"After {simulations}: none of the {len(pair_rows)} differences from {best} is "
+                "significant."
+            )
             continue
         count = f"{len(significant)} of {len(pair_rows)}"
-        text = f"After {k}: {best} is significantly better than {count} others"
+        text = f"After {simulations}: {best} is significantly better than {count} others"
         yield text + (f"; not decided: {', '.join(undecided_tuners)}." if undecided_tuners else ".")
 
 

@@ -231,15 +231,15 @@ class SuiteTables:
         A cell is a problem with one range of targets. The columns are `ERROR_COLUMNS`.
         """
         lines = []
-        for k in self.checkpoints:
-            ranks = self.get_ranks(k)
+        for simulations in self.checkpoints:
+            ranks = self.get_ranks(simulations)
             for cell, curves in self.curves.items():
                 for tuner in curves.list_tuners():
                     tuner_curves = curves.select(tuner=tuner)
                     with np.errstate(invalid="ignore"):
-                        median = float(np.median(tuner_curves.values[:, k]))
+                        median = float(np.median(tuner_curves.values[:, simulations]))
                     counts = tuner_curves.keys["target"].nunique(), int(tuner_curves.failed.sum())
-                    lines.append((cell, tuner, k, median, ranks.at[cell, tuner], *counts))
+                    lines.append((cell, tuner, simulations, median, ranks.at[cell, tuner], *counts))
         return pd.DataFrame(lines, columns=ERROR_COLUMNS)
 
     @cached_property
@@ -259,16 +259,20 @@ class SuiteTables:
         """
         lines = []
         for training in (FREE, COUNTED):
-            for k in self.checkpoints:
-                ranks = self.get_medians(k, training)[self.complete_tuners].round(9).rank(axis=1)
+            for simulations in self.checkpoints:
+                ranks = (
+                    self.get_medians(simulations, training)[self.complete_tuners]
+                    .round(9)
+                    .rank(axis=1)
+                )
                 if ranks.empty:
                     continue
-                rng = make_rng("suite ranks", k)
+                rng = make_rng("suite ranks", simulations)
                 resamples = rng.integers(len(ranks), size=(_RESAMPLE_COUNT, len(ranks)))
                 for tuner, mean in ranks.mean().sort_values(kind="stable").items():
                     resampled = ranks[tuner].to_numpy()[resamples].mean(axis=1)
                     interval = compute_percentile_interval(resampled)
-                    lines.append((training, k, tuner, mean, *interval, len(ranks)))
+                    lines.append((training, simulations, tuner, mean, *interval, len(ranks)))
         return pd.DataFrame(lines, columns=RANK_COLUMNS)
 
     def find_best(self, k: int, training: str = FREE) -> str:
@@ -292,11 +296,11 @@ class SuiteTables:
         """
         lines = []
         for training in (FREE, COUNTED):
-            for k in self.checkpoints:
-                medians = self.get_medians(k, training)[self.complete_tuners]
+            for simulations in self.checkpoints:
+                medians = self.get_medians(simulations, training)[self.complete_tuners]
                 if medians.shape[1] < 2:
                     continue
-                best = self.find_best(k, training)
+                best = self.find_best(simulations, training)
                 other_tuners = [tuner for tuner in medians if tuner != best]
                 tests = {
                     t: compare_pair(medians[best].to_numpy(), medians[t].to_numpy())
@@ -306,7 +310,7 @@ class SuiteTables:
                 for tuner, p_holm in zip(other_tuners, corrected, strict=True):
                     test = tests[tuner]
                     values = test.targets, test.a_better, test.ratio, test.p_value, float(p_holm)
-                    lines.append((training, k, best, tuner, *values))
+                    lines.append((training, simulations, best, tuner, *values))
         return pd.DataFrame(lines, columns=PAIR_COLUMNS)
 
     @cached_property
@@ -373,11 +377,11 @@ class SuiteTables:
         groups = [
             (name, value, cells) for name, value, cells in self.list_properties() if len(cells)
         ]
-        for k in self.checkpoints:
-            ranks = self.get_medians(k)[self.complete_tuners].round(9).rank(axis=1)
+        for simulations in self.checkpoints:
+            ranks = self.get_medians(simulations)[self.complete_tuners].round(9).rank(axis=1)
             for name, value, cells in groups:
                 for tuner, mean in ranks.loc[cells].mean().sort_values(kind="stable").items():
-                    lines.append((name, value, k, tuner, mean, len(cells)))
+                    lines.append((name, value, simulations, tuner, mean, len(cells)))
         return pd.DataFrame(lines, columns=PROFILE_COLUMNS)
 
     def list_properties(self) -> Iterator[tuple[str, str, list[str]]]:

@@ -364,9 +364,9 @@ def train_history_transformer(
         shapes_by_name = get_weight_shapes(
             material.shown.shape[-1], material.parameters.shape[-1], design
         )
-        w = _draw_initial_weights(shapes_by_name, generator)
-        _minimise_loss(w, material, draw_histories, design, rng, watched)
-        return {name: v.detach().numpy().astype(np.float64) for name, v in w.items()}
+        initial_weights = _draw_initial_weights(shapes_by_name, generator)
+        _minimise_loss(initial_weights, material, draw_histories, design, rng, watched)
+        return {name: v.detach().numpy().astype(np.float64) for name, v in initial_weights.items()}
 
 
 def _draw_initial_weights(
@@ -383,15 +383,15 @@ def _draw_initial_weights(
     """
     import torch
 
-    w: dict[str, Any] = {}
+    initial_weights: dict[str, Any] = {}
     for name, shape in shapes_by_name.items():
         gain = _INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
         if name.startswith(_RESIDUAL_LAYERS):
             gain *= _RESIDUAL_WEIGHT_FACTOR
         limit = gain / shape[0] ** 0.5
         uniform = torch.rand(shape, generator=generator) * 2 - 1
-        w[name] = (uniform * limit).requires_grad_()
-    return w
+        initial_weights[name] = (uniform * limit).requires_grad_()
+    return initial_weights
 
 
 def _minimise_loss(

@@ -96,7 +96,10 @@ def compute_response_coefficients(
 
 
 def _compute_run_response(series: Array, inputs: Array) -> Array:
-    """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U)."""
+    """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U).
+
+    Shapes: T samples, C channels.
+    """
     half_width = max(3, series.shape[1] // (2 * _BUMPS_PER_RUN))
     bump_width = half_width + 1
     s = np.arange(-half_width, half_width + 1) / (half_width + 1.0)
@@ -127,6 +130,8 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
 
 def _compute_smoothed_velocity_signs(series: Array) -> Array:
     """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction.
+
+    Shapes: T samples, C channels.
 
     Args:
         series: (n, T, C) observed channels.
@@ -187,6 +192,8 @@ class ScenarioFeatures:
     ) -> ScenarioFeatures | None:
         """Compute the map from training scenarios.
 
+        Shapes: T samples, C channels.
+
         Args:
             scenes: scenario information of each scenario.
             observations: (scenarios, m, T, C) observations of m simulations per scenario.
@@ -223,6 +230,8 @@ class ScenarioFeatures:
     def compute(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:
         """Compute the unscaled numbers of observations in one scenario.
 
+        Shapes: T samples, C channels.
+
         Args:
             observations: (n, T, C) observations in SI units.
             lengths: number of samples of each run.
@@ -240,6 +249,8 @@ class ScenarioFeatures:
 
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:
         """Compute network inputs, which grow logarithmically far from the training data.
+
+        Shapes: T samples, C channels.
 
         Args:
             observations: (n, T, C) observations in SI units.
@@ -379,6 +390,8 @@ class InputFeatures:
         missing: Array | None = None,
     ) -> Array:
         """Compute input rows (n, D) from observations (n, T, C) of one scenario.
+
+        Shapes: T samples, C channels.
 
         Args:
             observations: observations in SI units; NaN for missing samples.

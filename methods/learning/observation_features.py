@@ -63,9 +63,11 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
             continue
         samples = np.arange(length)
         positions = np.linspace(0, length - 1, points)
-        for i in range(run_count):
-            for c in range(channels):
-                resampled[i, run, c] = _interpolate_channel(positions, samples, series[i, c])
+        for run_index in range(run_count):
+            for channel_index in range(channels):
+                resampled[run_index, run, channel_index] = _interpolate_channel(
+                    positions, samples, series[run_index, channel_index]
+                )
     return resampled.reshape(run_count, len(lengths) * channels, points)
 
 
@@ -129,6 +131,8 @@ class ObservationFeatures:
     def __call__(self, observations: Array, lengths: tuple[int, ...]) -> Array:
         """Compute input rows (n, D) from observations (n, T, C).
 
+        Shapes: T samples, C channels.
+
         Args:
             observations: observations in SI units; NaN for missing samples.
             lengths: number of samples of each run.
@@ -157,6 +161,8 @@ def _compute_feature_rows(
 ) -> Array:
     """Compute all candidate numbers (n, D) of observations (n, T, C).
 
+    Shapes: T samples, C channels.
+
     Args:
         observations: (n, T, C) observations.
         lengths: number of samples of each run; T in total.
@@ -171,6 +177,8 @@ def make_raw_features(
     observations: Array, lengths: tuple[int, ...], points: int
 ) -> ObservationFeatures:
     """Make the published inputs: resampled series in SI units, neither centred nor scaled.
+
+    Shapes: T samples, C channels.
 
     Args:
         observations: (n, T, C) observations in SI units.

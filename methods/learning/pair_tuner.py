@@ -114,6 +114,8 @@ class TrainedPairNetwork:
         that of the target. They are one function unless the target has another sensor, such as a
         camera.
 
+        Shapes: T samples, C channels.
+
         Args:
             task: the target, with its observation, sample counts and scene.
         """
@@ -131,6 +133,8 @@ class TrainedPairNetwork:
 
             If the target has another sensor, its missing samples are first filled from the
             simulation.
+
+            Shapes: T samples, C channels.
             """
             if not np.isfinite(observations).all():
                 return np.full(task.dim, np.nan)
@@ -205,6 +209,8 @@ def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork)
     """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
 
     This is done only if one channel is compared.
+
+    Shapes: T samples, C channels.
 
     Args:
         task: the task, with the observations of the target.

@@ -139,9 +139,6 @@ def generate_quasi_random_points(count: int, shift: Array) -> Array:
     Point n is (s + n g^-k) mod 1 in dimension k, with the generalised golden ratio g. They fill the
     cube more evenly than random points. A random shift gives another set of points.
 
-    With g^(d + 1) = g + 1 (1), point n has the coordinates x_nk = (s_k + n g^-k) mod 1 (2), from a
-    random shift s.
-
     Args:
         count: number of points.
         shift: (d,) shift s of (2), in the unit cube.

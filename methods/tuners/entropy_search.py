@@ -138,13 +138,13 @@ class EntropySearch(Tuner):
             evaluation = yield proposal[None]
             points = np.vstack([points, evaluation.proposals])
             losses = np.append(losses, evaluation.losses)
-            n = len(points)
-            if n < self.initial:
-                proposal = design[n]
+            point_count = len(points)
+            if point_count < self.initial:
+                proposal = design[point_count]
                 continue
             # Near the minimum the loss spans several decades, which only a logarithm resolves.
             values = compute_log_losses(replace_failed_losses(losses))
-            fit = n < _REFIT_INTERVAL_THRESHOLD or n % self.refit == 0
+            fit = point_count < _REFIT_INTERVAL_THRESHOLD or point_count % self.refit == 0
             process = GaussianProcess(points, values, self.process, hyper, fit=fit)
             hyper = process.hyper
             candidates = self._choose_candidates(process, points[values.argmin()], rng)

@@ -187,14 +187,14 @@ class TuneNetLeastSquares(TuneNet):
         basis: list[Array] = []
         chosen_steps: list[int] = []
         # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
-        for i in nearest[usable[nearest]]:
-            step = steps[i]
+        for point_index in nearest[usable[nearest]]:
+            step = steps[point_index]
             parallel_part = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
             orthogonal_part = step - parallel_part
             length = np.linalg.norm(orthogonal_part)
             if length > _MIN_ORTHOGONAL_SHARE * np.linalg.norm(step):
                 basis.append(orthogonal_part / length)
-                chosen_steps.append(int(i))
+                chosen_steps.append(int(point_index))
         return chosen_steps, basis
 
 

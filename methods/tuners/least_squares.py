@@ -162,8 +162,8 @@ class LeastSquares(Tuner):
             longest: longest step, a share of the cube, limited by `difference` and
                 `smallest_difference`.
         """
-        h = min(max(longest, self.smallest_difference), self.difference)
-        steps = np.where(point + h > 1.0, -h, h)
+        difference = min(max(longest, self.smallest_difference), self.difference)
+        steps = np.where(point + difference > 1.0, -difference, difference)
         probe_residuals = yield from run.simulate(point + np.diag(steps))
         failed = np.isnan(probe_residuals).any(axis=1)
         if failed.any():

@@ -190,9 +190,6 @@ class BroydenSearch:
 
     The initial slope is -1, so that the first step is that of Algorithm 1.
 
-    Args:
-        task: task of the target.
-
     Attributes:
         best: (dim,) point with the smallest estimated difference so far.
     """
@@ -204,6 +201,9 @@ class BroydenSearch:
         `_residual` the estimate at `best`, and `_setbacks` counts the points since then that were
         not better. `_fallback` is the middle of the training range, used if the first simulation
         fails.
+
+        Args:
+            task: task of the target.
         """
         self._slope = -np.eye(task.dim)
         self._fallback = task.training.mean(axis=0)
@@ -249,8 +249,6 @@ class BroydenSearch:
             `change` y
         (dim,) that of their estimates h.
             A step of length zero is ignored.
-
-        With a step s and the change y of h, B <- B + (y - B s) s' / (s's) (3).
         """
         square = step @ step
         if square > 0.0:

@@ -167,6 +167,8 @@ class Effect(metaclass=EffectType):
     def parts(self, c: Array) -> ActiveEffects:
         """Return the effect as the sum of effects at one place each.
 
+        Shapes: L batch elements.
+
         Args:
             c: Coefficients (K, L, 1).
 
@@ -366,6 +368,8 @@ class HiddenStateEffect(Effect):
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the generalised force and the rate of the hidden state.
 
+        Shapes: L batch elements, D coordinates.
+
         Args:
             c: Coefficients (K, L, 1).
             moment: State of all batch elements.
@@ -411,6 +415,8 @@ class Contact(Effect):
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
         """Return the restitution (L, 1).
+
+        Shapes: L batch elements.
 
         Args:
             c: Coefficients (K, L, 1).

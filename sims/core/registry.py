@@ -56,16 +56,16 @@ class AddedPart(Generic[T]):
 
 
 class Registry(Generic[T]):
-    """Registered parts of one kind.
-
-    Args:
-        kind: Word for such a part in messages, e.g. ``tuner``.
-        group: Entry-point group of the installed parts.
-        base: Base class of the parts.
-    """
+    """Registered parts of one kind."""
 
     def __init__(self, kind: str, group: str, base: type[T]) -> None:
-        """Start without parts; installed parts are imported on first request."""
+        """Start without parts; installed parts are imported on first request.
+
+        Args:
+            kind: Word for such a part in messages, e.g. ``tuner``.
+            group: Entry-point group of the installed parts.
+            base: Base class of the parts.
+        """
         self.kind, self.group, self.base = kind, group, base
         self._added: dict[str, AddedPart[T]] = {}
         self._stubs: dict[str, AddedPart[T]] = {}

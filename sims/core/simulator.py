@@ -408,6 +408,8 @@ class Simulator(ABC):
         A batch element whose simulation fails numerically is filled with NaN and does not affect
         the others.
 
+        Shapes: T samples, C channels.
+
         Args:
             theta: Parameter vectors (n, dim), physical units.
             scenario: Conditions of the run.
@@ -449,15 +451,15 @@ class Simulator(ABC):
             InputError: a constant is unknown, not finite, or outside its limits.
         """
         values = self._check_values("constant", defaults, given_values)
-        for c in self.constants:
-            value = values[c.name]
-            if c.positive and value <= 0:
+        for constant in self.constants:
+            value = values[constant.name]
+            if constant.positive and value <= 0:
                 condition = "be > 0"
-            elif not c.limits[0] <= value <= c.limits[1]:
-                condition = f"lie in {c.wanted(value)}"
+            elif not constant.limits[0] <= value <= constant.limits[1]:
+                condition = f"lie in {constant.wanted(value)}"
             else:
                 continue
-            subject = f"constant '{c.name}' of simulator {self.name}"
+            subject = f"constant '{constant.name}' of simulator {self.name}"
             raise InputError(f"{subject} must {condition}, found {value}")
         return values
 

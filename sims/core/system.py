@@ -115,6 +115,8 @@ class StateSnapshot:
     def aimed(self, shift: Array) -> Array:
         """Return the change of the drive's force (L, D) if the servo's set point is shifted.
 
+        Shapes: L batch elements, D coordinates.
+
         Args:
             shift: (L, 1) shift of the set point.
         """
@@ -333,6 +335,8 @@ class System(ABC):
 
         A system whose engine computes inertia and gravity itself does not define it.
 
+        Shapes: L batch elements.
+
         Args:
             theta: (L, p) parameters.
             constants: Constants (L, 1) by name.
@@ -378,6 +382,8 @@ class System(ABC):
         constants: Mapping[str, Array],  # noqa: ARG002
     ) -> dict[str, Array]:
         """Return the channels (L, S) by name; unless overridden, each of them is a state.
+
+        Shapes: L batch elements, S steps, D coordinates.
 
         Args:
             x: (L, S, D) positions.

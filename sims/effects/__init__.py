@@ -39,7 +39,7 @@ def find_effect(name: str, system: type[System]) -> type[Effect]:
     """Return the effect of this name on a system: at one of its places, or a registered one.
 
     Args:
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         system: system on which the effect acts.
 
     Raises:

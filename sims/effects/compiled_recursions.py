@@ -48,6 +48,8 @@ def step_elements(kind: int, a: Any, b: Any, start: Any, result: Any) -> None:
     Kinds: limited acceleration; linear, y = a y + b; clamped to the range from a to b; and towards
     a by at most b (rate limit).
 
+    Shapes: L batch elements, S steps.
+
     Args:
         kind: Kind of the recursion.
         a: (L, S) first coefficients.
@@ -75,6 +77,8 @@ def move_with_limited_acceleration(commands: Any, steps: Any, start: Any, means:
 
     The speed w at the end of a step is chosen such that the remaining distance is sufficient for
     stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
+
+    Shapes: S steps.
 
     Args:
         commands: (S,) set point before the limit.

@@ -101,6 +101,8 @@ def _compute_signed_square(v: Array) -> Array:
 def _compute_air_velocity(c: Array, moment: StateSnapshot) -> Array:
     """Return the velocity (L, D) of the air along the system's coordinates.
 
+    Shapes: L batch elements, D coordinates.
+
     Args:
         c: (3, L, 1) coefficients of the effect: drag, wind along x, and wind along y.
         moment: state of the batch.
@@ -133,6 +135,8 @@ class MagnusLift(Force):
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), perpendicular to the velocity, so that it does no work.
+
+        Shapes: D coordinates, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.

@@ -79,6 +79,8 @@ class ForceRipple(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), periodic in the primary coordinate.
 
+        Shapes: D coordinates, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -161,6 +163,8 @@ class CubicSpring(Force):
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), towards zero for c > 0.
+
+        Shapes: D coordinates, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.

@@ -164,6 +164,8 @@ class DirectionalLoadFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1): absolute weighted sum of drive and external load.
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -184,6 +186,8 @@ class QuadraticLoadFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1) from the load and the square of the transmitted force.
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -203,6 +207,8 @@ class PositionFriction(Friction):
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), periodic in the primary coordinate.
+
+        Shapes: K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -227,6 +233,8 @@ class WarmingFriction(Friction):
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the remaining limit (L, 1); the viscous part is zero at rest.
+
+        Shapes: K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -253,6 +261,8 @@ class DirectionalViscousFriction(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), proportional to speed, with a coefficient per direction.
 
+        Shapes: D coordinates, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -263,6 +273,8 @@ class DirectionalViscousFriction(Force):
 
 def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
     """Return the smaller of two opposing forces (L, 1); zero where they do not oppose.
+
+    Shapes: L batch elements.
 
     Args:
         drive: (L, 1) force of the drive.
@@ -306,6 +318,8 @@ class FrictionHysteresis(HiddenStateEffect):
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D), and the rate (L, 1) of the hidden state.
+
+        Shapes: D coordinates, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.

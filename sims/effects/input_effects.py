@@ -34,6 +34,8 @@ def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
 
     They are exp(-h / T) at the end, and its mean m over the step (3).
 
+    Shapes: L batch elements, S steps.
+
     Args:
         steps: (L, S) lengths h in seconds.
         lag: (L, 1) time constants T in seconds.
@@ -178,6 +180,8 @@ class InputLag(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the lagged input over each step.
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -197,6 +201,8 @@ class InputDeadBand(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the excess (L, S) over the half width.
+
+        Shapes: L batch elements, S steps, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -220,6 +226,8 @@ class InputSaturation(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the limited input (L, S).
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -241,6 +249,8 @@ class InputBacklash(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) on the load side of the backlash.
+
+        Shapes: L batch elements, S steps, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -266,6 +276,8 @@ class InputPower(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) to a power; an input of one unit changes only by the gain.
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -289,6 +301,8 @@ class InputRateLimit(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the rate-limited input over each step.
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -300,8 +314,10 @@ class InputRateLimit(Input):
 def _apply_lag(signal: Signal, lag: Array) -> Array:
     """Return means (L, S) of the lagged input (4) over each step.
 
+    Shapes: L batch elements, S steps.
+
     Args:
-        signal: the input before the effect.
+        signal: input before the effect: values (L, S) and times of the steps.
         lag: (L, 1) time constants in seconds.
     """
     # the command is constant over a step, so (2) of sims.effects.input_effects gives the value at
@@ -319,8 +335,10 @@ def _apply_play(signal: Signal, half: Array) -> Array:
     The output is constant while it is within the clearance of the input; otherwise the nearer flank
     pushes it.
 
+    Shapes: L batch elements, S steps.
+
     Args:
-        signal: the input before the effect.
+        signal: input before the effect: values (L, S) and times of the steps.
         half: (L, 1) clearance to either side, in the unit of the input.
     """
     # the position within the backlash is not recorded: the centre favours neither direction
@@ -332,8 +350,10 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
 
     With the command u and a step h, dw/dt = clip((u - w) / h, -limit, limit).
 
+    Shapes: L batch elements, S steps.
+
     Args:
-        signal: the input before the effect.
+        signal: input before the effect: values (L, S) and times of the steps.
         limit: (L, 1) largest rate, infinite for no limit.
     """
     # An infinite limit times a step of zero length counts as zero.

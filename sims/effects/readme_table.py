@@ -36,9 +36,9 @@ def _format_effect_rows(effect: type[Effect]) -> list[str]:
     """
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
-    for c in effect.coefficients:
-        ranges = [_format_range(c, place) for place in range(len(SYSTEM_KINDS))]
-        rows.append(f"| {head} | {c.name} | " + " | ".join(ranges) + " |")
+    for coefficient in effect.coefficients:
+        ranges = [_format_range(coefficient, place) for place in range(len(SYSTEM_KINDS))]
+        rows.append(f"| {head} | {coefficient.name} | " + " | ".join(ranges) + " |")
         head = ""  # the description is only in the row of the first coefficient
     return rows
 
@@ -50,7 +50,7 @@ def _format_range(c: Coefficient, kind_index: int) -> str:
     that of another quantity, such as an input.
 
     Args:
-        c: the coefficient.
+        c: coefficient of the effect: name, units and plausible ranges.
         kind_index: index of the kind in `SYSTEM_KINDS`.
     """
     unit = c.units[kind_index]

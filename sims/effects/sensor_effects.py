@@ -136,6 +136,8 @@ class SensorLag(Sensor):
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the lagged reading (L, S), exact for a reading that is linear over each step.
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -175,6 +177,8 @@ class EncoderEccentricity(Sensor):
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the reading (L, S) with an error periodic in the angle.
+
+        Shapes: L batch elements, S steps, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -228,6 +232,8 @@ class ClockSkew(Sensor):
 def _smooth_step(instant: Array, times: Array) -> Array:
     """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between.
 
+    Shapes: L batch elements, S steps.
+
     Args:
         instant: (L, 1) time of the slip, s.
         times: (L, S) time stamps, s.
@@ -242,6 +248,8 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
 
     The result r obeys lag dr/dt = y - r, with the signal y linear within a step. `lag` (L, 1) is
     the time constant in seconds.
+
+    Shapes: L batch elements, S steps.
     """
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)

@@ -71,6 +71,8 @@ class ServoDeadBand(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D) that is missing in comparison with the proportional law.
 
+        Shapes: D coordinates, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -91,6 +93,8 @@ class ServoDerivativeAction(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the set point (L, S) plus its change in the last c seconds.
+
+        Shapes: L batch elements, S steps, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -117,6 +121,8 @@ class ServoMotionProfile(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the limited set point over each step.
 
+        Shapes: L batch elements, S steps, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -131,6 +137,8 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
 
     Before the run, the signal has its initial value.
+
+    Shapes: L batch elements, S steps.
     """
     step_ends = signal.times
     step_starts = step_ends - signal.steps
@@ -187,6 +195,8 @@ class SupplySag(Force):
         With the forces U_i of all drives that share the supply and D = sum |U_i|, the lost force is
         U_i c D / (1 + c D) (2).
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -209,6 +219,8 @@ class SupplyBrakingLoss(Force):
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), in the direction of motion.
+
+        Shapes: D coordinates, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.

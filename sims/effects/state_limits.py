@@ -87,6 +87,8 @@ class EndStop(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), which pushes away from the stop and never towards it.
 
+        Shapes: D coordinates, K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -120,6 +122,8 @@ class SpeedDependentRestitution(Contact):
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
         """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
+
+        Shapes: L batch elements, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.

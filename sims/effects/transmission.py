@@ -118,6 +118,8 @@ class DrivenLoad(HiddenStateEffect):
     def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash.
 
+        Shapes: L batch elements.
+
         Args:
             c: Coefficients (K, L, 1) in the order of `between`: compliance or gap, damping, and
                 inertia of the rotor.
@@ -137,6 +139,8 @@ class DrivenLoad(HiddenStateEffect):
     def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:
         """Return the initial state: moving with the drive, at the static deflection.
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -148,6 +152,8 @@ class DrivenLoad(HiddenStateEffect):
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D) on the drive side and the acceleration (L, 1) of the load.
+
+        Shapes: D coordinates, K coefficients.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -209,6 +215,8 @@ class JointFlexibility(DrivenLoad):
         It is T = s M (w^2 (x - y) + 2 z w (x' - y')) (3), with the inertia M of drive and load, the
         share s of the load, the drive's position x and the load's y.
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -247,6 +255,8 @@ class JointBacklash(DrivenLoad):
         It is T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with d the excess of
         x - y over the gap, the inertia M, the share s of the load, and the contact's frequency k.
 
+        Shapes: K coefficients.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -262,6 +272,8 @@ class JointBacklash(DrivenLoad):
 
 def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:
     """Return the acceleration (L, 1) by gravity alone at positions y (L, 1).
+
+    Shapes: L batch elements.
 
     Args:
         moment: state of the batch.

@@ -52,6 +52,8 @@ class AugmentedSystem(System):
         """Return the coefficients (K, L, 1) of each effect with hidden states.
 
         They are stored in the columns of `theta` after the system's own parameters.
+
+        Shapes: L batch elements, K coefficients.
         """
         coefficients = []
         column = len(cls.base_system.parameters)
@@ -65,6 +67,8 @@ class AugmentedSystem(System):
         """Return the inertia (L, 1) of the system's own coordinates.
 
         It is M' = M (1 - sum of the load-side shares) (1).
+
+        Shapes: L batch elements.
 
         Args:
             theta: (L, p) parameters of the augmented system.
@@ -86,6 +90,8 @@ class AugmentedSystem(System):
 
         The engine divides forces by the inertia. So the force on a hidden state is the
         inertia times its rate, which gives the rate as its acceleration.
+
+        Shapes: L batch elements, D coordinates.
         """
         base_moment = self.get_base_snapshot(moment)
         base_size = len(self.base_system.coordinates)
@@ -104,6 +110,8 @@ class AugmentedSystem(System):
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
         """Return the sensor channels of the system without hidden coordinates.
+
+        Shapes: L batch elements, S steps, D coordinates.
 
         Args:
             x: (L, S, D) positions.
@@ -257,6 +265,8 @@ def _get_base_snapshot(moment: StateSnapshot) -> StateSnapshot:
 
 def pad_force(force: Array, moment: StateSnapshot) -> Array:
     """Return a force (L, D), padded with zeros for the hidden coordinates.
+
+    Shapes: L batch elements, D coordinates.
 
     Args:
         force: (L, d) force on the system's own coordinates.

@@ -58,6 +58,8 @@ def compute_applied_inputs(
     unless its history is known. Effects act on the first input; effects with memory begin at the
     start of the known history.
 
+    Shapes: L batch elements, S steps.
+
     Args:
         plan: Time grid.
         runs: Scenarios of the batch elements.
@@ -154,6 +156,8 @@ def _apply_input_effects(
 ) -> Array:
     """Pass the means of the command through the effects on the input.
 
+    Shapes: L batch elements, S steps.
+
     Args:
         effects: Effects with their coefficients, and masks (L, 1) of the batch elements in which
             they are active.
@@ -196,6 +200,8 @@ def _find_last_nonzero_step(steps: Array) -> Indices:
     """Return the number (L, S) of each step, or of the last step before it with nonzero length.
 
     The input does not change while a batch element waits.
+
+    Shapes: L batch elements, S steps.
     """
     step_numbers = np.arange(steps.shape[1])
     last_steps = np.where(steps > 0, step_numbers, 0)
@@ -213,6 +219,8 @@ def _average_command(
     is_other_interpolation: bool = False,
 ) -> Array:
     """Return the mean of each batch element's signal over each step.
+
+    Shapes: L batch elements, S steps.
 
     Args:
         runs: Scenarios of the batch elements.

@@ -185,6 +185,8 @@ def _find_change_times(
 ) -> Array:
     """Return the times (L, K) at which a changed command is applied; zero where there are fewer.
 
+    Shapes: L batch elements.
+
     Args:
         runs: scenarios of the batch elements.
         commands: values of each input, by name, of each distinct scenario.
@@ -220,6 +222,8 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
     The steps are arranged in blocks of the most frequent number of steps per interval; steps of
     zero length fill the last block of an interval. The steps of a batch element do not depend on
     others.
+
+    Shapes: S steps, T samples.
 
     Args:
         instants: (N, T) times since the start, s.

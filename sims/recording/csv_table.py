@@ -158,19 +158,19 @@ def _make_encoding_error(path: Path) -> InputError:
 
 
 class RecordingTable:
-    """Table of a CSV file, and the checks of runs that apply to every kind of table.
-
-    Args:
-        path: Path of the table, for messages.
-        channels: Names of the measured signals; cells may be empty.
-        inputs: Names of the inputs; no cell may be empty.
-        extra: Names of other columns; cells may be empty.
-    """
+    """Table of a CSV file, and the checks of runs that apply to every kind of table."""
 
     def __init__(
         self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]
     ) -> None:
-        """Name the expected columns; `gaps` are those whose cells may be empty."""
+        """Name the expected columns; `gaps` are those whose cells may be empty.
+
+        Args:
+            path: Path of the table, for messages.
+            channels: Names of the measured signals; cells may be empty.
+            inputs: Names of the inputs; no cell may be empty.
+            extra: Names of other columns; cells may be empty.
+        """
         self.path = path
         self.wanted = ["run", "t", *inputs, *channels, *extra]
         self.gaps = {*channels, *extra}
@@ -311,9 +311,9 @@ class RecordingTable:
         # float() also accepts 1_000 and digits of other scripts.
         if "_" in joined_cells or not joined_cells.isascii():
             suspects = range(len(cells))
-        for i in suspects:
-            if cells[i].strip() or name not in self.gaps:
-                self._check_cell(name, cells[i], first_row + i)
+        for row_index in suspects:
+            if cells[row_index].strip() or name not in self.gaps:
+                self._check_cell(name, cells[row_index], first_row + row_index)
         return values
 
     def _check_cell(self, name: str, cell: str, record: int) -> None:
@@ -413,9 +413,11 @@ class RecordingTable:
         run_starts = np.array(edges[1:-1], dtype=int)
         is_bad[run_starts - 1] = False
         if is_bad.any():
-            i = int(np.argmax(is_bad))
+            row_index = int(np.argmax(is_bad))
             self.raise_error(
-                i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s"
+                row_index + 1,
+                "t",
+                f"expected more than {t[row_index]:.12g} s, found {t[row_index + 1]:.12g} s",
             )
 
     def raise_error(self, record: int, column: str, message: str) -> NoReturn:

@@ -233,7 +233,7 @@ def split_without_masked(run: Run, off: Mask) -> list[Run]:
     itself is returned.
 
     Args:
-        run: the run.
+        run: recorded run: times, channels and inputs.
         off: (T,) the mask.
     """
     if not off.any():

@@ -78,15 +78,7 @@ class _LogRows(NamedTuple):
 
 
 class _FolderLogs:
-    """Logs of one folder.
-
-    Args:
-        folder: Folder of the logs.
-        default_file: File of signals without a stated file.
-        sources: Location of each signal.
-        channels: Names of the measured signals.
-        inputs: Names of the inputs.
-    """
+    """Logs of one folder."""
 
     def __init__(
         self,
@@ -99,6 +91,13 @@ class _FolderLogs:
         """Find the file of each signal, and read the needed columns of each file once.
 
         An extra column without a stated file is searched for in the files of the signals.
+
+        Args:
+            folder: Folder of the logs.
+            default_file: File of signals without a stated file.
+            sources: Location of each signal.
+            channels: Names of the measured signals.
+            inputs: Names of the inputs.
         """
         self._time, self._rate, self._second = sources.time, sources.rate, sources.second
         self._channels, self._inputs, self._extra = channels, inputs, list(sources.extra)
@@ -277,7 +276,7 @@ class _FolderLogs:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
 
         Args:
-            log: the log.
+            log: log: its columns of numbers by name.
             run_rows: mask of the rows of one run; None for all.
 
         Raises:

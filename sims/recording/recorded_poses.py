@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sims.core.rotations import compute_yaw_pitch_roll
 from sims.core.simulator import Array, InputError
 from sims.recording.unit_conversion import unwrapped
 
@@ -70,25 +71,6 @@ def list_channel_names(tables: Mapping[str, Any]) -> list[str]:
     return names
 
 
-def compute_angles(quaternions: Array, reference: Array) -> Array:
-    """Compute yaw, pitch and roll (T, 3) in rad of orientations by eq. (1).
-
-    Args:
-        quaternions: (T, 4) orientations (w, x, y, z); NaN where a sample is missing.
-        reference: (4,) orientation in the model file, a unit quaternion.
-    """
-    inverse_reference = reference * np.array([1.0, -1.0, -1.0, -1.0])
-    w, x, y, z = multiply_quaternions(quaternions, inverse_reference[None]).T
-    with np.errstate(invalid="ignore"):
-        angles = [
-            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
-            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        ]
-    result: Array = np.stack(angles, axis=1)
-    return result
-
-
 def convert_quaternions(
     channels: Mapping[str, Array], base: str, reference: Array, where: str
 ) -> dict[str, Array]:
@@ -114,7 +96,7 @@ def convert_quaternions(
             f"{where}, sample {wrong_rows[0] + 1}: {names[0]}, qx, qy, qz: expected a quaternion "
             f"of length 1, found one of length {norms[wrong_rows[0], 0]:.3g}"
         )
-    angles = compute_angles(quaternions / norms, reference)
+    angles = compute_yaw_pitch_roll(quaternions / norms, reference)
     steep_rows = np.flatnonzero(np.abs(angles[:, 1]) > MAX_PITCH)
     if steep_rows.size:
         raise InputError(
@@ -128,11 +110,3 @@ def convert_quaternions(
         # NaN stays NaN, and whole turns are restored.
         converted[f"q.{base}.{angle}"] = unwrapped(values)
     return converted
-
-
-def multiply_quaternions(first: Array, second: Array) -> Array:
-    """Compute the Hamilton products (n, 4) of `first` and `second`, quaternions (w, x, y, z)."""
-    a, u = first[:, :1], first[:, 1:]
-    b, v = second[:, :1], second[:, 1:]
-    real_part = a * b - np.sum(u * v, axis=1, keepdims=True)
-    return np.concatenate([real_part, a * v + b * u + np.cross(u, v)], axis=1)

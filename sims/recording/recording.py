@@ -465,7 +465,7 @@ def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
 
     Args:
         path: path of the recording, for messages.
-        run: the run.
+        run: recorded run: times, channels and inputs.
 
     Raises:
         InputError: a part would have too few samples.

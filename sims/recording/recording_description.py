@@ -810,7 +810,7 @@ def _check_constants_possible(
     Raises:
         InputError: a constant is impossible.
     """
-    for c in declared.constants:
-        if c.name in constants and (expected := c.wanted(constants[c.name])):
-            value = constants[c.name]
-            raise InputError(f"{path}: {key}.{c.name}: expected {expected}, found {value:g}")
+    for constant in declared.constants:
+        if constant.name in constants and (expected := constant.wanted(constants[constant.name])):
+            value = constants[constant.name]
+            raise InputError(f"{path}: {key}.{constant.name}: expected {expected}, found {value:g}")

@@ -104,7 +104,7 @@ def _list_signals(
     """Return expected names, signals of the run, and a word for each kind of column.
 
     Args:
-        run: the run.
+        run: recorded run: times, channels and inputs.
         inputs: names of the inputs of all runs.
         channels: names of the channels of all runs.
         extra: names of further columns of all runs.

@@ -41,7 +41,7 @@ def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> b
     The real robot, or its controller, then carries its own weight.
 
     Args:
-        effect: name of the effect.
+        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         numbers: fitted numbers by coefficient.
     """
     return effect == "gravity.scale" and any(
@@ -161,7 +161,7 @@ def _list_places(robot: RobotModel, effect: str) -> list[str]:
     """List the places of an effect family that has one number for all places.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         effect: name of the effect without its place.
     """
     if effect.startswith("input."):

@@ -22,19 +22,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.rotations import MIN_QUATERNION_NORM, compute_rotation_vectors, multiply_quaternions
 from sims.core.simulator import Array, InputError
 from sims.recording.recorded_poses import (
     POSITION_AXES,
     QUATERNION_ENTRIES,
-    multiply_quaternions,
 )
 from sims.robot.robot_model import Joint, RobotModel
 
 IndexArray = NDArray[np.intp]
 ANGULAR_VELOCITY_AXES = ("wx", "wy", "wz")
 """Axes of angular velocity, those of the body."""
-MIN_QUATERNION_NORM = 1e-6
-"""Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
 
 
 class FloatingJoint(NamedTuple):
@@ -212,7 +210,7 @@ class FloatingJoints:
             columns.append(pose[:, translation_columns] - reference[:, translation_columns])
             inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
             columns.append(
-                _compute_rotation_vectors(
+                compute_rotation_vectors(
                     multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
                 )
             )
@@ -238,21 +236,3 @@ class FloatingJoints:
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
     """Return the axes of translation of a floating joint."""
     return POSITION_AXES if joint.kind == "free" else ()
-
-
-def _compute_rotation_vectors(quaternions: Array) -> Array:
-    """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi.
-
-    A quaternion (cos(a / 2), u sin(a / 2)) has the rotation vector a u. q and -q are the same
-    rotation; the sign with a nonnegative real part gives the smaller angle.
-
-    Args:
-        quaternions: (n, 4) unit quaternions (w, x, y, z).
-    """
-    sign = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
-    real_part, vector = sign * quaternions[:, :1], sign * quaternions[:, 1:]
-    length = np.linalg.norm(vector, axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(length, real_part)
-    is_small = length < MIN_QUATERNION_NORM
-    scale = np.where(is_small, 2.0, angle / np.where(is_small, 1.0, length))
-    return vector * scale

@@ -31,12 +31,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sims.core.rotations import compute_quaternions
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_geom, find_pair
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
-    compute_quaternions,
 )
 from sims.robot.integrator_settings import write_friction_form
 from sims.robot.places.centre_of_mass_limits import observable_tilts
@@ -138,7 +138,7 @@ def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelFi
     """Return the three fields of a body's centre of mass.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the body.
     """
     body_id = robot.body(place).id
@@ -157,7 +157,7 @@ def _make_servo_gain_finder(term: int) -> Find:
         """Return the bias field with the servo's gain, and the gain field if it is the same.
 
         Args:
-            robot: the robot.
+            robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
             place: name of the actuator.
         """
         actuator_id = robot.actuator(place).id
@@ -173,7 +173,7 @@ def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelFi
     """Return both ends of an actuator's force range, which one positive limit determines.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the actuator.
     """
     actuator_id = robot.actuator(place).id
@@ -230,6 +230,8 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
     with `friction_form` soft, the file's solver parameters remain.
 
+    Shapes: L batch elements.
+
     Args:
         fields: model fields of the batch elements, changed in place.
         robot: robot as read from its model file.
@@ -249,7 +251,7 @@ def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the body.
         c: (1, L) coefficient.
     """
@@ -306,6 +308,8 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
     Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
 
+    Shapes: L batch elements.
+
     Args:
         fields: model fields of the batch elements, changed in place.
         robot: robot as read from its model file.
@@ -338,7 +342,7 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the body.
         c: (1, L) coefficient.
     """
@@ -355,6 +359,8 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
     the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
     the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
+
+    Shapes: L batch elements.
 
     Args:
         fields: model fields of the batch elements, changed in place.
@@ -387,6 +393,8 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
     `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
 
+    Shapes: L batch elements.
+
     Args:
         fields: model fields of the batch elements, changed in place.
         robot: robot as read from its model file.
@@ -409,7 +417,7 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the pair.
         c: (1, L) coefficient.
     """
@@ -422,7 +430,7 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the geom.
         c: (1, L) coefficient.
     """

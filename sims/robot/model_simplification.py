@@ -195,12 +195,12 @@ def _write_inertials(spec: Any, model: Any) -> None:
         compiler.boundmass = compiler.boundinertia = 0.0
         compiler.settotalmass = -1.0
     for body in spec.bodies:
-        i = body.id
-        body.explicitinertial = bool(i and model.body_mass[i] > 0)
+        body_id = body.id
+        body.explicitinertial = bool(body_id and model.body_mass[body_id] > 0)
         if not body.explicitinertial:
             continue
-        body.mass, body.inertia = float(model.body_mass[i]), model.body_inertia[i]
-        body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
+        body.mass, body.inertia = float(model.body_mass[body_id]), model.body_inertia[body_id]
+        body.ipos, body.iquat = model.body_ipos[body_id], model.body_iquat[body_id]
         body.fullinertia = np.full(6, np.nan)
         body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
@@ -222,19 +222,19 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     hull_by_mesh: dict[str, Hull] = {}
     geom_numbers: dict[str, int] = {}
     # The numbers are collected first, since a spec loses them when it is edited.
-    for geom, i in [(geom, geom.id) for geom in spec.geoms]:
-        geom.name = geom.name or f"simgap.geom{i}"
-        geom_numbers[geom.name] = i
-        if not collision_mask[i]:
+    for geom, geom_id in [(geom, geom.id) for geom in spec.geoms]:
+        geom.name = geom.name or f"simgap.geom{geom_id}"
+        geom_numbers[geom.name] = geom_id
+        if not collision_mask[geom_id]:
             geom.contype = geom.conaffinity = 0
-        mesh = int(model.geom_dataid[i]) if geom.meshname else -1
+        mesh = int(model.geom_dataid[geom_id]) if geom.meshname else -1
         if mesh < 0 and not geom.meshname:
             continue
         # The compiler may have fitted a primitive to the mesh, or moved its frame.
-        kind = mujoco.mjtGeom(int(model.geom_type[i]))
+        kind = mujoco.mjtGeom(int(model.geom_type[geom_id]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
-            geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
-        elif is_tested_version and collision_mask[i] and model.mesh_facenum[mesh] > MIN_FACES:
+            geom.type, geom.size, geom.meshname = kind, model.geom_size[geom_id], ""
+        elif is_tested_version and collision_mask[geom_id] and model.mesh_facenum[mesh] > MIN_FACES:
             hull = hull_by_mesh.get(geom.meshname) or read_hull(model, mesh)
             if hull is None:
                 continue
@@ -243,7 +243,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
             continue
         geom.set_frame(geom.parent.add_frame())
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-        geom.pos, geom.quat = model.geom_pos[i], model.geom_quat[i]
+        geom.pos, geom.quat = model.geom_pos[geom_id], model.geom_quat[geom_id]
     for mesh in [mesh for mesh in spec.meshes if mesh.name in hull_by_mesh]:
         name = mesh.name
         spec.delete(mesh)

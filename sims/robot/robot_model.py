@@ -250,18 +250,20 @@ class RobotModel:
         """All joints, in the order of their velocities."""
         model = self.compiled
         joints = []
-        for i in range(model.njnt):
-            kind = KINDS[int(model.jnt_type[i])]
-            low, high = (float(v) for v in model.jnt_range[i])
-            effort = _get_limit(model.jnt_actfrcrange[i], bool(model.jnt_actfrclimited[i]))
+        for joint_id in range(model.njnt):
+            kind = KINDS[int(model.jnt_type[joint_id])]
+            low, high = (float(v) for v in model.jnt_range[joint_id])
+            effort = _get_limit(
+                model.jnt_actfrcrange[joint_id], bool(model.jnt_actfrclimited[joint_id])
+            )
             joints.append(
                 Joint(
-                    name=model.joint(i).name or f"joint{i}",
+                    name=model.joint(joint_id).name or f"joint{joint_id}",
                     kind=kind,
-                    id=i,
-                    position=int(model.jnt_qposadr[i]),
-                    velocity=int(model.jnt_dofadr[i]),
-                    range=(low, high) if model.jnt_limited[i] else None,
+                    id=joint_id,
+                    position=int(model.jnt_qposadr[joint_id]),
+                    velocity=int(model.jnt_dofadr[joint_id]),
+                    range=(low, high) if model.jnt_limited[joint_id] else None,
                     effort=effort[1] if effort else None,
                 )
             )
@@ -350,13 +352,13 @@ class RobotModel:
         for alias, name in (self.aliases or {}).items():
             fused_names.setdefault(name, []).append(alias)
         moving_bodies = []
-        for i in range(1, model.nbody):
+        for body_id in range(1, model.nbody):
             # Bodies welded to the world do not move; those welded to other bodies move with them.
-            if int(model.body_weldid[i]) == 0:
+            if int(model.body_weldid[body_id]) == 0:
                 continue
-            name = model.body(i).name or f"body{i}"
+            name = model.body(body_id).name or f"body{body_id}"
             aliases = tuple(fused_names.get(name, ()))
-            moving_bodies.append(Body(name, i, float(model.body_mass[i]), aliases))
+            moving_bodies.append(Body(name, body_id, float(model.body_mass[body_id]), aliases))
         return tuple(moving_bodies)
 
     @cached_property
@@ -364,13 +366,13 @@ class RobotModel:
         """Rows of all sensors."""
         model = self.compiled
         rows = []
-        for i in range(model.nsensor):
-            name = model.sensor(i).name or f"sensor{i}"
-            begin, count = int(model.sensor_adr[i]), int(model.sensor_dim[i])
+        for sensor_id in range(model.nsensor):
+            name = model.sensor(sensor_id).name or f"sensor{sensor_id}"
+            begin, count = int(model.sensor_adr[sensor_id]), int(model.sensor_dim[sensor_id])
             name_endings = (
                 [""] if count == 1 else [f".{axis}" for axis in _list_axis_suffixes(count)]
             )
-            unit = self._get_sensor_unit(i)
+            unit = self._get_sensor_unit(sensor_id)
             rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(name_endings)]
         return tuple(rows)
 

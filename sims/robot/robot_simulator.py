@@ -196,6 +196,8 @@ class RobotSimulator(SystemSimulator):
     def get_active_effects(self, theta: Array) -> ActiveEffects:
         """Return the active effects at one place each, for rows of parameters.
 
+        Shapes: L batch elements, K coefficients.
+
         Args:
             theta: (L, p) parameters.
 
@@ -234,6 +236,8 @@ class RobotSimulator(SystemSimulator):
         v: Array,
     ) -> Array:
         """Simulate observations (L, T, C) of batch elements.
+
+        Shapes: L batch elements, T samples, C channels, D joints, K coefficients.
 
         Args:
             acting: effects with coefficients (K, L, 1).
@@ -293,6 +297,8 @@ class RobotSimulator(SystemSimulator):
         added: AddedElements = (),
     ) -> list[Array]:
         """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
+
+        Shapes: T samples, C channels.
 
         Args:
             run_batches: batch elements of each run.
@@ -451,8 +457,10 @@ class RobotSimulator(SystemSimulator):
         the known commands before the run; otherwise that of a filter that has settled at
         the first command.
 
+        Shapes: S steps.
+
         Args:
-            activation_filter: the filter.
+            activation_filter: filter: its actuator, time constant and kind.
             batch: batch elements of the run.
             controls: (n, S) controls of the filter.
         """
@@ -484,8 +492,10 @@ class RobotSimulator(SystemSimulator):
     ) -> Array:
         """Integrate an activation filter over the steps, as MuJoCo's integrator does.
 
+        Shapes: S steps.
+
         Args:
-            activation_filter: the filter.
+            activation_filter: filter: its actuator, time constant and kind.
             controls: (n, S) controls over the steps.
             initial_activations: (n,) activations at the beginning.
 
@@ -541,10 +551,14 @@ class RobotSimulator(SystemSimulator):
             inputs: inputs over the steps.
             extra_fields: additional fields of MuJoCo's data to record.
         """
-        n = len(batch.x)
-        derived = bool(find_active_elements(batch.acting, n, changes_derived_constants).any())
-        is_stepwise = bool(find_active_elements(batch.acting, n, is_evaluated_per_step).any())
-        (added,) = group_by_added_elements(batch.acting, n)
+        element_count = len(batch.x)
+        derived = bool(
+            find_active_elements(batch.acting, element_count, changes_derived_constants).any()
+        )
+        is_stepwise = bool(
+            find_active_elements(batch.acting, element_count, is_evaluated_per_step).any()
+        )
+        (added,) = group_by_added_elements(batch.acting, element_count)
         start = BatchStart(batch.x, batch.v, batch.acting, self._get_floating_states([batch]))
         return self._simulate_steps(start, inputs, derived, is_stepwise, extra_fields, added)
 
@@ -659,6 +673,8 @@ class RobotSimulator(SystemSimulator):
     ) -> Array:
         """Compute the recorded observations (n, T, C) of one run, including sensor effects.
 
+        Shapes: T samples, C channels.
+
         Args:
             result_of_batch: states and readings of the batch; failed elements become NaN.
             batch: the n batch elements of the run.
@@ -726,6 +742,8 @@ def _group_batch_elements(
     acting: ActiveEffects, derived: Mask, is_stepwise: Mask
 ) -> Iterator[_ElementGroup]:
     """Group batch elements that can be simulated together.
+
+    Shapes: L batch elements, K coefficients.
 
     Args:
         acting: active effects, with coefficients (K, L, 1).

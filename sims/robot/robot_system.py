@@ -340,21 +340,21 @@ FREED_GAIN_RANGE_FACTOR = 9.0
 def _make_parameters(effect: type[Effect]) -> list[Parameter]:
     """Make parameters from an effect's coefficients; nominal values keep the file's values."""
     parameters = []
-    for c in effect.coefficients:
-        low, high = c.plausible[0]
+    for coefficient in effect.coefficients:
+        low, high = coefficient.plausible[0]
         # A free gain is a guess, so the true value may be several times as large.
-        is_free_gain = effect.at == "actuator" and c.least is not None
+        is_free_gain = effect.at == "actuator" and coefficient.least is not None
         bounds = (
             FREED_RANGE_FACTOR * low,
             FREED_GAIN_RANGE_FACTOR if is_free_gain else FREED_RANGE_FACTOR * high,
         )
         # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
         # data will not identify it.
-        if c.least is not None and c.least != c.most:
-            upper_limit = np.inf if c.most is None else c.most
-            bounds = max(bounds[0], c.least), min(bounds[1], upper_limit)
-        name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
-        unit = c.units[0] or "1"
+        if coefficient.least is not None and coefficient.least != coefficient.most:
+            upper_limit = np.inf if coefficient.most is None else coefficient.most
+            bounds = max(bounds[0], coefficient.least), min(bounds[1], upper_limit)
+        name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{coefficient.name}"
+        unit = coefficient.units[0] or "1"
         parameters.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
     return parameters
 

@@ -80,6 +80,8 @@ class BallSystem(System):
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
         """Return a unit vector (L, D) along a horizontal axis.
 
+        Shapes: L batch elements, D coordinates.
+
         Args:
             moment: state snapshot.
             axis: horizontal axis of the acceleration.
@@ -92,6 +94,8 @@ class BallSystem(System):
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
         """Return the position, and the vertical reading of an accelerometer on the ball.
+
+        Shapes: L batch elements, S steps, D coordinates.
 
         Args:
             x: (L, S, D) positions.

@@ -104,12 +104,12 @@ def _create_ground_and_ball(client: int, constants: Mapping[str, float]) -> tupl
         client: id of Bullet's world.
         constants: gravity (m/s²), radius (m) and mass (kg).
     """
-    p = bullet_world.import_pybullet()
-    p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
-    plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
-    ground: int = p.createMultiBody(0.0, plane, physicsClientId=client)
-    sphere = p.createCollisionShape(
-        p.GEOM_SPHERE, radius=constants["radius"], physicsClientId=client
+    pybullet = bullet_world.import_pybullet()
+    pybullet.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
+    plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    ground: int = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
+    sphere = pybullet.createCollisionShape(
+        pybullet.GEOM_SPHERE, radius=constants["radius"], physicsClientId=client
     )
-    ball: int = p.createMultiBody(constants["mass"], sphere, physicsClientId=client)
+    ball: int = pybullet.createMultiBody(constants["mass"], sphere, physicsClientId=client)
     return ground, ball

@@ -131,6 +131,8 @@ class ShotSystem(System):
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
         """Return a horizontal unit vector in the incline's frame (L, 3).
 
+        Shapes: L batch elements.
+
         Args:
             moment: state of the batch, with the angle of the incline.
             axis: direction of the vector in the world.
@@ -148,6 +150,8 @@ class ShotSystem(System):
 
         With the incline's angle a, x = along cos a + away sin a (3) and z = r / cos a + H - along
         sin a + away cos a (4).
+
+        Shapes: L batch elements, T samples.
 
         Args:
             x: (L, T, 3) displacement from the release in the frame of the incline, m.

@@ -81,6 +81,8 @@ class PendulumSystem(System):
         The pendulum swings in the plane of x and the vertical; the hinge supports forces along its
         axis.
 
+        Shapes: L batch elements.
+
         Args:
             moment: state snapshot.
             axis: horizontal axis of the acceleration.

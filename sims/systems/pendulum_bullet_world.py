@@ -34,12 +34,12 @@ def build(client: int, constants: Mapping[str, float]) -> int:
         client: Bullet client of an empty world.
         constants: constants of the system by name.
     """
-    p = bullet_world.import_pybullet()
-    p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
+    pybullet = bullet_world.import_pybullet()
+    pybullet.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     hanging = (0.0, 0.0, -constants["length"] / LENGTH_REDUCTION_FACTOR)
     return bullet_world.create_jointed_body(
         client,
-        p.JOINT_REVOLUTE,
+        pybullet.JOINT_REVOLUTE,
         (0.0, 1.0, 0.0),
         constants["mass"] * LENGTH_REDUCTION_FACTOR,
         hanging,

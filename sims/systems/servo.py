@@ -51,16 +51,20 @@ POINT_MASS_INERTIA = 1e-9
 
 def render_model_file(numbers: Mapping[str, float]) -> RenderedModelFile:
     """Return the model file of the servo with these parameters and constants."""
-    k = numbers
-    stall = k["torque_constant"] * k["voltage"] / k["resistance"]
+    numbers_by_name = numbers
+    stall = (
+        numbers_by_name["torque_constant"]
+        * numbers_by_name["voltage"]
+        / numbers_by_name["resistance"]
+    )
     text = SERVO_MJCF_TEMPLATE.format(
-        down=repr(-k["gravity"]),
-        armature=repr(k["armature"]),
-        damping=repr(k["torque_constant"] ** 2 / k["resistance"]),
-        below=repr(-k["length"]),
-        mass=repr(k["mass"]),
+        down=repr(-numbers_by_name["gravity"]),
+        armature=repr(numbers_by_name["armature"]),
+        damping=repr(numbers_by_name["torque_constant"] ** 2 / numbers_by_name["resistance"]),
+        below=repr(-numbers_by_name["length"]),
+        mass=repr(numbers_by_name["mass"]),
         point=repr(POINT_MASS_INERTIA),
-        kp=repr(stall * k["kp"] * k["error_gain"]),
+        kp=repr(stall * numbers_by_name["kp"] * numbers_by_name["error_gain"]),
         least=repr(-stall),
         most=repr(stall),
     )
@@ -201,7 +205,10 @@ class ServoSystem(PendulumSystem):
         return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
 
     def drive(self, moment: StateSnapshot) -> Array:
-        """Return the motor's torque (L, 1), including its back electromotive force."""
+        """Return the motor's torque (L, 1), including its back electromotive force.
+
+        Shapes: L batch elements.
+        """
         k = moment.constants
         kt = moment.theta[:, _TORQUE_CONSTANT]
         error = moment.inputs["goal"] - moment.x

@@ -74,6 +74,8 @@ class SliderSystem(System):
 
         The guide runs along x and supports forces across it.
 
+        Shapes: L batch elements.
+
         Args:
             moment: state snapshot.
             axis: horizontal axis of the acceleration.

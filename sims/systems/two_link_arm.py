@@ -225,8 +225,6 @@ class TwoLinkArm(OwnSimulator):
         The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
         these means are of second order.
 
-        From v through v1 to v2, q' = q + h (v + v1) / 2 (2) and v' = (v + v2) / 2 (3).
-
         Args:
             torques: torques at both joints, N·m.
             seconds: length of the step, s.
@@ -271,11 +269,11 @@ class TwoLinkArm(OwnSimulator):
         # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
         # one length of step.
         if seconds != self._step:
-            p = self._world
-            p.setTimeStep(seconds)
+            pybullet = self._world
+            pybullet.setTimeStep(seconds)
             for joint, friction in enumerate(self._friction):
-                p.setJointMotorControl2(
-                    self._arm, joint, p.VELOCITY_CONTROL, targetVelocity=0.0, force=friction
+                pybullet.setJointMotorControl2(
+                    self._arm, joint, pybullet.VELOCITY_CONTROL, targetVelocity=0.0, force=friction
                 )
             self._step = seconds
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.medians import compute_nan_median
 from sims.core.simulator import Array, InputError
 from sims.vision.ball_renderer import RgbImage
 
@@ -152,27 +153,9 @@ def compute_masked_background(
     values = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
     result = previous.copy()
     if is_partly_hidden.any():
-        median = _compute_nan_median(values)
+        median = compute_nan_median(values)
         # Add half a grey level, because the conversion to integers truncates.
         result[is_partly_hidden] = (median + 0.5).astype(np.uint8)
-    return result
-
-
-def _compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the median over the first axis, ignoring NaN; numpy's takes four times as long.
-
-    Args:
-        values: (n, ...) values, NaN where missing; at least one in each column is present.
-
-    Returns:
-        (...) medians; the mean of both middle values if their number is even.
-    """
-    # NaN are sorted last, so the number of other values determines the middle.
-    sorted_values = np.sort(values, axis=0)
-    count = np.isfinite(values).sum(axis=0, keepdims=True)
-    lower_middle = np.take_along_axis(sorted_values, (count - 1) // 2, axis=0)
-    upper_middle = np.take_along_axis(sorted_values, count // 2, axis=0)
-    result: NDArray[np.float32] = (lower_middle[0] + upper_middle[0]) / 2
     return result
 
 

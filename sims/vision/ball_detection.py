@@ -148,19 +148,18 @@ class BallDetection(NamedTuple):
 
 
 class BallDetector:
-    """Detector of round objects in pictures of one scene.
-
-    Args:
-        background: Scene without the ball.
-        sigma: Standard deviation of the noise, grey levels.
-        shadows: Whether regions that are only darker than the background are treated as shadow;
-            wrong for a ball of the ground's own hue.
-    """
+    """Detector of round objects in pictures of one scene."""
 
     def __init__(self, background: RgbImage, sigma: float, shadows: bool) -> None:
         """Precompute what every frame is compared with: grey and squared background, and threshold.
 
         `level` is the difference, in grey levels, from which a pixel counts as changed.
+
+        Args:
+            background: Scene without the ball.
+            sigma: Standard deviation of the noise, grey levels.
+            shadows: Whether regions that are only darker than the background are treated as shadow;
+                wrong for a ball of the ground's own hue.
         """
         self.background = background
         self.sigma = sigma
@@ -214,7 +213,7 @@ class BallDetector:
 
         Args:
             detection: the detection.
-            picture: the picture.
+            picture: picture (height, width, 3).
         """
         centre_colour = _compute_centre_colour(picture, detection)
         background_colour = _compute_centre_colour(self.background, detection)
@@ -285,7 +284,7 @@ class BallDetector:
         The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
 
         Args:
-            picture: the picture.
+            picture: picture (height, width, 3).
             mask: (height, width) pixels that differ from the background.
         """
         brightness_ratio = np.zeros(mask.shape, np.float32)
@@ -511,7 +510,7 @@ def _compute_median_colours(
     """Return the median colours (3,) of two parts of a picture.
 
     Args:
-        picture: the picture.
+        picture: picture (height, width, 3).
         object_mask: (height, width) pixels of the object.
         surroundings: (height, width) pixels around it.
     """
@@ -524,7 +523,7 @@ def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array
     """Return the mean colour (3,) at a detection's centre.
 
     Args:
-        picture: the picture.
+        picture: picture (height, width, 3).
         detection: centre and radius of the ball.
     """
     side = 2 * max(1, int(_CENTRE_PATCH_SHARE * detection.radius)) + 1
@@ -537,7 +536,7 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
     """Return the median colour (3,) on a circle around a detection, in grey levels.
 
     Args:
-        picture: the picture.
+        picture: picture (height, width, 3).
         detection: centre and radius of the ball.
     """
     cos, sin = _compute_ray_directions()

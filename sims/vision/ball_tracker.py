@@ -211,20 +211,20 @@ def _extend_paths(
         Numbers of the detections that were appended.
     """
     pairs = []
-    for i, path in enumerate(active_paths):
-        for k, detection in enumerate(detections):
+    for path_index, path in enumerate(active_paths):
+        for detection_index, detection in enumerate(detections):
             distance = path.compute_distance(frame, detection)
             if np.isfinite(distance):
-                pairs.append((distance, i, k))
+                pairs.append((distance, path_index, detection_index))
     paths: set[int] = set()
     used_detections: set[int] = set()
     # Nearest pairs first: a path gets one detection, and a detection one path.
-    for _, i, k in sorted(pairs):
-        if i in paths or k in used_detections:
+    for _, path_index, detection_index in sorted(pairs):
+        if path_index in paths or detection_index in used_detections:
             continue
-        paths.add(i)
-        used_detections.add(k)
-        active_paths[i].append(frame, detections[k])
+        paths.add(path_index)
+        used_detections.add(detection_index)
+        active_paths[path_index].append(frame, detections[detection_index])
     return used_detections
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.medians import compute_median
 from sims.core.simulator import Array
 
 Circle = tuple[float, float, float]
@@ -75,10 +76,10 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
         away_v = y - v
         distances = np.hypot(away_u, away_v)
         if radius is None:
-            radius = _compute_median(distances)
+            radius = compute_median(distances)
         residuals = distances - radius  # (1)
         width = _TUKEY_WIDTH * max(
-            _SIGMA_PER_MEDIAN * _compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
+            _SIGMA_PER_MEDIAN * compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
         )
         weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
         np.maximum(distances, 1e-9, out=distances)
@@ -188,12 +189,3 @@ def fit_arc(points: Array) -> Circle | None:
         float(v[best] + mean[1]),
         float(radius[best]),
     )
-
-
-def _compute_median(values: Array) -> float:
-    """Return the median; numpy's own takes ten times as long for a few numbers."""
-    k = len(values) // 2
-    sorted_there = np.partition(values, (k - 1, k))
-    if len(values) % 2:
-        return float(sorted_there[k])
-    return float(0.5 * (sorted_there[k - 1] + sorted_there[k]))

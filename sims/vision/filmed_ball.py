@@ -159,7 +159,7 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
     NaN stands where it finds none.
 
     Args:
-        camera: the camera.
+        camera: camera: its position, axes, focal length and principal point.
         radius: radius of the ball, m.
         places: (T, 3) centre of the ball, m.
         times: (T,) times of the frames, s.

@@ -168,6 +168,12 @@ def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -
 
     The two pipes become the descriptors 100 and 101. All others are closed, so that code of a tuner
     cannot reach anything of the harness through an open file.
+
+    Args:
+        request: What to run (`service`, as "module:function"), and the folder, readable paths and
+            memory of the process.
+        pipes: Two descriptors, to read from and to write to.
+        layers: Names of the isolation layers that the kernel permits.
     """
     _discard_output()
     reading, writing = (os.dup2(pipe, 100 + i) for i, pipe in enumerate(pipes))

@@ -106,6 +106,9 @@ def limited_memory(mebibytes: int) -> Iterator[None]:
     Allocations beyond the limit fail with `MemoryError`. Linux counts private writable memory
     (RLIMIT_DATA), so mapped files and libraries are not counted.
 
+    Args:
+        mebibytes: Limit in MiB, in addition to the present size.
+
     Raises:
         InputError: this system has no such limit.
     """
@@ -126,6 +129,9 @@ def limited_memory(mebibytes: int) -> Iterator[None]:
 
 def limit_memory(mebibytes: int) -> None:
     """Limit the additional memory of this process permanently; 0 for no limit.
+
+    Args:
+        mebibytes: Limit in MiB, in addition to the present size.
 
     Raises:
         InputError: this system has no such limit.
@@ -405,6 +411,9 @@ def _set_resource_limits(has_user_namespace: bool) -> None:
 
     Threads are counted for each user of the machine. Without a user namespace, those of the user's
     other programs would count too, so the number is not limited then.
+
+    Args:
+        has_user_namespace: Whether the process has a user namespace of its own.
     """
     limits = {
         resource.RLIMIT_CORE: 0,

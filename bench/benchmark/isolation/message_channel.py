@@ -104,17 +104,16 @@ def to_printable(text: str) -> str:
 
 
 class MessageChannel:
-    """One side of a pair of pipes.
-
-    Args:
-        reading: file descriptor to read from.
-        writing: file descriptor to write to.
-    """
+    """One side of a pair of pipes."""
 
     def __init__(self, reading: int, writing: int) -> None:
         """Store the descriptors, and prepare polling.
 
         Polling is needed so that every read and write can have a deadline.
+
+        Args:
+            reading: file descriptor to read from.
+            writing: file descriptor to write to.
         """
         self._reading, self._writing = reading, writing
         self._buffer = bytearray(_MAX_READ_BYTES)

@@ -296,6 +296,10 @@ def _make_environment(folder: str) -> dict[str, str]:
 
     Only variables that numerical libraries and Python need are inherited, because others could pass
     information to a tuner. Unless the user has set it, the number of numerical threads is one.
+
+    Args:
+        folder: Private folder of the process, which becomes its home and its place for temporary
+            files.
     """
     inherited_names = (
         "PATH",
@@ -390,6 +394,9 @@ class IsolatedProcess:
 
     def _wait_for_exit_code(self, seconds: float) -> int | None:
         """Wait for the report of the supervisor.
+
+        Args:
+            seconds: Longest time to wait.
 
         Returns:
             Exit code of the process; None if it has not ended in time. A supervisor without a
@@ -525,11 +532,6 @@ def relocate(tuned: TunerSpec, places: Mapping[Path, Path]) -> TunerSpec:
 class IsolatedTuner:
     """Tuner that has been built in an isolated process.
 
-    Args:
-        child: process of the tuner.
-        tuned: specification of the tuner.
-        state: trained weights of a learned tuner.
-
     Attributes:
         import_seconds: seconds to build the tuner, nearly all for imports of its file.
 
@@ -547,6 +549,11 @@ class IsolatedTuner:
 
         The tuner has been built when the process has answered. Message kinds: B builds, L loads
         weights.
+
+        Args:
+            child: process of the tuner.
+            tuned: specification of the tuner.
+            state: trained weights of a learned tuner.
         """
         self.child = child
         child.wait_until_ready()

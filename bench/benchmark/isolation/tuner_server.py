@@ -121,6 +121,11 @@ def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | No
 
     Message kinds: B builds a tuner, L loads its weights, T runs it on a task, F trains it. `tuner`
     is None before the first message B.
+
+    Args:
+        channel: Channel to the harness.
+        message: Request of the harness.
+        tuner: Tuner that was built before.
     """
     if message.kind == b"B":
         description = message.to_document()
@@ -196,6 +201,11 @@ def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
 
     At the end it sends S with the tuner's reason for stopping, or K after the harness closed the
     run.
+
+    Args:
+        channel: Channel to the harness.
+        message: Message T with the arrays of the task.
+        tuner: Tuner to run.
     """
     arrays = unpack_arrays(message.body)
     task = Task(
@@ -250,11 +260,13 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
             raise GeneratorExit
         if answer.flags:
             _set_processor(answer.flags - 1)
-        numbers, n = answer.to_array(), answer.size
-        used_simulations += n
-        proposals = numbers[: n * dim].reshape(n, dim)
-        losses = numbers[n * dim : n * dim + n]
-        observations = numbers[n * dim + n :].reshape(n, length, channels)
+        numbers, point_count = answer.to_array(), answer.size
+        used_simulations += point_count
+        proposals = numbers[: point_count * dim].reshape(point_count, dim)
+        losses = numbers[point_count * dim : point_count * dim + point_count]
+        observations = numbers[point_count * dim + point_count :].reshape(
+            point_count, length, channels
+        )
         proposals.setflags(write=False)
         losses.setflags(write=False)
         proposal = steps.send(Evaluation(proposals, observations, losses))
@@ -350,6 +362,11 @@ def _train_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> Non
     """Train the tuner on the harness's training simulator, and send its weights (message L).
 
     Progress is reported to the harness if the flags of the message ask for it.
+
+    Args:
+        channel: Channel to the harness, which simulates.
+        message: Message F with the budget and the state of the random generator.
+        tuner: Tuner to train.
     """
     arrays = unpack_arrays(message.body)
     tuner.watch = _RemoteTrainingCallback(channel) if message.flags else None

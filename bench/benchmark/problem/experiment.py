@@ -461,6 +461,9 @@ def load_experiment(name_or_path: str) -> Experiment:
 def find_experiment_file(name_or_path: str) -> Path:
     """Find the file of an experiment of the project, or of a user.
 
+    Args:
+        name_or_path: Name of an experiment of the project, or path of a TOML file.
+
     Raises:
         InputError: there is no such experiment.
     """

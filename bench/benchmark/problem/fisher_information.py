@@ -108,6 +108,8 @@ def compute_spectrum(
     The Jacobian is J_nk = (d y_n / d theta_k) / sigma_n (1), for sample n and parameter k in units
     of its training range.
 
+    Shapes: T samples, C channels.
+
     Args:
         simulate: parameters (n, dim) in physical units -> observations (n, T, C).
         truth: (dim,) true parameters in physical units.

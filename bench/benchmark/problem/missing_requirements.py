@@ -91,6 +91,9 @@ def _combine_availability(experiment: Experiment) -> Availability:
     Only the first missing data set is reported; the others follow when it has been downloaded.
     A suite leaves out the problems that cannot run, see `leave_out_missing_problems`: something is
     missing for it only if no problem can run.
+
+    Args:
+        experiment: Sweep or suite that names other experiments.
     """
     availability_by_name = {
         part_experiment.name: availability(part_experiment)

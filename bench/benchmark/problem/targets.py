@@ -164,7 +164,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     """Make one draw of a target; None if its simulation diverges.
 
     Args:
-        problem: the problem.
+        problem: problem: simulator, noise and ranges from which targets are drawn.
         kind: range of the target: ``wide`` draws from all bounds, others from the training range.
         index: index of the target in its range.
         number: 0 for the first draw; counts the repeated draws, each from new streams.
@@ -202,6 +202,8 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
 def _round_to_resolution(observed: Array, problem: TargetProblem) -> Array:
     """Round samples (T, C) to the resolution of the channels that have one.
 
+    Shapes: T samples, C channels.
+
     Args:
         observed: (T, C) samples in the units of the channels.
         problem: the problem, with the resolution of its sensors.
@@ -219,6 +221,8 @@ def _is_divergent(observed: Array, channels: Sequence[Channel]) -> bool:
 
     It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
     Single missing samples (NaN), as of a camera, are not a failure.
+
+    Shapes: T samples, C channels.
 
     Args:
         observed: (T, C) simulated channels.

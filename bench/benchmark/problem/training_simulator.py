@@ -46,6 +46,8 @@ class TrainingProblem(Protocol):
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
         """Simulate points of the unit cube.
 
+        Shapes: T samples, C channels.
+
         Args:
             points: (n, dim) points of the unit cube.
             scenarios: runs to simulate.
@@ -63,6 +65,8 @@ class RandomisedSimulation(Protocol):
     ) -> Array:
         """Simulate points of the unit cube with random effects.
 
+        Shapes: T samples, C channels.
+
         Args:
             rng: random generator of the effects.
             points: (n, dim) points of the unit cube.
@@ -74,13 +78,7 @@ class RandomisedSimulation(Protocol):
 
 
 class CountedTrainingSimulator:
-    """Training simulator of learned tuners; see `methods.tuner.TrainingSimulator`.
-
-    Args:
-        problem: problem to train on.
-        budget: number of simulations allowed.
-        nuisance: simulator with random effects that is used instead; None for the problem's own.
-    """
+    """Training simulator of learned tuners; see `methods.tuner.TrainingSimulator`."""
 
     def __init__(
         self, problem: TrainingProblem, budget: int, nuisance: RandomisedSimulation | None = None
@@ -89,6 +87,12 @@ class CountedTrainingSimulator:
 
         `dim` is the number of parameters, `training` (2, dim) the training range in the unit cube,
         `scale` (C,) the scale of each channel, `lengths` the number of samples of each scenario.
+
+        Args:
+            problem: problem to train on.
+            budget: number of simulations allowed.
+            nuisance: simulator with random effects that is used instead; None for the problem's
+                own.
         """
         self._problem = problem
         self._nuisance = nuisance
@@ -116,6 +120,8 @@ class CountedTrainingSimulator:
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
         """Simulate points, all in one scenario drawn at random; `scene` then describes it.
+
+        Shapes: T samples, C channels.
 
         Args:
             rng: random generator.
@@ -175,9 +181,6 @@ class RandomisedSimulator:
 
     An effect that the simulator already has with a fixed coefficient is not changed.
 
-    Args:
-        problem: problem that a tuner trains on.
-
     Raises:
         InputError: the simulator cannot have an effect, or the effect is tuned.
     """
@@ -187,6 +190,9 @@ class RandomisedSimulator:
 
         `ranges` are the bounds from which each coefficient is drawn, by ``effect.coefficient``. The
         coefficients become parameters of the simulator after the tuned ones.
+
+        Args:
+            problem: problem that a tuner trains on.
         """
         self._problem = problem
         experiment = problem.experiment
@@ -216,6 +222,8 @@ class RandomisedSimulator:
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
     ) -> Array:
         """Simulate points with effects whose coefficients are drawn at random.
+
+        Shapes: T samples, C channels.
 
         Args:
             rng: random generator.

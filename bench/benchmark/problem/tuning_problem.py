@@ -175,6 +175,8 @@ class TuningProblem:
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
         """Simulate points of the unit cube.
 
+        Shapes: T samples, C channels.
+
         Args:
             points: (n, dim) points of the unit cube.
             scenarios: runs to simulate.
@@ -199,6 +201,9 @@ class TuningProblem:
         """Return the scenario information for tuners: initial values, constants and inputs.
 
         An initial value of an observed channel is left out, because it is the first sample.
+
+        Args:
+            scenarios: Runs of the task, each with initial values, constants and inputs.
         """
         observed_names = {c.name for c in self.channels}
         initial: list[float] = []
@@ -266,6 +271,9 @@ class TuningProblem:
         """Return the distance of true parameters (dim,) from the training range.
 
         It is the largest distance of a parameter in units of the training-range width; 0 inside.
+
+        Args:
+            truth: (dim,) true parameters in their physical units.
         """
         ranges = np.array([p.training_range for p in self.cube.parameters])
         # One of the two differences is positive outside, both are negative inside.

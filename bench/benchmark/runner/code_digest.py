@@ -197,6 +197,9 @@ def hash_class_source(kind: type) -> str:
     changes with everything that determines the class. Its attribute ``made_of`` may list further
     classes that it uses.
 
+    Args:
+        kind: Simulator, tuner, effect or diagnoser class.
+
     Raises:
         InputError: the source of a class cannot be found.
     """
@@ -215,6 +218,9 @@ def _list_source_classes(kind: type) -> list[type]:
     """Return a class, its bases, and the classes that it lists in ``made_of``, recursively.
 
     Their sources together determine the behaviour of the class, so all of them are hashed.
+
+    Args:
+        kind: Class whose behaviour is hashed.
     """
     classes: list[type] = []
     waiting = [kind]
@@ -256,6 +262,9 @@ def _represent_class(kind: type) -> Any:
     """Return the representation of a class in a hash.
 
     It is empty if `hash_source_folders` covers the class; otherwise it is the source of the class.
+
+    Args:
+        kind: Class to represent.
 
     Raises:
         InputError: there is no source.

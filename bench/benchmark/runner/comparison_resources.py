@@ -66,6 +66,9 @@ class _Experiment:
 
         `samples` and `steps` are the numbers of samples and of time steps of one evaluation.
         `learned` is True if at least one of these tuners must be trained.
+
+        Args:
+            experiment: Experiment whose needs are estimated.
         """
         problem = TuningProblem(experiment)
         self.channels = len(problem.channels)

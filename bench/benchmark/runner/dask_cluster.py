@@ -229,6 +229,9 @@ class ClusterPool:
         """Wait until at least one future is done, and return all that are.
 
         It checks regularly whether the scheduler still answers.
+
+        Args:
+            futures: Futures of Dask that have not been returned yet.
         """
         from distributed import CancelledError, wait
 
@@ -271,6 +274,12 @@ class ClusterPool:
 
         It is stored as the result of a task: scattered data would be lost with the worker that
         stores them, whereas a task is executed again.
+
+        Args:
+            path: Local file.
+
+        Returns:
+            Future of its name and content, which tasks take as an argument.
         """
         if path not in self._sent_files:
             content = (path.name, path.read_bytes())

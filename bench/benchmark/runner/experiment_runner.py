@@ -189,6 +189,9 @@ def count_seeds(experiment: Experiment, entry: TunerEntry) -> int:
 def check_tuners(experiment: Experiment) -> dict[str, str]:
     """Build every tuner once, so that errors are reported before the work begins.
 
+    Args:
+        experiment: Experiment with its tuners and their options.
+
     Returns:
         Reason by label of each tuner that is skipped.
     """
@@ -360,6 +363,11 @@ def _store_untrained_runs(
 
     A failure is a result too, so these runs are not tried again. `failures` are the errors of
     trainings by label of the tuner and seed.
+
+    Args:
+        results: Runs of the experiment and their journal.
+        progress: Factory of progress displays.
+        failures: Errors of trainings by label of the tuner and seed.
     """
     missing = [
         index for index in range(len(results.plan)) if index not in results.run_sink.statuses

@@ -215,6 +215,9 @@ def _announce_installed(names: Iterable[str]) -> None:
     """Inspect tuners of other packages before they are imported in this process.
 
     Their code must not run here, so a stub with the properties found is registered in their place.
+
+    Args:
+        names: Registered names of tuners.
     """
     for name in names:
         if is_external_part(name):

@@ -206,6 +206,8 @@ class _ReplayCheckedEvaluator:
     def __call__(self, points: Array) -> tuple[Array, Array]:
         """Simulate points and compute their losses, if the request equals the one before a kill.
 
+        Shapes: T samples, C channels.
+
         Args:
             points: (n, dim) points of the unit cube.
 
@@ -228,7 +230,7 @@ def _list_stream_names(experiment: Experiment, request: RunRequest) -> tuple[str
 
     Args:
         experiment: configuration of the experiment.
-        request: the run.
+        request: requested run: tuner, target and seed.
     """
     return experiment.name, request.entry.tuner, request.target.name, request.seed
 
@@ -246,7 +248,7 @@ def _run_isolated(
     """Execute a run whose tuner has an isolated process.
 
     Args:
-        experiment: the experiment.
+        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
         request: request of the run.
         task: task of the target.
         evaluate: function that simulates points and computes their losses.

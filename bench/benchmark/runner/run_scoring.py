@@ -105,12 +105,12 @@ def build_rows(
     unknown_errors = np.full((k + 1, len(problem.channels)), np.nan)
     heldout = unknown_errors if outcome.heldout_rmse is None else outcome.heldout_rmse
     columns["heldout_error"] = heldout[:, problem.error_channel]
-    for i, channel in enumerate(problem.channels):
-        columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
+    for channel_index, channel in enumerate(problem.channels):
+        columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, channel_index]
         # Without noise the error cannot be measured in units of the noise.
-        noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
-        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
-        columns[f"heldout_error_{channel.name}"] = heldout[:, i]
+        noise = problem.noise[channel_index] if problem.noise[channel_index] > 0 else np.nan
+        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, channel_index] / noise
+        columns[f"heldout_error_{channel.name}"] = heldout[:, channel_index]
     columns["tuner_seconds"] = _prepend_nan(trace.tuner_seconds)
     columns["simulator_seconds"] = _prepend_nan(trace.simulator_seconds)
     return columns
@@ -141,10 +141,10 @@ def _build_parameter_columns(
         len(errors),
         np.nan if target.truth is None else problem.compute_distance_from_training(target.truth),
     )
-    for i, parameter in enumerate(cube.parameters):
-        columns[f"proposal_{parameter.name}"] = _prepend_nan(proposed[:, i])
-        columns[f"recommendation_{parameter.name}"] = recommended[:, i]
-        columns[f"true_{parameter.name}"] = np.full(len(errors), truth[i])
+    for parameter_index, parameter in enumerate(cube.parameters):
+        columns[f"proposal_{parameter.name}"] = _prepend_nan(proposed[:, parameter_index])
+        columns[f"recommendation_{parameter.name}"] = recommended[:, parameter_index]
+        columns[f"true_{parameter.name}"] = np.full(len(errors), truth[parameter_index])
     return columns
 
 

@@ -93,6 +93,11 @@ def _check_proposals(proposed: object, dim: int, label: str) -> Array:
 
     `label` names them in messages: "proposals" or "recommendations".
 
+    Args:
+        proposed: Object that the tuner yielded.
+        dim: Number of parameters.
+        label: What the points are, for messages.
+
     Raises:
         _DivergenceError: a point is not finite.
     """
@@ -342,10 +347,6 @@ class ProposalEvaluator:
 
         L^2 = 1/C sum_c 1/(N_c s_c^2) S_c,   S_c = sum_t (y_tc - o_tc)^2        (1)
         RMSE_c^2 = S_c / N_c                                                    (2)
-
-    Args:
-        problem: tuning problem.
-        side: runs of the target with their observations.
     """
 
     def __init__(self, problem: TuningProblem, side: ObservedRuns) -> None:
@@ -355,6 +356,10 @@ class ProposalEvaluator:
         `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1), for C channels
         with N_c samples and the scale s_c. `_evaluated_squares` collects
         the sums of squares (n, C) of all batches, from which `compute_rmse` looks up points.
+
+        Args:
+            problem: tuning problem.
+            side: runs of the target with their observations.
         """
         self._problem = problem
         self._scenarios = side.scenarios
@@ -370,6 +375,8 @@ class ProposalEvaluator:
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
         """Simulate points and compute their losses.
+
+        Shapes: T samples, C channels.
 
         Args:
             points: (n, dim) points of the unit cube.
@@ -394,6 +401,13 @@ class ProposalEvaluator:
         """Compute the loss (1,) of one observation of one channel without missing samples.
 
         Most evaluations are of this kind, and this takes a third of the time of the general case.
+
+        Args:
+            observations: (1, T, 1) simulated channel.
+
+        Returns:
+            Root of the mean squared error in units of the channel's scale; infinite if it is not
+            finite.
         """
         difference = (observations - self._observed).ravel()
         square = float(difference.dot(difference))  # S of (1)
@@ -403,6 +417,8 @@ class ProposalEvaluator:
 
     def _sum_squared_errors(self, observations: Array) -> Array:
         """Compute sums (n, C) of squared errors over present samples, in squared channel units.
+
+        Shapes: T samples, C channels.
 
         Args:
             observations: (n, T, C) simulated channels of n proposals; overwritten.

@@ -420,6 +420,12 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         """Store the hashes of the requests before a kill, which the repeated training must repeat.
 
         `_before` is extended with each new request, and `_place` is the index of the next one.
+
+        Args:
+            problem: Problem to train on.
+            budget: Number of simulations allowed.
+            earlier_requests: Hashes of the requests of the training that was killed.
+            nuisance: Simulator with random effects; None for the problem's own.
         """
         super().__init__(problem, budget, nuisance)
         self._before, self._place = earlier_requests, 0
@@ -428,6 +434,8 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         """Simulate points, and check them against the requests before a kill.
 
         See `CountedTrainingSimulator.simulate`.
+
+        Shapes: T samples, C channels.
 
         Args:
             rng: random generator.

@@ -337,16 +337,15 @@ class _PrefetchPolicy:
 
 
 class LocalPool:
-    """Worker processes on this machine, each a new interpreter with one numerical thread.
-
-    Args:
-        jobs: number of worker processes.
-    """
+    """Worker processes on this machine, each a new interpreter with one numerical thread."""
 
     def __init__(self, jobs: int) -> None:
         """Set the number of threads of numerical libraries to one.
 
         Workers start with the first calls. Variables that the user has set are kept.
+
+        Args:
+            jobs: number of worker processes.
         """
         # Workers inherit the variables; numerical libraries read them when they are loaded.
         for name in THREAD_COUNT_VARIABLES:

@@ -51,9 +51,6 @@ Few tuners reach the tighter ones.
 class ComparisonStatistics:
     """Statistics of one comparison: the deciding metric, rankings, medians and costs.
 
-    Args:
-        stored: the stored comparison; it has at least one run.
-
     Attributes:
         metric: name of the deciding metric, see `select_primary_metric`.
         runs: runs that have the deciding metric.
@@ -69,6 +66,9 @@ class ComparisonStatistics:
 
         Other statistics are computed when they are used. `floor` is the error below which tuners
         count as equal. `_curves` and `_medians` cache the results of other metrics by name.
+
+        Args:
+            stored: the stored comparison; it has at least one run.
         """
         self.metric, self.runs, in_widths = select_primary_metric(stored.runs)
         self._statuses, self._costs = stored.statuses, stored.costs
@@ -116,7 +116,11 @@ class ComparisonStatistics:
         return [*ranked, *(t for t in self.order if t not in ranked)]
 
     def sort_rows(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
+        """Sort rows that have the columns range and tuner: range by range, the best tuner first.
+
+        Args:
+            frame: Table with the columns `range` and `tuner`.
+        """
         kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
         position_of_key = {key: position for position, key in enumerate(order)}
@@ -248,6 +252,9 @@ class ComparisonStatistics:
         """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
 
         Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
+
+        Args:
+            level: Error to be reached.
         """
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")

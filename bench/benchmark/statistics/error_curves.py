@@ -104,13 +104,7 @@ RUN_KEY_COLUMNS = ["run", "experiment", "tuner", "range", "target", "seed"]
 
 
 class RunRowTable:
-    """Table of runs.parquet, arranged once so that a matrix of any column can be built from it.
-
-    Args:
-        runs: rows with at least the columns `RUN_KEY_COLUMNS`, k and the metrics.
-        statuses: rows of status.csv.
-        budget: largest number of simulations that is used.
-    """
+    """Table of runs.parquet, arranged once so that a matrix of any column can be built from it."""
 
     def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
         """Assign a matrix row to every run, and a matrix column to every number of simulations k.
@@ -118,6 +112,11 @@ class RunRowTable:
         For R runs: `_codes` is the matrix row of each table row, `keys` (R rows) has tuner, target
         and seed, `used` (R,) is the last k of each run, and `failed` (R,) marks runs with a failed
         status.
+
+        Args:
+            runs: rows with at least the columns `RUN_KEY_COLUMNS`, k and the metrics.
+            statuses: rows of status.csv.
+            budget: largest number of simulations that is used.
         """
         self._runs, self._budget = runs, budget
         # The matrices of all metrics use the same row and column indices.
@@ -136,6 +135,9 @@ class RunRowTable:
 
     def build_matrix(self, name: str) -> Array:
         """Arrange a column as a matrix of runs and numbers of simulations.
+
+        Args:
+            name: Column of the table, such as "param_error".
 
         Returns:
             (R, budget + 1) values; NaN after the end of a run.
@@ -478,9 +480,10 @@ def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) 
         second: errors of another tuner, by number of simulations.
     """
     points = first.index.intersection(second.index)
-    a, b = first[points].to_numpy(), second[points].to_numpy()
+    first_errors, second_errors = first[points].to_numpy(), second[points].to_numpy()
     is_equal = np.logical_and.accumulate(
-        np.abs(a - b) <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(a, b)
+        np.abs(first_errors - second_errors)
+        <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(first_errors, second_errors)
     )
     return int(points[is_equal][-1]) if is_equal.any() else 0
 
@@ -560,15 +563,19 @@ def _compute_median_with_interval(
 
 
 def format_bin_labels(table: pd.DataFrame) -> list[str]:
-    """Return labels of the groups of `compute_medians_by_distance`, with numbers of targets."""
+    """Return labels of the groups of `compute_medians_by_distance`, with numbers of targets.
+
+    Args:
+        table: Result of `compute_medians_by_distance`, with the limits of each bin.
+    """
     first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
     names = []
-    for b in range(max(first, default=0) + 1):
-        row = first.get(b)
+    for bin_index in range(max(first, default=0) + 1):
+        row = first.get(bin_index)
         if row is None:
             names.append("inside\nn=0")
             continue
         limits = [f"{row[end]:.2f}" for end in ("beyond", "to")]
-        name = "–".join(dict.fromkeys(limits)) if b else "inside"
+        name = "–".join(dict.fromkeys(limits)) if bin_index else "inside"
         names.append(f"{name}\nn={row['targets']}")
     return names

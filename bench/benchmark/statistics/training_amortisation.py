@@ -255,7 +255,11 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
 
 
 def map_break_even_counts(table: pd.DataFrame) -> pd.DataFrame:
-    """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
+    """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`.
+
+    Args:
+        table: Counts of targets after which a training has paid, with intervals.
+    """
     mapped_table = table.copy()
     for column in ("targets", "low", "high"):
         values = table[column].to_numpy(dtype=np.float64)

@@ -154,14 +154,14 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
     failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier_ranks: list[pd.Series[float]] = []
-    for k in list_ranking_points(budget):
-        logs = build_log_error_table(curves, k, floor)
+    for simulations in list_ranking_points(budget):
+        logs = build_log_error_table(curves, simulations, floor)
         # Rounding gives errors that differ by the last bits the same rank.
         medians, mean_logs = logs.median().round(9), logs.mean().round(9)
         ranks = medians.rank(method="min")
         keys = [pd.Series(failed), medians, mean_logs, *reversed(earlier_ranks)]
         order = sorted(logs.columns, key=lambda t: [float(key[t]) for key in keys])
-        rankings[k] = _Ranking(logs, ranks, order)
+        rankings[simulations] = _Ranking(logs, ranks, order)
         earlier_ranks.append(ranks)
     return rankings
 
@@ -272,6 +272,9 @@ def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.Dat
 
 def compute_nemenyi_p_values(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]:
     """Test ranks (problems, tuners) with Friedman's test and Nemenyi's post-hoc test.
+
+    Args:
+        ranked: (problems, tuners) ranks, 1 is best.
 
     Returns:
         Friedman's p-value, and Nemenyi's p-value for each pair of tuners.

@@ -70,7 +70,7 @@ def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
     """Convert a column of a Parquet file to text, int64, float64 or bool.
 
     Args:
-        column: Its declaration.
+        column: Declaration of the column: type, range, allowed words, and empty cells.
         values: Its values.
 
     Raises:
@@ -114,7 +114,7 @@ def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
     """Convert a column of a CSV file to text, int64, float64 or bool.
 
     Args:
-        column: Its declaration.
+        column: Declaration of the column: type, range, allowed words, and empty cells.
         values: Its cells as text.
 
     Raises:
@@ -180,7 +180,7 @@ def check_cells(
     """Check that every cell fits the declaration of its column.
 
     Args:
-        column: Its declaration.
+        column: Declaration of the column: type, range, allowed words, and empty cells.
         values: Result of `parse_parquet_column`, `parse_csv_column` or `parse_json_column`.
         at_start: Mask of rows with k = 0.
         is_recording: Mask of rows of a recording.

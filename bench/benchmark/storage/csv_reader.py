@@ -48,11 +48,6 @@ ColumnResolver = Callable[[list[str]], Columns]
 class CsvTable:
     """A CSV file whose cells fit their declarations.
 
-    Args:
-        path: The file.
-        columns: Declared columns, or a function that returns them for a file's header.
-        remedy: Advice for a damaged file.
-
     Attributes:
         table: Declared columns that the file has.
 
@@ -61,7 +56,13 @@ class CsvTable:
     """
 
     def __init__(self, path: Path, columns: Columns | ColumnResolver, remedy: str) -> None:
-        """Read and check the whole file; a wrong cell becomes an error that names its line."""
+        """Read and check the whole file; a wrong cell becomes an error that names its line.
+
+        Args:
+            path: The file.
+            columns: Declared columns, or a function that returns them for a file's header.
+            remedy: Advice for a damaged file.
+        """
         self._path, self._remedy = path, remedy
         self._text = self._read_text()
         self._header = next(self._iterate_records(), (1, []))[1]
@@ -264,7 +265,7 @@ def declare_run_columns(names: list[str], experiment: Experiment) -> list[Column
 
     Args:
         names: Names of the file's columns.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
     """
     parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
     channels = experiment.observe or list_channels(names)
@@ -413,6 +414,9 @@ def _check_same(rows: pa.Table) -> None:
     """Check that the columns that describe a run are constant within it.
 
     These are columns such as tuner and target, which are repeated in each row of the run.
+
+    Args:
+        rows: Table in which the rows of a run follow each other.
 
     Raises:
         CellError: a value differs from the row before.

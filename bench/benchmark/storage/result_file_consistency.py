@@ -54,7 +54,7 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
 
     Args:
         plan: The id of every run.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         path: Path of the plan.
         remedy: Advice for a damaged plan.
 
@@ -94,7 +94,7 @@ def check_complete(
 
     Args:
         executed_runs: Tuner, target and seed of each run; the index is the row in the file.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         make_error: Makes the error for a row, or for the file.
 
     Raises:
@@ -164,7 +164,7 @@ def check_files(
 
     Args:
         folder: Folder of the comparison.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         is_unfinished: Whether runs may be missing.
         plan: The id of every run; None if unknown.
 
@@ -274,7 +274,7 @@ def check_statuses(
 
     Args:
         statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`, cells checked.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         make_error: Makes the error for a row.
 
     Raises:
@@ -399,7 +399,7 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
     Args:
         runs: One line per run, as read from `file`.
         file: File of the rows.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
 
     Raises:
         InputError: A check fails.
@@ -435,7 +435,7 @@ def check_segment_statuses(
     Args:
         path: Path of the part or journal.
         statuses_by_index: Statuses by index in the plan.
-        experiment: The experiment.
+        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
         plan: The id of every run; None if unknown.
         remedy: Advice for a damaged file.
 

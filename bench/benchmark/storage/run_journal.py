@@ -123,6 +123,9 @@ _DAMAGE_ERRORS = (
 def _convert_statuses(entries: Any) -> dict[int, RunStatus]:
     """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
 
+    Args:
+        entries: JSON list from the footer of a file.
+
     Raises:
         CellError: A value violates its declaration.
     """
@@ -194,7 +197,11 @@ def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
 
 
 def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunStatus]]]:
-    """Yield the statuses of the finished runs of a study by file; see `read_finished_statuses`."""
+    """Yield the statuses of the finished runs of a study by file; see `read_finished_statuses`.
+
+    Args:
+        folder: Result folder of the study.
+    """
     # Journals first: a journal that becomes a part in the meantime is then found among the parts.
     for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):
         with suppress(FileNotFoundError):

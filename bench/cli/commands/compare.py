@@ -129,7 +129,7 @@ def _run_study(
     """Run one study until it is complete or stopped, then write its report.
 
     Args:
-        study: the study.
+        study: study in its result folder.
         pool: executes the runs on a cluster; None for worker processes on this machine.
         options: parsed command line.
         print_line: prints one line of text.

@@ -89,7 +89,7 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
     """Download one data set with a progress bar; return its folder.
 
     Args:
-        data_set: the data set.
+        data_set: data set of the catalogue: its files, source and licence.
         source: address of its files.
         target_folder: folder below which it is stored; None for the usual one.
     """
@@ -122,7 +122,7 @@ def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path 
     """Return the folder of a data set that is already present; None if it must be downloaded.
 
     Args:
-        data_set: the data set.
+        data_set: data set of the catalogue: its files, source and licence.
         target_folder: folder below which it may be; None for the usual ones.
     """
     if target_folder is None:
@@ -135,7 +135,7 @@ def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
     """Explain how experiments find a data set in a folder other than the default one.
 
     Args:
-        data_set: the data set.
+        data_set: data set of the catalogue: its files, source and licence.
         target_folder: folder below which it is stored.
     """
     from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, list_search_folders

@@ -154,7 +154,7 @@ def _remove_inactive_drives(
     """Return a robot's recording without samples in which drives do nothing, and where that is.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class.
     """
     from bench.logs.quality.quality_finding import QualityFinding
@@ -180,7 +180,7 @@ def _find_differing_conventions(
 
     Args:
         options: parsed arguments of the command.
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class.
 
     Raises:

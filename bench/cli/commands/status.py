@@ -115,7 +115,7 @@ def _print_progress(study: Study, is_all: bool, print_line: PrintLine) -> JsonDo
     """Print the progress of a study, and return it as a document.
 
     Args:
-        study: the study.
+        study: study in its result folder.
         is_all: whether every run is listed, and not only notable ones.
         print_line: prints one line of text.
     """

@@ -251,6 +251,12 @@ class ConventionComparison:
         """Return the largest missing force of a joint, as a share of its typical force.
 
         It is infinite if the filter diverges.
+
+        A missing force is the process noise with which the filter has to follow the readings; it is
+        large if a convention is wrong.
+
+        Args:
+            recording: Recording under one hypothesis.
         """
         followed = self._filter_runs(self._select_parts(recording))
         return (
@@ -265,6 +271,10 @@ class ConventionComparison:
         The missing force is the standard deviation of the force noise (process noise) with which
         the filter follows the readings. A wrong sign, unit or joint order shows as such a force. If
         the filter diverges, all joints are suspects.
+
+        Args:
+            filtered_runs: Result of the filter, with the missing and the typical force of each
+                joint.
         """
         if not filtered_runs.has_expected_innovations:
             return self._generator.joints
@@ -373,7 +383,7 @@ class ConventionComparison:
 
         Args:
             score: log-likelihood with the hypothesis.
-            hypothesis: the hypothesis.
+            hypothesis: hypothesis: changed signs, units or orders of signals.
             recording: short part of the recording.
         """
         inputs = recording.runs[0].inputs
@@ -583,7 +593,7 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
     """Return the noise floor of the channels as noise without autocorrelation.
 
     Args:
-        evaluator: the runs for fitting.
+        evaluator: run evaluator of the runs to which models are fitted.
         recording: the recording, which may state the noise.
     """
     sigma = compute_noise_floor(evaluator, recording).sigma
@@ -629,6 +639,9 @@ def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
 
     The friction acts at the joint with the largest missing force, and is not part of the
     regression. The result is minus infinity without such an effect.
+
+    Args:
+        followed: Result of the filter without this friction.
     """
     evaluator = followed.evaluator
     joint = followed.joints_by_loss[0]

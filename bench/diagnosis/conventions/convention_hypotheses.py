@@ -207,6 +207,9 @@ def list_recorded_joints(subject: Subject) -> list[JointSignals]:
     """Collect for each joint of a robot its recorded channels, inputs and position range.
 
     The order is that of the coordinates of the robot.
+
+    Args:
+        subject: Recording and its robot.
     """
     kind: Any = subject.kind
     run = subject.recording.runs[0]
@@ -268,6 +271,9 @@ class HypothesisGenerator:
         """Yield hypotheses that all positions, commands, velocities or torques have another unit.
 
         They are tried together only if the description states the same unit for all of them.
+
+        Args:
+            recording: Recording in the units of its description.
         """
         positions = self._list_channels("q")
         commands = [name for joint in self.joints for name in joint.servo_inputs]
@@ -461,7 +467,7 @@ def _generate_units(
 
     Args:
         signals: signals with the same specified unit.
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
     """
     first_signal = signals[0]
     names = [signal.name for signal in signals]

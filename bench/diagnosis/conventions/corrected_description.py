@@ -68,6 +68,11 @@ def _move_to_column(
     """Return the description table of a signal after its values were taken from another column.
 
     `change.source` names that column or the signal that has it; `tables` are the present tables.
+
+    Args:
+        tables: Tables of the description by signal.
+        name: Signal to change.
+        change: Correction of the signal.
     """
     is_signal = change.source in tables
     table = dict(tables[change.source if is_signal else name])

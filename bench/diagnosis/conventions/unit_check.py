@@ -449,7 +449,7 @@ def _get_unit_gain(signal: Signal, unit: str) -> float:
     """Return the factor from the values of a signal to SI units, if the values have this unit.
 
     Args:
-        signal: the recorded signal.
+        signal: recorded signal with its declared and recorded unit.
         unit: name of the unit.
     """
     if unit == signal.specified_unit:
@@ -478,7 +478,7 @@ def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> l
 
     Args:
         evaluator: the runs, with the bounds of the parameters.
-        fit: the base fit.
+        fit: fit of the base model: parameters, initial states, simulated runs and derivatives.
     """
     names = []
     for index in fit.free_indices.tolist():
@@ -493,19 +493,25 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
 
     It is 0 for a channel that does not move beyond its noise.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: run evaluator with the recorded runs.
         residual: (R, T, C) residual of the base model; zero where no sample exists.
         noise: noise of each channel.
     """
     shares = []
-    for c, sigma in enumerate(noise.sigma.tolist()):
-        is_recorded = np.isfinite(evaluator.observed[..., c])
+    for channel_index, sigma in enumerate(noise.sigma.tolist()):
+        is_recorded = np.isfinite(evaluator.observed[..., channel_index])
         deviation = (
-            float(np.std(evaluator.observed[..., c][is_recorded])) if is_recorded.any() else 0.0
+            float(np.std(evaluator.observed[..., channel_index][is_recorded]))
+            if is_recorded.any()
+            else 0.0
         )
         # A failed simulation counts as an infinite residual.
-        mean_square = float(np.mean(np.nan_to_num(residual[..., c][is_recorded], nan=np.inf) ** 2))
+        mean_square = float(
+            np.mean(np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf) ** 2)
+        )
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
         shares.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
     return np.array(shares)
@@ -513,6 +519,8 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
 
 def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
     """Return the RMS of a residual over its samples, in units of the noise.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         residual: (R, T, C) residual.
@@ -528,7 +536,7 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
     """Return the joints and actuators of a robot to check; None for other systems: check all.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         shares: (C,) share of each channel in the squares of the residual.
     """
     if not evaluator.kind.has_model:
@@ -715,8 +723,8 @@ def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float
     """
     is_recorded = np.isfinite(evaluator.observed)
     max_squares = 0.0
-    for c, sigma in enumerate(noise.sigma.tolist()):
-        values = evaluator.observed[..., c][is_recorded[..., c]]
+    for channel_index, sigma in enumerate(noise.sigma.tolist()):
+        values = evaluator.observed[..., channel_index][is_recorded[..., channel_index]]
         deviation = float(np.std(values)) if values.size else 0.0
         excess = MAX_RESIDUAL_SHARE * deviation if deviation > MIN_MOTION_SIGMAS * sigma else np.inf
         max_squares += values.size * ((excess / sigma) ** 2 + 1.0) if values.size else 0.0

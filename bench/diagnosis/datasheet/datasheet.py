@@ -255,8 +255,8 @@ def _is_recorded(evaluator: RunEvaluator, effect: str) -> bool:
     """Return whether the signal that an effect acts on was recorded.
 
     Args:
-        evaluator: the runs.
-        effect: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     run = evaluator.runs[0]
     return evaluator.available_effects[effect].signal in {*run.channels, *run.inputs}

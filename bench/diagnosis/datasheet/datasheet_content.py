@@ -236,7 +236,7 @@ class _Rows:
 
         Args:
             row: the row.
-            effect: name of the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             parameter: name of its coefficient, by which the half widths are stored.
         """
         half_width, file_value = (
@@ -252,7 +252,7 @@ class _Rows:
 
         Args:
             row: row of the cause.
-            effect: name of the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             number: fitted coefficient, whose interval gives the detection limit.
         """
         detection_limit = _make_limit_from_interval(

@@ -205,7 +205,7 @@ def _add_small_gaps(
     Each size is half the previous one, `GAP_HALVINGS` times.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         fit: fit of the model.
         directions: directions of all candidates.
     """
@@ -247,8 +247,8 @@ def _linearise_extended(
     Only the initial states are fitted; parameters and coefficients keep their values.
 
     Args:
-        evaluator: the runs.
-        extended: the extended simulator.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         noise: noise of each channel.
     """
     theta = build_theta(evaluator, extended)
@@ -286,6 +286,15 @@ class _DetectionLimitCalculator:
         the coefficients with which the parameters reproduce each direction; `powers` (K,) is the
         information of eq. (1) that remains, and `newton_steps` (K,) the estimate after one
         Gauss-Newton step from zero, eq. (2).
+
+        Shapes: R runs, T samples, C channels.
+
+        Args:
+            evaluator: Run evaluator of the recording.
+            noise: AR(1) noise with which derivatives and residual are whitened.
+            fit: Fitted model, with the derivatives of the runs.
+            direction_set: Directions of all candidate effects.
+            residual: (R, T, C) recorded minus simulated runs.
         """
         self.evaluator, self.direction_set = evaluator, direction_set
         self.q = fit.free_indices.size
@@ -357,7 +366,7 @@ class _DetectionLimitCalculator:
         """Return the name of a coefficient of an effect.
 
         Args:
-            effect: name of the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             coefficient_index: index of the coefficient within the effect.
         """
         return (
@@ -425,7 +434,7 @@ class _DetectionLimitCalculator:
         The simpler effect may be in the model or not.
 
         Args:
-            name: name of the effect.
+            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             k: index of the probe of its coefficient.
             best: index of the probe with the best shape, by effect and coefficient index.
         """
@@ -449,6 +458,9 @@ class _DetectionLimitCalculator:
         The search contains directions of several fixed sizes of the effect (`probes`). A size is
         detectable if it changes the runs by at least `MIN_DETECTABLE_LIMIT_SIGMAS`, after the
         parameters of the model have absorbed what they can.
+
+        Args:
+            name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
         probes = [
             (k, p)

@@ -118,7 +118,7 @@ def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
     """Return whether the inputs that switch the motor are on all the time.
 
     Args:
-        run: the recorded run.
+        run: recorded run: times, channels and inputs.
         model: the MJCF model; inputs that it does not have are switches.
     """
     switches = [values for name, values in run.inputs.items() if name not in model.signals]

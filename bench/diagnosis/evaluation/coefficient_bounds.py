@@ -61,8 +61,8 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
     nonnegative by definition stays so, and a shape parameter stays in its range.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     effect = evaluator.available_effects[name]
     pairs = zip(
@@ -82,7 +82,7 @@ def get_bounds_by_index(
     """Return the ranges of `compute_coefficient_bounds` for some effects, by index in theta.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         names: names of the effects.
     """
     bounds: dict[int, tuple[float, float]] = {}
@@ -96,8 +96,8 @@ def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:
     """Clip the coefficients (k,) of an effect to the range in which a fit may move them.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) its coefficients.
     """
     clipped: Array = np.clip(c, *np.array(compute_coefficient_bounds(evaluator, name)).T)
@@ -159,7 +159,7 @@ def _compute_fit_bounds(
     Args:
         parameter: the coefficient as a parameter, with its unit and plausible range.
         coefficient: its declaration by the effect.
-        effect: the effect.
+        effect: effect: a force, friction, input, sensor or contact law.
         evaluator: the runs, whose durations limit times and frequencies.
     """
     low, high = parameter.bounds

@@ -88,17 +88,16 @@ class _WorkerTracebackError(Exception):
 
 
 class ForkedWorkerPool:
-    """Pool of up to a given number of worker processes.
-
-    Args:
-        jobs: maximum number of processes; 1 means only this process.
-    """
+    """Pool of up to a given number of worker processes."""
 
     def __init__(self, jobs: int = 1) -> None:
         """Create a pool without workers; they are forked when enough work was done to justify them.
 
         `_task_seconds` is the time, in seconds, that tasks took in this process; workers start when
         it reaches `PARALLEL_THRESHOLD_SECONDS`.
+
+        Args:
+            jobs: maximum number of processes; 1 means only this process.
         """
         self._jobs = jobs
         self._task_seconds = 0.0

@@ -129,7 +129,7 @@ def add_minimal_noise(recording: Recording, channels: Sequence[str]) -> tuple[Re
     Channels that never change are not modified.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         channels: names of the channels to check.
 
     Returns:
@@ -148,7 +148,7 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     """Return the standard deviation of noise to add; 0 for noisy, quantised or constant channels.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         name: name of the channel.
     """
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]

@@ -80,6 +80,8 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
     With the residual e_t, w_t = (e_t - phi e_{t-1}) / (sigma sqrt(1 - phi^2)); a sample without a
     predecessor has w_t = e_t / sigma (2).
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         values: (R, T, C, ...) noise, or derivatives of noisy signals, because whitening is linear.
         observed_mask: (R, T, C) mask of available samples; the others become zero.
@@ -113,6 +115,8 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
 def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:
     """Return half the log-determinant of whitening at unit variance: -m/2 log(1 - φ²).
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         observed_mask: (R, T, C) whether a sample is recorded.
         phi: (C,) AR(1) correlation of each channel, or one for all.
@@ -144,6 +148,8 @@ def maximise_likelihood(
 ) -> Likelihood:
     """Maximise the likelihood of a residual over the noise of each channel.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         residual: (R, T, C) residual of a model.
         observed_mask: (R, T, C) mask of available samples.
@@ -156,8 +162,8 @@ def maximise_likelihood(
     # The degrees of freedom of the fit are distributed over the channels by their samples.
     samples = max(int(observed_mask.sum()), 1)
     share = max(1.0 - fitted_freedom / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
-    for c in range(residual.shape[2]):
-        channel = slice(c, c + 1)
+    for channel_index in range(residual.shape[2]):
+        channel = slice(channel_index, channel_index + 1)
         channel_mask = observed_mask[:, :, channel]
         # A channel without samples has no likelihood and no noise.
         if not channel_mask.any():
@@ -186,6 +192,8 @@ def _maximise_channel_likelihood(
     With n samples, m of them with a predecessor, and the mean square v of the whitened values for
     sigma = 1, 2 log L = -n log v - m log(1 - phi^2) - n (4).
 
+    Shapes: R runs, T samples.
+
     Args:
         residual: (R, T, 1) residual.
         observed_mask: (R, T, 1) mask of available samples.
@@ -194,8 +202,8 @@ def _maximise_channel_likelihood(
     count = int(observed_mask.sum())
     best = (-np.inf, 0.0, 0.0)
     for phi in _list_nearby_phis(residual, observed_mask):
-        w = whiten(residual, observed_mask, _make_unit_noise(phi))
-        power = float((w * w).sum())
+        whitened = whiten(residual, observed_mask, _make_unit_noise(phi))
+        power = float((whitened * whitened).sum())
         variance = max(power / count, MIN_VARIANCE)
         # Equation (4) with the determinant of whitening.
         determinant = 2.0 * compute_log_determinant(observed_mask, phi)
@@ -209,6 +217,8 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     """Return AR(1) correlations to try for a channel, near the residual's sample correlation.
 
     Zero (white noise) is always included.
+
+    Shapes: R runs, T samples.
 
     Args:
         residual: (R, T) residual of the channel.
@@ -240,14 +250,16 @@ def compute_portmanteau_p_value(
 
     With several channels, the smallest p-value is multiplied by their number (Bonferroni).
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         residual: (R, T, C) residual of a model.
         observed_mask: (R, T, C) mask of available samples.
         likelihood: likelihood of the residual, which contains the fitted correlations.
     """
     min_p_value = 1.0
-    for c, phi in enumerate(likelihood.phi.tolist()):
-        channel = slice(c, c + 1)
+    for channel_index, phi in enumerate(likelihood.phi.tolist()):
+        channel = slice(channel_index, channel_index + 1)
         channel_mask = observed_mask[:, :, channel]
         white = whiten(residual[:, :, channel], channel_mask, _make_unit_noise(phi))
         count = max(int(channel_mask.sum()), 2)
@@ -260,6 +272,8 @@ def _compute_ljung_box_sum(w: Array, count: int) -> float:
     """Return the sum Σ r_k² / (n - k) of the Ljung-Box test of `compute_portmanteau_p_value`.
 
     `w` (R, T) has the whitened values of a channel, and `count` is n, the number of samples.
+
+    Shapes: R runs, T samples.
     """
     runs, length = w.shape
     power = max(float((w * w).sum()), MIN_VARIANCE)

@@ -72,7 +72,7 @@ def prepare_run(
     """Prepare a run of a recording for a simulator.
 
     Args:
-        run: the run.
+        run: recorded run: times, channels and inputs.
         recording: the recording that contains the run.
         simulator: simulator that observes the recorded channels.
         states: names of the initial states.
@@ -111,7 +111,7 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
     It is the specified value, or an estimate from the first samples, or the default.
 
     Args:
-        run: the recorded run.
+        run: recorded run: times, channels and inputs.
         simulator: simulator with the default initial states.
     """
     system = simulator.system
@@ -154,6 +154,9 @@ def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
     """Return the states of coordinates that no recorded channel shows.
 
     They keep their defaults, because the data cannot determine them.
+
+    Args:
+        simulator: Simulator with the recorded channels.
     """
     system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
     unobserved_states = set()
@@ -274,6 +277,8 @@ class SimulationCache:
         self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
     ) -> None:
         """Store new results, and write the results of all elements to an output array.
+
+        Shapes: T samples, C channels.
 
         Args:
             keys: keys of all elements, as passed to `missing`.

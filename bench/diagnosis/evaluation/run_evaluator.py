@@ -124,15 +124,6 @@ class RunEvaluator:
             (`bench.diagnosis.kalman.measured_states`).
         worker_pool: worker pool for simulations and fits; by default only this process.
 
-    Args:
-        kind: class of the simulator.
-        recording: the recording.
-        runs: the runs of the recording to use; they are padded to equal length.
-        engine: name of the engine.
-        extra: effects in addition to the registered library.
-        free: names of constants to treat as parameters.
-        candidates: names of the available library effects; None for all that are applicable.
-
     Raises:
         InputError: the simulator is not a system that accepts effects, a constant does not exist,
             or none of its channels is recorded.
@@ -153,6 +144,15 @@ class RunEvaluator:
         An effect is included if the recorded channels and inputs can show it. `free` names
         constants that are fitted like parameters. `candidates` are the names of the effects to
         include; None means all that are observable.
+
+        Args:
+            kind: class of the simulator.
+            recording: recorded runs, with their channels, inputs and constants.
+            runs: the runs of the recording to use; they are padded to equal length.
+            engine: name of the engine.
+            extra: effects in addition to the registered library.
+            free: names of constants to treat as parameters.
+            candidates: names of the available library effects; None for all that are applicable.
         """
         self.kind = kind
         self.recording = recording
@@ -398,6 +398,8 @@ class RunEvaluator:
     ) -> Array:
         """Simulate a batch of runs.
 
+        Shapes: T samples, C channels, P parameters, s states of a run.
+
         Args:
             theta: (L, P) parameters.
             runs: (L,) index of the run of each batch element.
@@ -434,6 +436,8 @@ class RunEvaluator:
         """Simulate B batch elements in several engine calls, without cache and step correction.
 
         Elements of different kinds are simulated separately, and large batches are split.
+
+        Shapes: T samples, C channels, P parameters, s states of a run.
 
         Args:
             theta: (B, P) parameters of each element.
@@ -493,6 +497,9 @@ class RunEvaluator:
         """Return a run evaluator of the same runs with another simulator of the same system.
 
         Parameters keep their indices, so that fitted models can be compared between the simulators.
+
+        Args:
+            kind: Simulator class, for example with another integrator.
         """
         evaluator = self._copy(kind, self.runs)
         evaluator.filtered_runs, evaluator.initial_state_guesses = (
@@ -539,6 +546,8 @@ class RunEvaluator:
         Groups 1 and 3 have effects that read signals at other times; groups 2 and 3 need fine
         steps.
 
+        Shapes: P parameters.
+
         Args:
             theta: (L, P) parameters.
         """
@@ -555,6 +564,8 @@ class RunEvaluator:
 
     def _make_scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
         """Return the scenarios of batch elements with their freed constants.
+
+        Shapes: P parameters.
 
         Args:
             theta: (L, P) parameters, which contain the constants.
@@ -577,6 +588,8 @@ class RunEvaluator:
         self, is_fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
         """Simulate L batch elements in one engine call; all of them have the same time step.
+
+        Shapes: P parameters, s states of a run.
 
         Args:
             is_fine: whether to use the fine time step that filters need.
@@ -601,6 +614,8 @@ class RunEvaluator:
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
     ) -> Array:
         """Simulate batch elements in arbitrary scenarios.
+
+        Shapes: T samples, C channels, P parameters, s states of a run.
 
         Args:
             theta: (L, P) parameters.
@@ -630,6 +645,8 @@ class RunEvaluator:
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
         """Return a scenario whose freed constants, those that a fit estimates, have fitted values.
+
+        Shapes: P parameters.
 
         Args:
             scenario: input of the simulator.
@@ -688,6 +705,8 @@ class RunEvaluator:
     def begin_at(self, states: Array, deviations: Array) -> None:
         """Use estimated initial states.
 
+        Shapes: R runs, s states of a run.
+
         Args:
             states: (R, s) initial states.
             deviations: (s,) standard deviations of their errors.
@@ -714,7 +733,7 @@ def _simulate_engine_call(evaluator: RunEvaluator, *call: Any) -> Array:
     """Simulate one engine call; a module-level function, so that workers can run it.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         *call: arguments of `RunEvaluator.simulate_batch`.
     """
     return evaluator.simulate_batch(*call)

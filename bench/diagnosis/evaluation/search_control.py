@@ -154,12 +154,6 @@ class SearchControl:
     Attributes:
         deadline: end of the search on the clock `time.monotonic`, which all processes share; None
             for no limit. A part of the time limit is left (`use_reserve`).
-
-    Args:
-        budget: wall-clock time limit in seconds; None for no limit.
-        stop: callback that returns whether the user wants to stop; called between two steps.
-        progress: callback that receives the estimated finished share and the current step.
-        listener: receives the stages, steps and results of the search.
     """
 
     def __init__(
@@ -173,6 +167,12 @@ class SearchControl:
 
         A search answers a sequence of questions, such as ``base_fit``. Each has a weight, its usual
         duration in seconds, from which the finished share is estimated.
+
+        Args:
+            budget: wall-clock time limit in seconds; None for no limit.
+            stop: callback that returns whether the user wants to stop; called between two steps.
+            progress: callback that receives the estimated finished share and the current step.
+            listener: receives the stages, steps and results of the search.
         """
         self.deadline: float | None = None
         self._reserve = 0.0

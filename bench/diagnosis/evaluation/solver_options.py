@@ -97,7 +97,7 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     converges.
 
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         noise: noise of each channel.
     """
     kind = evaluator.kind
@@ -128,6 +128,9 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
     """Yield finer time steps and other integrators than the robot's own, the cheapest first.
 
     The cost of a step depends on the integrator (`RELATIVE_RK4_COST`).
+
+    Args:
+        model_settings: Time step, integrator and options of the model file.
     """
     step, integrator, *_ = model_settings
     cost = {"RK4": RELATIVE_RK4_COST}
@@ -145,8 +148,10 @@ def simulate_with_settings(
 ) -> Array:
     """Simulate the first runs of a robot with other settings, without effects.
 
+    Shapes: T samples, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         numerics: settings of the integrator and the solver.
         theta: (P,) parameters.
         initial_states: (R, s) initial states of the first R runs.
@@ -196,6 +201,11 @@ class _ReferenceMotions:
         stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
 
         The extrapolation (Richardson) from step sizes h and h / 2 is q = 2 q(h / 2) - q(h) (1).
+
+        Shapes: R runs, T samples, C channels.
+
+        Args:
+            model_settings: Time step, integrator and options of the model file.
         """
         for division in (1, 2, 5):
             coarse, refined = (
@@ -228,6 +238,8 @@ class _ReferenceMotions:
         """Return the RMS difference in units of the noise; infinite if a simulation fails.
 
         Only available samples of the recording are compared.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             first: (R, T, C) simulated channels of the checked runs.
@@ -287,8 +299,10 @@ def rank_option_alternatives(
     makes the same motion. Another value of an option that has been changed already needs no large
     decrease.
 
+    Shapes: R runs, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         noise: noise of each channel.
         theta: (P,) parameters of the model.
         initial_states: (R, s) initial states.
@@ -334,6 +348,9 @@ def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSett
     """Yield the settings with other values of one option, or of the solver and its iterations.
 
     Alternatives that differ less from common settings come first.
+
+    Args:
+        kind: Simulator of the robot.
     """
     settings = kind.numerics
     present = settings.to_model_options()

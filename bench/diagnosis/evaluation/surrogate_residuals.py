@@ -59,6 +59,8 @@ def draw_surrogates(
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         residual: (R, T, C) residual of a model, zero where no sample exists.
         observed_mask: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
@@ -97,6 +99,8 @@ def _simulate_autoregression(
 
     The process is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and innovations u_t.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         residual: (R, T, C) residual.
         observed_mask: (R, T, C) mask of available samples.
@@ -109,15 +113,15 @@ def _simulate_autoregression(
     """
     runs, length, channels = residual.shape
     result = np.zeros((count, runs, length, channels))
-    for c, channel_weights in enumerate(weights):
-        channel_mask = observed_mask[:, :, c]
-        filled = np.where(channel_mask, residual[:, :, c], 0.0)
+    for channel_index, channel_weights in enumerate(weights):
+        channel_mask = observed_mask[:, :, channel_index]
+        filled = np.where(channel_mask, residual[:, :, channel_index], 0.0)
         innovations = _compute_centred_innovations(filled, channel_mask, channel_weights)
         step = max(
             MAX_CHUNK_SIZE // ((length + BURN_IN_SAMPLES) * runs), MIN_CHUNK_WIDTH // runs, 1
         )
         for first in range(0, count, step):
-            surrogates = result[first : first + step, :, :, c]
+            surrogates = result[first : first + step, :, :, channel_index]
             drawn_innovations = rng.choice(
                 innovations, size=(length + BURN_IN_SAMPLES, len(surrogates), runs)
             )
@@ -134,6 +138,8 @@ def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) 
 
     With the weights a* estimated from surrogates of a, the corrected weights are a + s (a - a*)
     (2), where s <= 1 keeps the process stationary.
+
+    Shapes: R runs, T samples.
 
     Args:
         weights: (p,) weights of an autoregression.
@@ -181,6 +187,8 @@ def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> A
 
     The model is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and independent u_t.
 
+    Shapes: R runs, T samples.
+
     Args:
         values: (R, T) residual of one channel.
         observed_mask: (R, T) whether a sample is recorded.
@@ -204,6 +212,8 @@ def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> A
 def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations (n,) minus their mean; the samples themselves if there are too few.
 
+    Shapes: R runs, T samples.
+
     Args:
         filled: (R, T) residual of one channel, zero where it is not recorded.
         observed_mask: (R, T) whether a sample is recorded.
@@ -221,6 +231,8 @@ def _estimate_autocovariances(filled: Array, observed_mask: Mask, max_order: int
     """Estimate the autocovariances (max_order + 1,) of values (R, T) at the lags 0 to `max_order`.
 
     Missing samples are zero in `filled`; only pairs of available samples (`observed_mask`) count.
+
+    Shapes: R runs, T samples.
     """
     length = observed_mask.shape[1]
     covariances = []
@@ -257,6 +269,8 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     Times at which one of the required samples is missing are left out.
 
     The innovations are u_t = e_t - sum_k a_k e_{t-k}, from (1).
+
+    Shapes: R runs, T samples.
 
     Args:
         filled: (R, T) residual of one channel, zero where it is not recorded.

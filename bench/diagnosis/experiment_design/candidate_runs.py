@@ -62,6 +62,9 @@ def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
     """Read the limits of commands, positions, velocities and forces from a robot's model file.
 
     A system without a model file has none.
+
+    Args:
+        evaluator: Run evaluator of the recording.
     """
     if not evaluator.kind.has_model:
         return StatedLimits()
@@ -219,12 +222,7 @@ class CandidateRun:
 
 
 class RigModel:
-    """Experimental setup, from which variants of the recorded runs are made.
-
-    Args:
-        evaluator: Run evaluator of the recorded runs.
-        seconds: Duration of the next run in seconds.
-    """
+    """Experimental setup, from which variants of the recorded runs are made."""
 
     def __init__(self, evaluator: RunEvaluator, seconds: float) -> None:
         """Measure the usual input levels, command sizes and sampling interval of the present runs.
@@ -233,6 +231,10 @@ class RigModel:
         `largest_commands` its largest deviation from this median. `driven_inputs` names the inputs
         that deviate at all. `step` is the median sampling interval of the first run in seconds, and
         `initial_state` the initial state of a candidate run.
+
+        Args:
+            evaluator: Run evaluator of the recorded runs.
+            seconds: Duration of the next run in seconds.
         """
         self.evaluator, self.seconds = evaluator, seconds
         self.recorded_scenario = evaluator.prepared_runs[0].scenario
@@ -258,8 +260,12 @@ class RigModel:
         """
         states = self.evaluator.prepared_runs[0].initial_state_guess.copy()
         rates = set(self.evaluator.simulator.system.rates)
-        for i, name in enumerate(self.evaluator.state_names):
-            states[i] = 0.0 if name in rates else self._clip_to_joint_range(name, float(states[i]))
+        for state_index, name in enumerate(self.evaluator.state_names):
+            states[state_index] = (
+                0.0
+                if name in rates
+                else self._clip_to_joint_range(name, float(states[state_index]))
+            )
         return states
 
     def _clip_to_joint_range(self, name: str, value: float) -> float:

@@ -211,7 +211,7 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
     within their limits.
 
     Args:
-        evaluator: the fitted runs.
+        evaluator: run evaluator of the runs to which models are fitted.
         limits: limits of the model file; empty for a system.
     """
     run_data = evaluator.prepared_runs[0]
@@ -268,7 +268,7 @@ def _change_initial_states(
     The initial velocities of a robot are not changed, because it starts at rest.
 
     Args:
-        evaluator: the fitted runs.
+        evaluator: run evaluator of the runs to which models are fitted.
         first: the first fitted run.
         limits: limits of the model file; empty for a system.
     """

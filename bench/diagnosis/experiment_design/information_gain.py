@@ -134,6 +134,13 @@ class RunRanker:
         above which a run gains nothing more, and `max_exact_evaluations` the maximum number of
         exact evaluations in a row. `is_free_state` (s,) marks the initial states that have to be
         estimated.
+
+        Shapes: s states of a run.
+
+        Args:
+            models: Fitted models with noise and run evaluator.
+            competing_models: Models that explain the present data about equally well; a single one
+                if only its parameters are uncertain.
         """
         self.models, self.evaluator = models, models.evaluator
         self.information = [_compute_prior_covariance(models, model) for model in competing_models]
@@ -190,7 +197,7 @@ class RunRanker:
         and a competing model; with one model it is the information gain D of eq. (2).
 
         Args:
-            run: the candidate run.
+            run: run that could be recorded: its plan, scenario and initial state.
             slopes: its linearisation with each model of the ranker.
         """
         if not self.pairs:
@@ -249,6 +256,8 @@ class RunRanker:
     ) -> Array:
         """Simulate the run (L, T, C) with each parameter vector and initial state.
 
+        Shapes: T samples, C channels, P parameters, s states of a run.
+
         Args:
             run: the run.
             thetas: L parameter vectors (P,).
@@ -273,8 +282,10 @@ class RunRanker:
     ) -> _LinearisedRun | None:
         """Linearise a run at a parameter vector and an initial state.
 
+        Shapes: P parameters, s states of a run.
+
         Args:
-            run: the candidate run.
+            run: run that could be recorded: its plan, scenario and initial state.
             information: model with its free parameters and the steps of their differences.
             theta: (P,) parameters.
             states: (s,) initial state; None for that of the run.
@@ -383,6 +394,10 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Paramete
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
     its bounds: otherwise the step of a parameter that the data hardly determine would be too large
     for a derivative.
+
+    Args:
+        models: Fitted models with noise and run evaluator.
+        model: Model whose covariance is computed.
     """
     covariance = compute_covariance(models, model)
     bounds = np.array(
@@ -415,6 +430,8 @@ def _compute_remaining_difference(
     """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
     It is min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta (1), in whitened units.
+
+    Shapes: q fitted parameters.
 
     Args:
         gap: (n,) residual of the competing model.

@@ -125,8 +125,10 @@ class RigLimits:
     ) -> list[Mapping[str, Array]]:
         """Simulate runs with a model, and return the monitored channels of each, (T,) by name.
 
+        Shapes: T samples, s states of a run.
+
         Args:
-            model: the model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             scenarios: R runs.
             states: (R, s) their initial states.
         """

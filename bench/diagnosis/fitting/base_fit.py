@@ -96,7 +96,7 @@ def fit_base_model(
     """Fit base parameters and initial states.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise that weights the channels.
         initial_base: (b,) base parameters to start from, for example from a tuner; None for a
             multi-start over the bounds.
@@ -155,7 +155,7 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
     Args:
         evaluator: the runs of a robot; the correction is stored in it.
         noise: noise of each channel.
-        base: the fitted base model.
+        base: fit of the base model, with the parameters that were fixed or freed.
     """
     # Imported here, because only robots need it.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
@@ -171,6 +171,8 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
 
 def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
+
+    Shapes: P parameters.
 
     Args:
         evaluator: the runs, with the nominal parameters and their bounds.
@@ -213,7 +215,7 @@ def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share:
     """Return the lowest cost of the starts of a base fit, before any fit.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise that weights the channels.
         share: initial share of each run that counts.
 
@@ -237,7 +239,7 @@ def compute_start_costs(
     """Return the sum of squares of each start over the first samples of the runs.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise that weights the channels.
         starts: parameters and initial states.
         share: initial share of each run that counts.
@@ -267,7 +269,7 @@ def _is_sensitive(
     over its whole range.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         fit: fit of the base model, whose derivatives are used.
         index: index of the parameter in theta.
         noise: noise of each channel.
@@ -302,14 +304,16 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
         base: fit of the base model within these ranges.
     """
     places = []
-    for i in evaluator.base_indices.tolist():
-        if i in base.fixed_parameters:
+    for parameter_index in evaluator.base_indices.tolist():
+        if parameter_index in base.fixed_parameters:
             continue
-        low, high = evaluator.parameters[i].bounds
-        end = bound_of(float(base.fit.theta[i]), low, high)
-        lower, upper = widen_range(evaluator.parameters[i], get_physical_limits(evaluator, i))
+        low, high = evaluator.parameters[parameter_index].bounds
+        end = bound_of(float(base.fit.theta[parameter_index]), low, high)
+        lower, upper = widen_range(
+            evaluator.parameters[parameter_index], get_physical_limits(evaluator, parameter_index)
+        )
         if (end == "low" and lower < low) or (end == "high" and upper > high):
-            places.append(i)
+            places.append(parameter_index)
     return places
 
 
@@ -319,7 +323,7 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
     Args:
         evaluator: the runs for fitting; the ranges of its parameters are replaced.
         noise: noise of each channel.
-        base: the fitted base model.
+        base: fit of the base model, with the parameters that were fixed or freed.
 
     Returns:
         The base model; the same if no parameter is at a bound.
@@ -346,7 +350,7 @@ def compute_range_around(evaluator: RunEvaluator, place: int, value: float | Non
     It is widened at most `MAX_WIDENING_ROUNDS` times.
 
     Args:
-        evaluator: the runs for fitting.
+        evaluator: run evaluator of the runs to which models are fitted.
         place: index of the parameter.
         value: value that the range must contain; None for the widest range.
     """
@@ -381,7 +385,7 @@ def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
     Args:
-        evaluator: the runs for fitting.
+        evaluator: run evaluator of the runs to which models are fitted.
         place: index of the parameter.
     """
     parameter = evaluator.parameters[place]
@@ -446,14 +450,16 @@ def describe_unusual_values(
 ) -> list[str]:
     """Return a sentence for each fitted parameter that lies outside its declared range.
 
+    Shapes: P parameters.
+
     Args:
-        evaluator: the runs for fitting.
+        evaluator: run evaluator of the runs to which models are fitted.
         theta: (P,) the fitted parameters.
         wider: by parameter name, the declared range and the wider range that was used.
     """
     sentences = []
-    for i in evaluator.base_indices.tolist():
-        parameter, value = evaluator.parameters[i], float(theta[i])
+    for parameter_index in evaluator.base_indices.tolist():
+        parameter, value = evaluator.parameters[parameter_index], float(theta[parameter_index])
         if parameter.name not in wider:
             continue
         (low, high), (wide_low, wide_high) = wider[parameter.name]
@@ -483,7 +489,7 @@ def find_start_with_tuner(
 
     Args:
         name: name of the tuner.
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise of each channel.
         seed: seed of the tuner's random numbers.
 
@@ -518,8 +524,10 @@ def _evaluate_base(
     The loss is the root mean square of scaled residuals, as in a comparison; it is infinite if the
     simulation fails.
 
+    Shapes: T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise of each channel.
         observed: (T, C) observations of all runs, concatenated.
         base: (n, b) base parameters.

@@ -436,8 +436,8 @@ def count_identified_states(
         f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
 
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
         noise: noise of each channel.
     """
     observed_mask = np.isfinite(evaluator.observed)

@@ -114,6 +114,8 @@ class KnownJacobian(NamedTuple):
     def add_parameters(self, indices: Sequence[int], jacobian: Array) -> KnownJacobian:
         """Return the derivatives together with those by further parameters.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             indices: (k,) indices of the further parameters in theta.
             jacobian: (R, T, C, k) derivatives by them.
@@ -307,6 +309,11 @@ class FitState:
         """Return signed difference steps (q + s,) from parameters (P,).
 
         The step of a parameter at its upper bound points inward.
+
+        Shapes: P parameters, q fitted parameters, s states of a run.
+
+        Args:
+            theta: (P,) parameters at which derivatives are computed.
         """
         steps = self.steps.copy()
         parameter_steps = steps[: self.free_indices.size]
@@ -320,6 +327,8 @@ class FitState:
 
         For a step delta with scales D, J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 /
         (delta' D^-2 delta) (4).
+
+        Shapes: R runs, T samples, C channels, q fitted parameters.
 
         Args:
             new_point: the point that the step has reached.
@@ -405,6 +414,8 @@ class FitState:
 
     def find_blocked_parameters(self, residual: Array, jacobian: Array) -> Mask:
         """Return the mask (q,) of parameters at a bound that the data push against.
+
+        Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
         Args:
             residual: (R, T, C) whitened residual.

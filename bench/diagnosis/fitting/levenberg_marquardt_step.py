@@ -84,6 +84,8 @@ class _ArrowheadEquations:
         Parameters follow from the Schur complement (U - sum W_i V_i^-1 W_i') dx = a - sum W_i
         V_i^-1 b_i (4), the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx (5).
 
+        Shapes: R runs, q fitted parameters, s states of a run.
+
         Args:
             blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
 
@@ -124,6 +126,8 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
 
     The result is U - sum_i W_i V_i^-1 W_i' and a - sum_i W_i V_i^-1 b_i, both sides of (4).
 
+    Shapes: R runs, q fitted parameters, s states of a run.
+
     Args:
         shared: (q, q) U.
         cross: (R, q, s) all W_i.
@@ -142,6 +146,8 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
 
 def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
     """Fix known initial states in the normal equations.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
         inner: (R, s, s) all V_i.
@@ -169,6 +175,8 @@ def compute_gauss_newton_step(
 ) -> GaussNewtonStep:
     """Compute one damped Gauss-Newton step.
 
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
+
     Args:
         residual: (R, T, C) whitened residual, observed minus simulated.
         jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
@@ -180,16 +188,18 @@ def compute_gauss_newton_step(
         blocked_mask: (q,) parameters that do not move.
     """
     runs, size = len(residual), jacobian.shape[3]
-    j = jacobian.reshape(runs, -1, size)
-    r = residual.reshape(runs, -1)
+    run_jacobians = jacobian.reshape(runs, -1, size)
+    run_residuals = residual.reshape(runs, -1)
     equations = _apply_damping(
-        _assemble_normal_equations(j, r, q, drift, prior), damping, known_mask
+        _assemble_normal_equations(run_jacobians, run_residuals, q, drift, prior),
+        damping,
+        known_mask,
     )
     parameter_step, state_steps = equations.solve(blocked_mask)
     return GaussNewtonStep(
         parameter_step,
         state_steps,
-        _predict_decrease(j, r, drift, prior, parameter_step, state_steps),
+        _predict_decrease(run_jacobians, run_residuals, drift, prior, parameter_step, state_steps),
     )
 
 
@@ -204,6 +214,8 @@ def _assemble_normal_equations(
 
     They are U dx + sum_i W_i dz_i = a (2) and W_i' dx + V_i dz_i = b_i (3), for parameters x and
     the initial state z_i of each run.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
         j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
@@ -235,6 +247,8 @@ def _apply_damping(
     A small ridge is always added to U, so that it can be inverted if parameters have the same
     response.
 
+    Shapes: R runs, s states of a run.
+
     Args:
         equations: normal equations with the blocks U of the parameters and V of the initial states.
         damping: damping λ, without unit.
@@ -264,6 +278,8 @@ def _predict_decrease(
 
     It is sum |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 + sum |d_i|^2 - |d_i + dz_i / pi|^2 (6), with
     residuals r_i and normalised deviations d_i of the initial states from their prior.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
         j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
@@ -315,6 +331,8 @@ def build_displaced_inputs(
     The first entry is not displaced. Each further entry has one unknown displaced by its step; an
     initial state is displaced in all runs at once.
 
+    Shapes: R runs, P parameters, q fitted parameters, s states of a run.
+
     Args:
         start: point of the derivatives.
         free: (q,) indices of the fitted parameters.
@@ -338,6 +356,8 @@ def build_displaced_inputs(
 
 def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) -> Array:
     """Return steps (q + s,) that change the observations by `TARGET_RESPONSE_SIGMAS` of the noise.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
     Args:
         jacobian: (R, T, C, q + s) derivatives from earlier finite differences.

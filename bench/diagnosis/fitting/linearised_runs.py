@@ -26,8 +26,10 @@ def compute_effect_responses(
     The result has single precision, because it is by far the largest array of an explanation and
     only a derivative.
 
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         theta: (P,) parameters, without the added effects.
         states: (R, s) initial states.
         added: K effects with their coefficients.
@@ -70,6 +72,8 @@ def _compute_responses(
 
     The second result is the number of simulations that were needed.
 
+    Shapes: T samples, C channels, P parameters, s states of a run.
+
     Args:
         evaluator: run evaluator of all runs.
         run: index of the run.
@@ -92,8 +96,10 @@ def compute_state_jacobian(
     Initial states act similarly in all models near the data, and a fit with derivatives of another
     such model converges to the same result.
 
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         theta: (P,) parameters.
         states: (R, s) initial states.
         is_recomputed: whether to recompute the derivatives about this model and store them.
@@ -108,8 +114,10 @@ def compute_initial_state_derivatives(
 ) -> Array:
     """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
 
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         theta: (P,) parameters of the model.
         states: (R, s) initial states of the model.
     """
@@ -129,8 +137,10 @@ def _compute_initial_state_derivatives(
 ) -> Array:
     """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker.
 
+    Shapes: T samples, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         run: index of the run.
         theta: (P,) parameters.
         states: (s,) initial state about which the run is linearised.
@@ -144,6 +154,8 @@ def _get_linearisation(
     """Return the linearised dynamics along one run of a robot, about given parameters.
 
     The latest ones are cached, one per run on average, because most are used more than once.
+
+    Shapes: P parameters, s states of a run.
 
     Args:
         evaluator: run evaluator of all runs.
@@ -185,8 +197,10 @@ def correct_discretisation(
     be mistaken for one: for example dry friction that stops within a step and not at its end, or a
     servo that is nearly too fast for the step.
 
+    Shapes: R runs, P parameters.
+
     Args:
-        evaluator: the runs of a robot.
+        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
         noise: noise of each channel.
         theta: (P,) parameters of a model near the data.
         states: (R, s) initial states of the model.

@@ -107,8 +107,10 @@ def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivative
 
     In that case a fit of whole runs has no more local minima than a fit of their segments.
 
+    Shapes: R runs, T samples, C channels, s states of a run.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise of each channel.
         derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
             for known states.

@@ -281,6 +281,8 @@ class TrajectoryFitter:
     def _simulate_starts(self, fit_states: Sequence[FitState], sample_mask: Mask) -> None:
         """Simulate the start of each fit, and compute its derivatives unless they are known.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             fit_states: states of the fits; they are moved to their starts in place.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -339,6 +341,8 @@ class TrajectoryFitter:
         self, fit_states: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
     ) -> None:
         """Recompute the derivatives of fits whose present ones are not good enough.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             fit_states: states of the fits, updated in place.
@@ -414,6 +418,8 @@ class TrajectoryFitter:
         integrates over time only once. An initial state that is known in every run is not an
         unknown.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             trials: each fit with the point to simulate.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -455,6 +461,8 @@ class TrajectoryFitter:
 
         `_accept_or_reject_trial` updates these derivatives if the point is accepted.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             trials: each fit with the point to simulate.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -492,6 +500,8 @@ class TrajectoryFitter:
 
         They are those of the fit itself, if it has any, or those that all models share.
 
+        Shapes: R runs, C channels, s states of a run.
+
         Args:
             fit_state: state of the fit.
             start: parameters and initial states about which the runs are linearised.
@@ -512,6 +522,8 @@ class TrajectoryFitter:
         """Compute finite-difference derivatives (R, T, C, q + s).
 
         They are zero for known initial states, which therefore absorb nothing of the residual.
+
+        Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
         Args:
             simulated: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
@@ -550,6 +562,8 @@ class TrajectoryFitter:
     def _compute_residual(self, simulated: Array, sample_mask: Mask) -> Array:
         """Return observed minus simulated (R, T, C), zero where no sample counts.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             simulated: (R, T, C) simulated channels.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -561,6 +575,8 @@ class TrajectoryFitter:
         """Return initial states minus their guesses (R, s), in prior standard deviations.
 
         Their squares are a term of the cost, eq. (1) of `levenberg_marquardt_step`.
+
+        Shapes: R runs, s states of a run.
         """
         deviation: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
             self.evaluator
@@ -582,6 +598,8 @@ class TrajectoryFitter:
         It is the cost, eq. (1) of `levenberg_marquardt_step`, and infinite if the simulation was
         abandoned.
 
+        Shapes: R runs, T samples, C channels, s states of a run.
+
         Args:
             simulated: (R, T, C) simulated runs.
             states: (R, s) initial states.
@@ -602,6 +620,8 @@ class TrajectoryFitter:
 
         A fit without a useful step is marked as finished or waiting and yields nothing.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             fit_states: states of the fits.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -617,6 +637,8 @@ class TrajectoryFitter:
         """Return the next parameters and initial states to try.
 
         If no decrease is predicted, mark the fit as finished or waiting, and return None.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             fit_state: state of the fit.
@@ -690,7 +712,7 @@ def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) 
     """Advance one group of fits by one racing round; runs in this process or in a worker.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         terms: further fields of `TrajectoryFitter`.
         *call: arguments of `TrajectoryFitter.advance_round`.
     """
@@ -701,6 +723,11 @@ def compute_state_prior(evaluator: RunEvaluator) -> Array:
     """Return the standard deviations (s,) of the normal priors of the initial states, SI units.
 
     A state that samples show has such a wide prior that only the samples decide.
+
+    Shapes: s states of a run.
+
+    Args:
+        evaluator: Run evaluator of the recording.
     """
     if evaluator.state_prior is not None:
         return evaluator.state_prior

@@ -42,6 +42,8 @@ def leave_out_jumps(runs: SimulatedRuns, simulated: Array) -> SimulatedRuns:
     which neither a fit nor a linear model follows. Few segments with a larger residual than the
     others show it.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         runs: the segments of a robot on the ground.
         simulated: (R, T, C) simulation of a model that explains most segments for fitting.

@@ -480,8 +480,10 @@ class VerdictBuilder:
 def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]) -> float:
     """Compute the RMS error over the channels that count, in their unit.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         simulated: (R, T, C) simulated channels.
         channels: indices of the channels that count.
     """

@@ -34,7 +34,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
     build_regression_about,
 )
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.start_selection import add_effect_to_start
+from bench.diagnosis.search.start_value_selection import add_effect_to_start
 from sims.core.simulator import Array
 from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator

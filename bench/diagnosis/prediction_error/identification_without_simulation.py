@@ -43,7 +43,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
 )
 from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
 from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
-from bench.diagnosis.search.start_selection import add_effect_to_start
+from bench.diagnosis.search.start_value_selection import add_effect_to_start
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0

@@ -312,11 +312,6 @@ class _Intervals:
         state: number of the hypothesis, ``OFF`` or ``HELD``.
         costs: (2, T) costs in each run, of active drives and of the hypothesis.
         masks: (T,) samples of each run in which the hypothesis holds.
-
-    Args:
-        forces: forces in the runs.
-        joints: indices of the joints to which the hypothesis applies.
-        state: number of the hypothesis.
     """
 
     def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
@@ -325,6 +320,11 @@ class _Intervals:
         `residuals` of a joint are its force residuals under each hypothesis, run by run; the costs
         of all joints are added. If the intervals are too many, the hypothesis explains noise, and
         none is kept.
+
+        Args:
+            forces: forces in the runs.
+            joints: indices of the joints to which the hypothesis applies.
+            state: number of the hypothesis.
         """
         self.state = state
         self._forces, self._joints = forces, joints

@@ -87,7 +87,7 @@ from bench.diagnosis.prediction_error.single_effect_fits import (
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.score_test import CandidateScores
-from bench.diagnosis.search.start_selection import add_effect_to_start
+from bench.diagnosis.search.start_value_selection import add_effect_to_start
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
 

@@ -414,7 +414,7 @@ def get_candidate_status(report: DiagnosisReportData, effect: str) -> str:
 
     Args:
         report: Report data.
-        effect: Name of the effect.
+        effect: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     for cause in report.verdict.causes:
         if effect in (cause.effect, *cause.alternatives):
@@ -426,6 +426,9 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     """List all candidates as entries, the highest score first.
 
     Without places each candidate is an entry. Otherwise each effect and each cause is one entry.
+
+    Args:
+        report: Data of the report.
     """
     ordered_candidates = sorted(report.verdict.candidates, key=lambda c: c.score, reverse=True)
     if not has_placed_causes(report):

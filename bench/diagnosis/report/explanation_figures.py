@@ -178,7 +178,7 @@ def _format_candidate_name(report: DiagnosisReportData, candidate: Candidate) ->
 
     Args:
         report: content of the report, with the status of the candidate.
-        candidate: the candidate.
+        candidate: effect of the library with its score, p-value and held-out gain.
     """
     text = sanitise(shorten_effect_name(candidate.effect), 160)
     if get_candidate_status(report, candidate.effect) != NOT_NEEDED:
@@ -314,7 +314,7 @@ def _is_insignificant(report: DiagnosisReportData, candidate: Candidate) -> bool
 
     Args:
         report: content of the report, with the status of the candidate.
-        candidate: the candidate.
+        candidate: effect of the library with its score, p-value and held-out gain.
     """
     return (
         candidate.p_value > SIGNIFICANCE_LEVEL
@@ -575,7 +575,7 @@ def _draw_signal(
         signal_axis: axes of the signal.
         residual_axis: axes of the residual, below it.
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         c: index of the channel.
     """
     channel, split = report.channels[c], view.data_split
@@ -583,27 +583,33 @@ def _draw_signal(
     # Arrays are padded after the end of a shorter run.
     signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
     shown_samples = thin_signal(signals[0], MAX_SAMPLES)
-    t = times[shown_samples]
+    shown_times = times[shown_samples]
     measured, before, after = (signal[shown_samples] for signal in signals)
 
     size = 3.6 if shown_samples.size < 250 else 2.6  # points: smaller dots for many samples
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
     # Thousands of vector outlines would dominate the file size.
     marks["rasterized"] = shown_samples.size > MAX_OUTLINED_DOTS
-    signal_axis.plot(t, measured, "o", label="measured", zorder=4, **marks)
+    signal_axis.plot(shown_times, measured, "o", label="measured", zorder=4, **marks)
     base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
-    signal_axis.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
+    signal_axis.plot(shown_times, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
     noise, band = 2 * channel.sigma, "±2σ: 95 % of the noise"
     residual_axis.axhspan(-noise, noise, color=NOISE_BAND_GREY, linewidth=0, label=band, zorder=0)
     residual_axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
-    residual_axis.plot(t, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0})
+    residual_axis.plot(
+        shown_times, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0}
+    )
     if has_extended_model(report):
         # The wide curve is behind: where both agree, "before" is visible as dashes on it.
         signal_axis.plot(
-            t, after, label="simulated after", zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 3.2}
+            shown_times,
+            after,
+            label="simulated after",
+            zorder=2,
+            **{**EXTENDED_MODEL_LINE, "linewidth": 3.2},
         )
         residual_axis.plot(
-            t, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8}
+            shown_times, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8}
         )
 
     signal_axis.set_ylabel(shorten_label(channel.name, channel.unit, 14))

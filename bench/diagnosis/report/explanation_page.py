@@ -101,26 +101,28 @@ def build_candidate_table(report: DiagnosisReportData) -> Table:
     heads = {entry.best.effect for entry in rank_candidates(report)}
     has_causes = bool(report.verdict.causes)
     rows = []
-    for c in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
-        _, place = split_effect_name(c.effect)
+    for candidate in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
+        _, place = split_effect_name(candidate.effect)
         rows.append(
             {
                 # A place has its own column.
-                "candidate": sanitise(format_effect_name(split_effect_name(c.effect)[0]), 120),
-                "effect": sanitise(c.effect, 120),
-                "score": c.score,
-                "p_value": c.p_value,
-                "heldout_gain": c.heldout_gain,
+                "candidate": sanitise(
+                    format_effect_name(split_effect_name(candidate.effect)[0]), 120
+                ),
+                "effect": sanitise(candidate.effect, 120),
+                "score": candidate.score,
+                "p_value": candidate.p_value,
+                "heldout_gain": candidate.heldout_gain,
                 # Without a diagnosed cause, "not needed" would be wrong.
-                "standing": get_candidate_status(report, c.effect)
+                "standing": get_candidate_status(report, candidate.effect)
                 if has_causes
                 else "not convincing",
-                "set": sets.get(c.effect, ""),
-                "kind": get_place_kind(c.effect),
+                "set": sets.get(candidate.effect, ""),
+                "kind": get_place_kind(candidate.effect),
                 "place": "all" if place == ALL_PLACES else sanitise(place, 80),
-                "joint": find_joint(report, get_place_kind(c.effect), place),
-                "shown": BEST if c.effect in heads else ELSEWHERE,
-                "says": _get_effect_description(report, c.effect),
+                "joint": find_joint(report, get_place_kind(candidate.effect), place),
+                "shown": BEST if candidate.effect in heads else ELSEWHERE,
+                "says": _get_effect_description(report, candidate.effect),
             }
         )
     return Table.from_rows(rows).without(_list_empty_columns(report))
@@ -580,11 +582,11 @@ def compute_channel_errors(split: DataSplit) -> Array:
     """
     errors = np.full((split.observed.shape[2], 2), np.nan)
     for column, simulated in enumerate((split.before, split.after)):
-        for c in range(len(errors)):
-            residual = (split.observed - simulated)[:, :, c]
+        for channel_index in range(len(errors)):
+            residual = (split.observed - simulated)[:, :, channel_index]
             # The mean of an empty set would cause a warning.
             if np.isfinite(residual).any():
-                errors[c, column] = np.sqrt(np.nanmean(residual**2))
+                errors[channel_index, column] = np.sqrt(np.nanmean(residual**2))
     return errors
 
 

@@ -100,12 +100,14 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
     """
     joints: dict[str, dict[str, int]] = {}
     sensors = []
-    for c, channel in enumerate(report.channels):
+    for channel_index, channel in enumerate(report.channels):
         quantity, _, name = channel.name.partition(".")
         if quantity in QUANTITY_LABELS and name:
-            joints.setdefault(name, {})[quantity] = c
+            joints.setdefault(name, {})[quantity] = channel_index
         else:
-            sensors.append(JointRow(channel.name, c, {_get_first_quantity(report): c}))
+            sensors.append(
+                JointRow(channel.name, channel_index, {_get_first_quantity(report): channel_index})
+            )
     rows = []
     for name, channels in joints.items():
         # The position is shown if it was recorded, otherwise the velocity or the torque.
@@ -171,7 +173,7 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
 
     Args:
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
     """
     rows = list_joint_rows(report)
 
@@ -187,7 +189,7 @@ def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, mo
 
     Args:
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         c: index of the channel.
         model: ``before`` for the base model, ``after`` for the extended one.
     """
@@ -203,7 +205,7 @@ def _compute_scaled_residual(
 
     Args:
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         c: index of the channel.
         model: ``before`` for the base model, ``after`` for the extended one.
     """
@@ -223,7 +225,7 @@ def _draw_motion(
     Args:
         panel: axes to draw on.
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         row: the joint.
         is_named: whether the diagnosis names the joint; its name is then highlighted.
     """
@@ -235,10 +237,10 @@ def _draw_motion(
     ]
     shown_samples = thin_signal(signals[0], MAX_SAMPLES)
     measured, before, after = (signal[shown_samples] for signal in signals)
-    t = times[shown_samples]
+    shown_times = times[shown_samples]
     size = 4.0 if shown_samples.size < 250 else 3.4  # points: smaller dots for many samples
     panel.plot(
-        t,
+        shown_times,
         measured,
         "o",
         color="black",
@@ -249,10 +251,10 @@ def _draw_motion(
         rasterized=shown_samples.size > MAX_OUTLINED_DOTS,
     )
     base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
-    panel.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
+    panel.plot(shown_times, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
     if has_extended_model(report):
         # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
-        panel.plot(t, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
+        panel.plot(shown_times, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
     quantity = channel.name.partition(".")[0]
     symbol = quantity if quantity in QUANTITY_LABELS else ""
     panel.set_ylabel(shorten_label(symbol, channel.unit, 14), fontsize=8)
@@ -291,7 +293,7 @@ def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: i
     Args:
         panel: axes to draw on.
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         c: index of the channel.
     """
     times = view.data_split.times[view.row]
@@ -339,7 +341,7 @@ def _unify_scale(
     Args:
         panels: axes of the column.
         report: content of the report.
-        view: the run to show.
+        view: run to show: its part of the data, its index there, and the selected channels.
         rows: joints and sensors of the figure.
         quantity: the quantity, such as ``q``.
     """
@@ -399,7 +401,7 @@ def _add_title_and_legend(
     """Add title, legend and margins to the figure of joints.
 
     Args:
-        figure: the figure.
+        figure: figure of Matplotlib.
         axes: array of its axes: motion, then residuals of each quantity.
         report: content of the report.
         view: the run that is shown.

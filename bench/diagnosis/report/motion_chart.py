@@ -152,7 +152,7 @@ def _format_rows(
 
     Args:
         report: content of the report.
-        run: the run.
+        run: run of the page: its label, and its place in the data.
         c: index of the channel.
         max_rows: maximum number of samples.
     """
@@ -298,7 +298,7 @@ def _make_panels(
 
     Args:
         report: content of the report.
-        run: the run.
+        run: run of the page: its label, and its place in the data.
         c: number of the channel.
         facets: values of the switches that show these panels.
         is_wide: place the panels side by side.

@@ -536,6 +536,9 @@ def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     samples whose mean square has the same variance as that of noise with the correlation phi^k over
     k samples. An estimated noise has itself a relative error of 1.2 / sqrt(n); d is the error of
     its square, twice as much.
+
+    Args:
+        report: Data of the report.
     """
     sizes = []
     for c, channel in enumerate(report.channels):
@@ -696,6 +699,9 @@ def has_absorbed_gap(p: ParameterChange) -> bool:
 
     The change must exceed the combined 95 % intervals, and be at least `MIN_REPORTED_CHANGE` of the
     value.
+
+    Args:
+        p: Parameter with value and interval before and after the causes are added.
     """
     change = abs(p.after[0] - p.before[0])
     # Without intervals, a minimum relative change is required instead.

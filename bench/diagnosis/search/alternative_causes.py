@@ -18,9 +18,9 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.search.coefficient_start_values import generate_frequency_neighbours
 from bench.diagnosis.search.effect_search import FAR_EXCESS, EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
-from bench.diagnosis.search.initial_values import generate_frequency_neighbours
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.model_moves import MAX_RICHER_LAW_EXCESS_RATIO
 from bench.diagnosis.search.score_test import estimate_tail_p_value
@@ -127,7 +127,7 @@ def _make_swapped_start(
 
     Args:
         search: the search, with all fitted models.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
         other_model: competing model.
     """
     (added_effect,), (removed_effect,) = (
@@ -184,7 +184,7 @@ def _is_competitive(search: EffectSearch, other_model: FittedModel, model: Fitte
     Args:
         search: the search, with all fitted models.
         other_model: competing model.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
     """
     if (
         abs(model.penalised_log_likelihood - other_model.penalised_log_likelihood)
@@ -201,7 +201,7 @@ def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel
 
     Args:
         search: the search, with all fitted models.
-        model: the larger model.
+        model: model with more effects.
     """
     names = set(model.effects)
     size = len(names) - 1
@@ -218,8 +218,8 @@ def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseMode
     Return None if the residual has structure, because it is then not noise.
 
     Args:
-        search: the search.
-        model: the fitted model.
+        search: search for causes, with its run evaluator, noise and fitted models.
+        model: fitted model: its effects, parameters, initial states and likelihood.
     """
     if assess_lack_of_fit(search, model).has_structure:
         return None
@@ -321,7 +321,7 @@ class AlternativeFinder:
 
         Args:
             reduced_model: the model without the effect.
-            effect: name of the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             gain: gain of the model with the effect over the model without it, in twice the
                 log-likelihood.
         """
@@ -375,6 +375,11 @@ class AlternativeFinder:
         Each further coefficient must then reduce the excess residual (RMS residual in units of the
         noise, minus one) as much as a richer law must. `distance` is how far the other model is
         behind, in twice the log-likelihood.
+
+        Args:
+            effect: Effect of the model.
+            other_effect: Effect that would replace it.
+            distance: Twice the difference of the log-likelihoods.
         """
         if not self.structure:
             return False
@@ -392,6 +397,10 @@ class AlternativeFinder:
 
         These are families of which one member explains as much, and richer laws of which the
         simpler one does.
+
+        Args:
+            competing_effects: Distance and name of each effect that explains the data about as
+                well.
         """
         effects = self.search.evaluator.available_effects
         names = {name for _, name in competing_effects}
@@ -424,7 +433,7 @@ class AlternativeFinder:
         a number of the simulation.
 
         Args:
-            model: the model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             other_model: the model that it is compared with.
             is_in_one_loop: whether the differing effects act in one kinematic loop.
         """

@@ -30,7 +30,7 @@ from bench.diagnosis.evaluation.run_data import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
-from bench.diagnosis.search.initial_values import (
+from bench.diagnosis.search.coefficient_start_values import (
     EVENT_TIME_COUNT,
     compute_reachable_levels,
     generate_end_stops,
@@ -99,8 +99,8 @@ def compute_directions(
     """Compute the sensitivity directions of effects about a fitted model.
 
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
         names: names of effects that the model does not contain.
     """
     probes = [
@@ -135,9 +135,9 @@ def iterate_first_probes(
     stops, get several full sizes instead.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         model_effects: names of the effects that the model contains.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     parameters = list_coefficients(evaluator, name)
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
@@ -215,7 +215,7 @@ def _make_end_stop_probes(
     Each is one candidate that is valid only at its size.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         name: name of the end-stop effect.
         first_group: number of the first grid point.
     """
@@ -243,8 +243,8 @@ def _make_limit_probes(
     """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         first_group: number of the first grid point.
         shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
     """
@@ -287,7 +287,7 @@ def _make_shape_grid(
     """Return the values to try of a shape parameter.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         parameter: the shape parameter.
         specified_values: values that the coefficient specifies itself, if any.
         travel: largest range of the position in one run.
@@ -334,6 +334,8 @@ def _find_observable_probes(
     evaluator: RunEvaluator, probes: Sequence[CandidateDirection], values: Array
 ) -> Mask:
     """Return the mask (K,) of the probes that change the runs by more than rounding errors.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: run evaluator with the recorded runs.
@@ -413,15 +415,15 @@ def _iterate_grid_points(
         # All modifiers at zero give the effect that was already tried.
         if not any(point):
             continue
-        c = first.coefficients.copy()
+        grid_coefficients = first.coefficients.copy()
         for modifier, share in zip(modifiers, point, strict=True):
             _, high = parameters[modifier.coefficient_index].bounds
-            c[modifier.coefficient_index] = share * high
+            grid_coefficients[modifier.coefficient_index] = share * high
         yield CandidateDirection(
             effect=first.effect,
             grid_point=group,
             coefficient_index=first.coefficient_index,
-            coefficients=c,
+            coefficients=grid_coefficients,
             can_be_negative=first.can_be_negative,
         )
 
@@ -435,8 +437,10 @@ def _compute_directions(
 
     A direction is d = (y(c) - y(0)) / c (1), with the simulated runs y(c) at a small coefficient c.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         fit: fit of the model without the candidates.
         probes: the K candidates.
     """
@@ -458,9 +462,11 @@ def compute_responses(
 
     Linearised responses are used if the simulator provides them, because they cost less.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
         added: K effects with their coefficients.
 
     Returns:
@@ -481,9 +487,11 @@ def simulate_with_effect(
 ) -> Array:
     """Simulate the runs of a fitted model with one additional effect each.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
         added: K effects with their coefficients.
 
     Returns:

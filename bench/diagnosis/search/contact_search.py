@@ -40,7 +40,7 @@ from bench.diagnosis.search.effect_search import MAX_P_VALUE_FURTHER_EFFECT, Eff
 from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES
 from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomSearch
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
-from bench.diagnosis.search.start_selection import select_refit_starts
+from bench.diagnosis.search.start_value_selection import select_refit_starts
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 
@@ -180,6 +180,9 @@ def _list_single_starts(search: EffectSearch) -> list[FitStart]:
     Effects at contacts are scanned over their range. Of the others, those with the best scores are
     fitted, and the members of a fitted family are tried alone. An effect with more coefficients has
     to explain more.
+
+    Args:
+        search: Search with its models.
     """
     base, evaluator = search.base_model, search.evaluator
     states = base.fit.initial_states
@@ -203,6 +206,10 @@ def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[
     """Return starts of the members of a fitted family, with their sums of squares.
 
     Members have one coefficient each.
+
+    Args:
+        search: Search with its run evaluator.
+        model: Fit of a family alone: one effect with a coefficient for each place.
     """
     (name,) = model.effects
     evaluator, fit = search.evaluator, model.fit
@@ -284,6 +291,11 @@ def _use_first_states_of(
     """Use the initial states of a model for all runs, and fit it and the base model about them.
 
     Those of held-out runs are estimated with its final coefficients.
+
+    Args:
+        search: Search whose base model is fitted again.
+        evaluators: Run evaluators of the fitted and the held-out runs.
+        model: Model whose initial states are used.
     """
     base, evaluator = search.base_model, search.evaluator
     deviations = evaluator.state_prior
@@ -300,6 +312,8 @@ def _use_first_states_of(
 
 def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array) -> None:
     """Search initial states at random if the smoothed ones do not explain the runs.
+
+    Shapes: P parameters.
 
     Args:
         search: search with the noise.
@@ -322,8 +336,10 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
 def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, states: Array) -> Array:
     """Return sums of squares (N,) of the residual, in units of the noise.
 
+    Shapes: R runs, C channels, P parameters, s states of a run.
+
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         sigma: (C,) standard deviation of the noise of each channel.
         samples: (N, P) parameters.
         states: (R, s) initial states.
@@ -403,6 +419,10 @@ def _refine_coefficient(search: EffectSearch, value: _ScannedValue) -> _ScannedV
 def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_ScannedValue]:
     """Scan each effect at a contact over its range, from the initial states of the base model.
 
+    Args:
+        search: Search with its run evaluator.
+        base: Base model.
+
     Returns:
         The best value of each effect that explains a part of the discrepancy, the best effect
         first.
@@ -450,6 +470,8 @@ def _list_nearby_values(
 
 def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Array) -> _ScannedValue:
     """Return the value that has the lowest sum of squares.
+
+    Shapes: R runs, s states of a run.
 
     Args:
         search: search with the base model.
@@ -565,7 +587,7 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
 
     Args:
         search: the search, with scores about the model.
-        model: the model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
     """
     (name,) = model.effects
     model = search.refine_jacobian(model)
@@ -636,6 +658,12 @@ def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
 
     A difference quotient over a step of the motion is arbitrarily large, so the smallest of several
     quotients is used.
+
+    Shapes: R runs, T samples, C channels.
+
+    Args:
+        search: Search with its run evaluator.
+        model: Model with one effect.
     """
     (name,) = model.effects
     evaluator, fit = search.evaluator, model.fit

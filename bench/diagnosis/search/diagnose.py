@@ -96,11 +96,6 @@ def answer(inquiry: Inquiry) -> DiagnosisResult:
 class Inquiry:
     """The steps of a diagnosis, and their results so far.
 
-    Args:
-        search: the search, which contains the fitted base model.
-        held_out: predicts held-out runs, or each run by cross-validation; None if neither is
-            possible.
-
     Attributes:
         alternative_finder: collects the evidence for each cause.
     """
@@ -113,6 +108,11 @@ class Inquiry:
         `_trial` is the validation of the models on held-out runs, and `_model` the best model so
         far; both are None until their step is reached. They are kept so that a search that is
         stopped early can report what it found.
+
+        Args:
+            search: the search, which contains the fitted base model.
+            held_out: predicts held-out runs, or each run by cross-validation; None if neither is
+                possible.
         """
         self._search = search
         self._held_out = held_out
@@ -274,7 +274,7 @@ class Inquiry:
 
         Args:
             verdict: name of the verdict.
-            base: the base model.
+            base: base model: the simulator without additional effects, fitted to the runs.
             model: the extended model; the base model if no cause was found.
             causes: evidence for the causes, strongest first.
             lack_of_fit: lack-of-fit result of the extended model.
@@ -322,8 +322,8 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     """Return the sensitive base parameters that the data do not determine, the worst first.
 
     Args:
-        search: the search.
-        base: the base model.
+        search: search for causes, with its run evaluator, noise and fitted models.
+        base: base model: the simulator without additional effects, fitted to the runs.
     """
     variances = np.diagonal(compute_covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
@@ -374,7 +374,7 @@ def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackO
 
     Args:
         search: the search, with all fitted models.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
         lack_of_fit: result of the lack-of-fit test.
     """
     p_value = search.best_p_values.get(frozenset(model.effects))
@@ -394,9 +394,9 @@ def compute_gap_closed(
     - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy.
 
     Args:
-        search: the search.
+        search: search for causes, with its run evaluator, noise and fitted models.
         model: the extended model.
-        lack_of_fit: its lack-of-fit result.
+        lack_of_fit: lack-of-fit test of the model: p-value and description.
     """
     residual_sigma = model.likelihood.sigma
     # A residual without structure is noise, even if it exceeds an estimated noise floor.
@@ -416,7 +416,7 @@ def _compute_normalised_rms(search: EffectSearch, model: FittedModel, noise: Arr
 
     Args:
         search: the search with the recorded runs.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
         noise: (C,) standard deviation of each channel.
     """
     normalised_residual = search.compute_residual(model.fit) / noise

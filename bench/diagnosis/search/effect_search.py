@@ -377,7 +377,7 @@ def select_conservative_model(
     Args:
         search: the search, with all fitted models.
         best: the best smaller model.
-        larger: the larger model.
+        larger: model with more effects.
     """
     # A model that contains the effects of the best one replaces none of them.
     is_extension = set(best.effects) <= set(larger.effects)

@@ -83,7 +83,7 @@ class HeldOutValidation:
 
         Args:
             search: the search, with every fitted model.
-            model: the model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
         """
         while model.effects and model.effects in self.held_out_fits:
             submodels = self._list_smaller_models(search, model)
@@ -145,7 +145,7 @@ class HeldOutValidation:
 
         Args:
             search: the search, which computes the excess on the fitted runs.
-            model: the smaller model.
+            model: model with fewer effects.
             larger: a model with all its effects and further ones.
         """
         required_ratio = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (
@@ -165,7 +165,7 @@ class HeldOutValidation:
 
         Args:
             search: the search, with all fitted models.
-            model: the fitted model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
         """
         names = set(model.effects)
         size = len(names) - 1
@@ -225,7 +225,7 @@ class HeldOutValidation:
 
         Args:
             model: the model, which has been evaluated.
-            lack_of_fit: its lack-of-fit result.
+            lack_of_fit: lack-of-fit test of the model: p-value and description.
         """
         residual_sigma = np.nan_to_num(model.likelihood.sigma)
         # The residual of fitted runs is noise if it has no structure; otherwise only the noise

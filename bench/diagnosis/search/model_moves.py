@@ -50,8 +50,8 @@ class ModelMoves(ScoredModelSet):
         """Return the model with one of its effects removed.
 
         Args:
-            model: the model.
-            name: name of the effect.
+            model: fitted model: its effects, parameters, initial states and likelihood.
+            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
         remaining_effects = frozenset(n for n in model.effects if n != name)
         if remaining_effects not in self.models:
@@ -123,7 +123,7 @@ class ModelMoves(ScoredModelSet):
         all together, and the most active member of a family (one effect at all joints or bodies).
 
         Args:
-            model: the fitted model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the effect to replace.
         """
         contained_laws = self._split_into_contained_laws(model, name)
@@ -142,8 +142,8 @@ class ModelMoves(ScoredModelSet):
         effect, in the order in which it names the laws.
 
         Args:
-            model: the fitted model.
-            name: name of the effect.
+            model: fitted model: its effects, parameters, initial states and likelihood.
+            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
         effects = self.evaluator.available_effects
         coefficient_slices = self.evaluator.coefficient_slices
@@ -162,7 +162,7 @@ class ModelMoves(ScoredModelSet):
         effects, or if the members share their coefficients.
 
         Args:
-            model: the fitted model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the family.
         """
         members = getattr(self.evaluator.available_effects[name], "members", ())

@@ -99,6 +99,8 @@ class RandomSearch:
         It minimises J(c) = sum over runs r of min_x J_r(c, x) (1), with the coefficients c and the
         initial state x of each run.
 
+        Shapes: P parameters.
+
         Args:
             theta: (P,) parameters.
             indices: indices of the K coefficients that are searched.
@@ -141,6 +143,12 @@ class RandomSearch:
 
     def _sample_states(self, run: int, samples: Array) -> tuple[Array, Array]:
         """Simulate one run from random initial states with each sample of the parameters (N, P).
+
+        Shapes: P parameters, s states of a run.
+
+        Args:
+            run: Index of the run.
+            samples: (N, P) parameter vectors.
 
         Returns:
             Deviates (N, M, s) of the initial states, and costs (N, M): sums of squares of the

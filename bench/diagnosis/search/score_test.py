@@ -314,14 +314,7 @@ class CandidateScores:
 
 
 class ScoreTest:
-    """Score test of candidate effects against any residuals of one model.
-
-    Args:
-        fit: the fitted model that the directions refer to.
-        directions: directions of the candidates.
-        observed_mask: (R, T, C) mask of available samples.
-        noise: its sigma weights the channels; its correlation is not used.
-    """
+    """Score test of candidate effects against any residuals of one model."""
 
     def __init__(
         self, fit: TrajectoryFit, directions: DirectionSet, observed_mask: Mask, noise: NoiseModel
@@ -331,6 +324,14 @@ class ScoreTest:
         A group has the directions of one effect that act together. `_count` is n of eq. (3), the
         number of samples. `_determinants` has twice log det W for each correlation phi of the grid,
         which is log det W'W of eq. (3).
+
+        Shapes: R runs, T samples, C channels.
+
+        Args:
+            fit: the fitted model that the directions refer to.
+            directions: directions of the candidates.
+            observed_mask: (R, T, C) mask of available samples.
+            noise: its sigma weights the channels; its correlation is not used.
         """
         self._groups = group_directions(directions)
         self._batches = batch_groups(self._groups)
@@ -353,6 +354,8 @@ class ScoreTest:
 
     def compute_scores(self, residual: Array, surrogate: Array | None = None) -> CandidateScores:
         """Score a residual.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             residual: (R, T, C) residual of the model, zero where no sample exists.
@@ -384,6 +387,8 @@ def compute_calibrated_scores(
     from every threshold need not be more accurate (J. Besag, P. Clifford, Sequential Monte Carlo
     p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         test: score test about the model.
         residual: (R, T, C) residual of the model.
@@ -402,11 +407,6 @@ class _BestScores:
 
     For each correlation, the caller calls `begin_correlation`, then `add_batch` for all groups, and
     then `end_correlation`.
-
-    Args:
-        members: groups of all effects.
-        residuals: number S of residuals: the observed one first, then the surrogates.
-        count: number n of samples.
     """
 
     def __init__(self, members: Sequence[DirectionGroup], residuals: int, count: int) -> None:
@@ -417,6 +417,11 @@ class _BestScores:
         `_best_without_effects` (S,) that without any direction, and `_white_noise_scores` (E,) the
         score without autocorrelation. `_explained_squares` (E, S) has the explained sums of squares
         at the present correlation `_phi`, and `_total_squares` (S,) the sums of squares before.
+
+        Args:
+            members: groups of all effects.
+            residuals: number S of residuals: the observed one first, then the surrogates.
+            count: number n of samples.
         """
         self._count = count
         self._groups = members

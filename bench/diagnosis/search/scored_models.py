@@ -24,7 +24,7 @@ from bench.diagnosis.search.score_test import (
     compute_calibrated_scores,
     estimate_tail_p_value,
 )
-from bench.diagnosis.search.start_selection import select_refit_starts
+from bench.diagnosis.search.start_value_selection import select_refit_starts
 from bench.diagnosis.search.verdict_rules import MAX_AUTOCORRELATED_NOISE_RATIO
 from sims.core.simulator import Array
 
@@ -134,8 +134,10 @@ class ScoredModelSet(ModelSet):
     ) -> CandidateScores:
         """Score every effect that the model lacks.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
-            model: the model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             noise_residual: (R, T, C) residual whose spectrum the surrogates have; None for that of
                 the model.
         """
@@ -391,8 +393,8 @@ class ScoredModelSet(ModelSet):
         spectrum of the larger model's residual, which is closer to pure noise.
 
         Args:
-            model: the smaller model.
-            larger: the larger model.
+            model: model with fewer effects.
+            larger: model with more effects.
         """
         gain = larger.likelihood.value - model.likelihood.value
         model = self.models[frozenset(model.effects)]
@@ -413,7 +415,7 @@ class ScoredModelSet(ModelSet):
 
         Args:
             scores: scores about the smaller model.
-            larger: the larger model.
+            larger: model with more effects.
             gain: gain in twice the log-likelihood.
         """
         null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
@@ -427,7 +429,7 @@ class ScoredModelSet(ModelSet):
         """Return whether neither scores nor residual suggest that the model lacks something.
 
         Args:
-            model: the model.
+            model: fitted model: its effects, parameters, initial states and likelihood.
             p_value_threshold: p-value threshold of the scores.
         """
         # The residual is tested first, because scores need thousands of simulations.
@@ -472,9 +474,11 @@ def _scan_model(
 ) -> ModelScan:
     """Score all effects that one model lacks; runs in this process or in a worker.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
         missing_effects: names of the effects that it lacks.
         weights: noise that weights the channels.
         residual: (R, T, C) residual of the model.
@@ -499,6 +503,8 @@ def _score_residual(
 
     The surrogates are random noise with the spectrum of a residual; they show which scores such
     noise reaches without any effect.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         test: score test about the model.

@@ -46,7 +46,7 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
     """Return a `RunEvaluator` with thinned runs and the same parameters.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
 
     Returns:
         The thinned runs, or None if there are few samples, if the sample interval is already as

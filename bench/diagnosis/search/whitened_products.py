@@ -100,6 +100,11 @@ def count_missing_neighbours(observed_mask: Mask) -> Array:
     """Count the missing neighbours in time of each available sample: n_t of eq. (1), (R, T, C).
 
     The first and the last sample of a run lack one neighbour each.
+
+    Shapes: R runs, T samples, C channels.
+
+    Args:
+        observed_mask: (R, T, C) whether a sample exists.
     """
     missing_counts = np.full(observed_mask.shape, 2.0)
     missing_counts[:, 1:] -= observed_mask[:, :-1]
@@ -123,7 +128,7 @@ def add_cross_products(
         parts: sums to add to, in place.
         first: columns of the first set.
         second: columns of the second set.
-        segment: the section of the run.
+        segment: section of a run, with its samples that lack neighbours.
     """
     parts.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
     # Summed over a run, it does not matter to which of the two columns the neighbours belong.
@@ -139,7 +144,7 @@ def add_self_products(parts: LaggedSums, columns: SegmentColumns, segment: RunSe
     Args:
         parts: sums to add to, in place.
         columns: the columns.
-        segment: the section of the run.
+        segment: section of a run, with its samples that lack neighbours.
     """
     parts.same_samples[...] += np.einsum("kn,kn->k", columns.samples, columns.samples)
     parts.neighbours[...] += np.einsum("kn,kn->k", columns.neighbour_sums, columns.samples)
@@ -187,13 +192,6 @@ class WhiteningDesign:
 
     Attributes:
         blocks: as given.
-
-    Args:
-        fit: the fitted model.
-        directions: (R, T, C, K) change of the runs by each direction.
-        observed_mask: (R, T, C) mask of available samples.
-        sigma: (C,) weights of the channels.
-        blocks: arrays (n, k) of column indices; the directions in a row act together.
     """
 
     def __init__(
@@ -213,6 +211,15 @@ class WhiteningDesign:
         `_block_products` the products of directions that act together. `_missing_neighbours` (R, T,
         C) counts the missing neighbours of each sample, and `_reduced_designs` caches the projected
         design of each phi.
+
+        Shapes: R runs, T samples, C channels.
+
+        Args:
+            fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+            directions: (R, T, C, K) change of the runs by each direction.
+            observed_mask: (R, T, C) mask of available samples.
+            sigma: (C,) weights of the channels.
+            blocks: arrays (n, k) of column indices; the directions in a row act together.
         """
         self.blocks = list(blocks)
         self._parameter_count = fit.free_indices.size
@@ -252,6 +259,8 @@ class WhiteningDesign:
     ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             values: (k, R, T, C) columns: derivatives, directions or residuals.
             segment: the section.
@@ -279,6 +288,9 @@ class WhiteningDesign:
 
         The products are those of the Jacobian with itself and with the directions, the squares of
         the directions, and the products of directions that act together.
+
+        Args:
+            segment: Section of a run, with its samples that lack neighbours.
         """
         jacobian_columns = self._weight_columns(self._jacobian, segment)
         direction_columns = self._weight_columns(self._directions, segment)
@@ -307,6 +319,8 @@ class WhiteningDesign:
 
     def compute_products(self, *residuals: Array) -> tuple[LaggedSums, LaggedSums, LaggedSums]:
         """Compute products of residuals with themselves, with the Jacobian, and with directions.
+
+        Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
         Args:
             *residuals: arrays (S_i, R, T, C) of residuals, which are concatenated to S residuals.
@@ -339,6 +353,8 @@ class WhiteningDesign:
 
     def project_out(self, residuals: Array) -> Array:
         """Return the residuals of a least-squares fit of parameters and initial states.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             residuals: (S, R, T, C) residuals before the fit.
@@ -470,6 +486,8 @@ def _flatten(values: Array) -> Array:
 def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
     """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
 
+    Shapes: R runs, q fitted parameters, s states of a run.
+
     Args:
         reduced_design: the whitened design.
         shared: (R, q + s, S) products of the Jacobian with residuals.
@@ -485,6 +503,8 @@ def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[A
 
 def _project_directions(roots: Array, products: Array) -> Array:
     """Multiply the products J'a of each run by the root L', as in eq. (2).
+
+    Shapes: R runs, s states of a run.
 
     Args:
         roots: (R, s, s) L of each run.
@@ -503,6 +523,9 @@ def _compute_matrix_root(normal: Array) -> Array:
     Eigenvectors with very small eigenvalues are omitted.
 
     L is the root of a pseudoinverse, L L' = (J'J)^-1.
+
+    Args:
+        normal: Matrices J'J of the normal equations.
     """
     if not normal.shape[-1]:
         return normal

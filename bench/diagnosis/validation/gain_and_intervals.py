@@ -131,6 +131,8 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     The first axis is the lower and the upper side. Row j of the first n parameters and states has
     number j moved by its step.
 
+    Shapes: R runs, P parameters.
+
     Args:
         fit: the fit, with q free parameters.
         steps: (n,) steps of the q parameters, then of the s initial states.
@@ -179,9 +181,11 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     derivatives A_r of run r by parameters and B_r by its initial state, whose prior has the
     standard deviation sigma_0.
 
+    Shapes: q fitted parameters.
+
     Args:
         models: the models, with the runs to which they are fitted.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
     """
     fisher_blocks = compute_fisher_blocks(models, model)
     parameter_curvature = fisher_blocks.parameters.sum(axis=0)
@@ -196,6 +200,8 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     """Invert the curvature after elimination of the initial states.
 
     Directions that the data do not identify get a huge variance.
+
+    Shapes: q fitted parameters.
 
     Args:
         parameter_curvature: (q, q) curvature by the parameters alone, the first sum of eq. (2); it
@@ -256,6 +262,8 @@ def compute_fisher_blocks_from_jacobian(
     evaluator: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
 ) -> FisherBlocks:
     """Compute the curvature blocks from a Jacobian.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -353,6 +361,8 @@ def compute_held_out_gain(
 
     For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: Run evaluator of the held-out runs.
         before: (R, T, C) simulated by the base model.
@@ -392,6 +402,8 @@ def _sum_squared_errors(
 
     Each row (n, 3) has the sum of squares of the base model, that of the extended model, and the
     number of samples.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         evaluator: the predicted runs.

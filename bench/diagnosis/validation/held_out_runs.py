@@ -135,6 +135,8 @@ class HeldOutRuns:
         Least squares may converge to a different minimum for similar models, and chance would then
         decide between them. Models far from the nearest one are therefore fitted again from its
         initial states, and the better fit counts.
+
+        Shapes: P parameters.
         """
         guess = self.evaluator.initial_state_guesses
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
@@ -279,6 +281,8 @@ def compute_penalised_likelihood(observed: Array, simulated: Array, free: float)
     It is M = 2 log L - f log n (1), with the likelihood L of n samples and f effective initial
     states.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         observed: (R, T, C) observations; NaN where missing.
         simulated: (R, T, C) predictions.
@@ -374,10 +378,12 @@ class CrossValidation:
             )
             thetas = self._refit_fold(fold, fits)
             predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
-            for i, prediction in enumerate(predicted):
-                simulated[i, fold.rows, : prediction.simulated.shape[1]] = prediction.simulated
-                initial_states[i, fold.rows] = prediction.states
-                free_state_counts[i] += prediction.freedom
+            for model_index, prediction in enumerate(predicted):
+                simulated[model_index, fold.rows, : prediction.simulated.shape[1]] = (
+                    prediction.simulated
+                )
+                initial_states[model_index, fold.rows] = prediction.states
+                free_state_counts[model_index] += prediction.freedom
         return [
             self._predict_all_runs(*result)
             for result in zip(simulated, initial_states, free_state_counts.tolist(), strict=True)
@@ -389,6 +395,8 @@ class CrossValidation:
         """Return a model's prediction of all runs with its merit, the penalised log-likelihood.
 
         A failed simulation has the merit -infinity, so that any other model is preferred.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             simulated: (R, T, C) prediction of each run by the model refitted without it.
@@ -444,6 +452,8 @@ class CrossValidation:
     def _refit_fold(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
         """Refit each model to the runs of a fold that are not left out.
 
+        Shapes: P parameters.
+
         Args:
             fold: Fold whose left-out runs will be predicted.
             fits: Models fitted to all runs, from which the refits start.
@@ -478,8 +488,10 @@ class CrossValidation:
         `MIN_SUPPORTED_CHANGE`, in units of the noise. Its coefficients are then arbitrary and would
         spoil the prediction.
 
+        Shapes: P parameters.
+
         Args:
-            evaluator: the fitted runs.
+            evaluator: run evaluator of the runs to which models are fitted.
             fits: fits of all models to these runs.
         """
         thetas = [fit.theta.copy() for fit in fits]

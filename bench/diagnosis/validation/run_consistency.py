@@ -119,6 +119,9 @@ def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariat
 
     They are the order of the runs, the root mean square of each command, and the mean of each
     recorded signal that the simulator does not use, such as a temperature.
+
+    Args:
+        evaluator: Run evaluator of the recording.
     """
     yield RunCovariate(
         "time", "the order of runs", np.arange(len(evaluator.runs), dtype=np.float64)
@@ -141,7 +144,7 @@ def _compute_motion_covariates(
     and the mean position.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         model: model that simulates them.
         number: name of the parameter, ``NAME@JOINT`` for that of a joint.
     """
@@ -340,8 +343,8 @@ def _find_trend_covariate(
     None if no trend is significant.
 
     Args:
-        evaluator: the runs.
-        model: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        model: fitted model: its effects, parameters, initial states and likelihood.
         grouping: the groups of runs, such as logs.
         consistency: estimates of the parameter from each group.
     """
@@ -455,9 +458,11 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     diag sigma_0^-2, H_r = A_r'A_r - A_r'B_r S_r^-1 B_r'A_r and g_r = A_r'e_r - A_r'B_r S_r^-1
     (B_r'e_r + prior) (1).
 
+    Shapes: R runs.
+
     Args:
         models: the models, with the runs.
-        model: the fitted model.
+        model: fitted model: its effects, parameters, initial states and likelihood.
     """
     evaluator, fit = models.evaluator, model.fit
     q = fit.free_indices.size
@@ -498,6 +503,8 @@ def _test_parameters(
 
     The step of group G is d_G = H_G^-1 g_G with covariance H_G^-1, where H_G and g_G are sums over
     its runs (2).
+
+    Shapes: R runs, q fitted parameters.
 
     Args:
         evaluator: Run evaluator of the runs.
@@ -562,6 +569,9 @@ def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[f
 
     Q = sum w (x - mean)^2 with w = 1 / var (3), and tau^2 = (Q - (n - 1)) / (sum w - sum w^2 / sum
     w) for n groups (4).
+
+    Args:
+        group_estimates: Estimate and standard error of each group.
     """
     values = np.array([part.value for part in group_estimates])
     weights = np.array([part.error for part in group_estimates]) ** -2.0
@@ -577,6 +587,13 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     """Fit a line to the group estimates over covariate values, weighted by 1 / error².
 
     Return None for fewer than three groups, or if the covariate is the same in all.
+
+    The error of the slope is multiplied by the square root of the reduced chi-squared, if this is
+    above 1 (Birge ratio).
+
+    Args:
+        group_estimates: Estimate and standard error of each group.
+        covariate_values: Value of the covariate in each group, such as the load.
     """
     if len(group_estimates) < 3 or not np.ptp(covariate_values) > 0:
         return None

@@ -27,12 +27,7 @@ MAX_FIRST_STEP = 0.02
 
 
 class FlightDynamics:
-    """Accelerations of a ball in flight.
-
-    Args:
-        true_system: the true system.
-        number: index of the run in the recording.
-    """
+    """Accelerations of a ball in flight."""
 
     def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the hidden causes, and the times between which a gust blows.
@@ -40,6 +35,10 @@ class FlightDynamics:
         `gust` is (acceleration along x, upward acceleration, begin, end) in this run, in m/s^2 and
         s; None without a gust. `breaks` are the times at which the acceleration jumps: the solver
         must not step over them.
+
+        Args:
+            true_system: true system of a case: constants, parameters and hidden effects.
+            number: index of the run in the recording.
         """
         self.g, self.acting = (
             true_system.constants["gravity"],
@@ -173,8 +172,8 @@ def simulate_ball(
     impact is integrated without looking for the ground, because the ball starts there.
 
     Args:
-        true_system: the true system.
-        scenario: the run.
+        true_system: true system of a case: constants, parameters and hidden effects.
+        scenario: scenario of the run: times, initial state, inputs and constants.
         number: index of the run in the recording.
         instants: increasing times >= 0, (T,).
 
@@ -274,7 +273,7 @@ def _compute_bounce(true_system: TrueSystem, t: float, state: Array) -> tuple[Ar
     most the friction coefficient times the vertical impulse, (1 + e) times the impact speed.
 
     Args:
-        true_system: the true system.
+        true_system: true system of a case: constants, parameters and hidden effects.
         t: time of the impact, s.
         state: position and velocity before the impact, (6,).
 

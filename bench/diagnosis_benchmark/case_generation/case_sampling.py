@@ -78,9 +78,9 @@ def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset
     """Return an effect and all effects that are equivalent to it.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         driven: whether there is an input.
-        effect: name of the effect.
+        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     classes = (
         names
@@ -162,7 +162,7 @@ def _draw_conditions(
 
     Args:
         name: name of the case, from which its random numbers follow.
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         hidden: names of the hidden effects.
         requested: conditions that are not drawn.
     """
@@ -218,7 +218,7 @@ def _draw_clean(
     chooses.
 
     Args:
-        case: the case.
+        case: case of the benchmark: its recording conditions and hidden causes.
         setting: unused.
         hidden: unused.
         target_size: unused.
@@ -270,7 +270,7 @@ def find_coefficients(
     """Find coefficients of an effect at which the residual has the requested size.
 
     Args:
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         setting: recording conditions.
         target_size: size in units of the noise.
         rng: random generator for the shape of the effect.
@@ -365,6 +365,8 @@ def _draw_unmodelled(
         """Simulate noise-free observations (R, T, C) with the cause at a strength, by scipy.
 
         The batch engine cannot be used here, because it does not know unmodelled causes.
+
+        Shapes: R runs, T samples, C channels.
         """
         true_system = setting.make_true_system(foreign={name: compute_coefficients(strength)})
         return np.array(
@@ -391,7 +393,7 @@ def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
     """Write the recording of a case as NAME.csv and NAME.toml.
 
     Args:
-        case: the case.
+        case: case of the benchmark: its recording conditions and hidden causes.
         folder: folder for the files.
         truth: whether to write NAME.truth.json too.
 

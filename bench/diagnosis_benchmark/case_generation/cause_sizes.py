@@ -72,6 +72,7 @@ def fit_coefficients(
         ]
         jacobian = np.stack(columns, axis=1)
         normal_matrix, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        # The small number keeps columns of zeros solvable.
         scaling = np.diag(np.diag(normal_matrix) + 1e-12)
         for _ in range(MAX_DAMPING_TRIALS):
             step = np.linalg.solve(normal_matrix + damping * scaling, gradient)

@@ -64,12 +64,7 @@ class ResidualFit:
 
 
 class NuisanceFitter:
-    """Damped least-squares fit of base parameters, effect coefficients and initial states.
-
-    Args:
-        setting: recording conditions with the true parameters and initial states.
-        effects: names of the effects whose coefficients are fitted.
-    """
+    """Damped least-squares fit of base parameters, effect coefficients and initial states."""
 
     def __init__(self, setting: RecordingConditions, effects: Sequence[str] = ()) -> None:
         """Make the simulator with the fitted effects; collect starting values, bounds and scales.
@@ -78,6 +73,10 @@ class NuisanceFitter:
         coefficients. A coefficient may reach twice its plausible range, as far as a hidden effect
         can be. The scale of a base parameter is its value, that of a coefficient a tenth of its
         range; steps of the fit are in units of these scales.
+
+        Args:
+            setting: recording conditions with the true parameters and initial states.
+            effects: names of the effects whose coefficients are fitted.
         """
         kind = SIMULATORS[setting.system]
         self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
@@ -114,6 +113,8 @@ class NuisanceFitter:
 
         A step that does not decrease the sum of squares increases the damping, another one
         decreases it. The fit stops when the RMS residual hardly decreases.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             observed: observations, (R, T, C).
@@ -174,6 +175,8 @@ class NuisanceFitter:
     def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """Compute the residual and its Jacobian by finite differences.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             observed: observations, (R, T, C).
             theta: parameters and coefficients.
@@ -205,11 +208,13 @@ class NuisanceFitter:
         residual = (observed / self.sigma).reshape(runs, -1) - observations[:, 0]
         slopes = (observations[:, 1:] - observations[:, :1]) / FINITE_DIFFERENCE_STEP
         slope = np.zeros((*residual.shape, count + runs * state_count))
-        for r in range(runs):
-            slope[r, :, :count] = slopes[r, :count].T
-            slope[r, :, count + r * state_count : count + (r + 1) * state_count] = slopes[
-                r, count:
-            ].T
+        for run_index in range(runs):
+            slope[run_index, :, :count] = slopes[run_index, :count].T
+            slope[
+                run_index,
+                :,
+                count + run_index * state_count : count + (run_index + 1) * state_count,
+            ] = slopes[run_index, count:].T
         is_finite = (np.abs(observations) < DIVERGED_VALUE).all()
         return residual.ravel() if is_finite else np.full(residual.size, np.inf), slope.reshape(
             residual.size, -1
@@ -218,6 +223,8 @@ class NuisanceFitter:
 
 def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
     """Simulate noise-free observations (R, T, C) with given effects.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         setting: recording conditions.
@@ -236,6 +243,8 @@ def make_gap_function(
     setting: RecordingConditions, observed: Callable[[float], Array]
 ) -> Callable[[float], float]:
     """Make the function that computes the size of a cause from its strength.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         setting: recording conditions.
@@ -291,10 +300,12 @@ def compute_refitted_residual(
 ) -> float:
     """Compute the residual after base parameters, initial states and an effect are refitted.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         setting: recording conditions with the true parameters, where the fit starts.
         observed: noise-free observations, (R, T, C).
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         coefficients: starting values of its coefficients; None for several guesses.
 
     Returns:
@@ -309,6 +320,8 @@ def compute_refitted_residual(
 
 def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str, float]:
     """Find the effect of the library that leaves the smallest residual.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         setting: recording conditions.
@@ -337,10 +350,12 @@ def _rank_starts(
 ) -> list[tuple[float, Array]]:
     """List starting points for refitting an effect, the best first.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         setting: recording conditions.
         observed: noise-free observations, (R, T, C).
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         base_fit: fit without the effect.
 
     Returns:
@@ -398,6 +413,8 @@ def _compute_residual(
     It ranks starting points where the derivative of the effect is zero, so that a linear step is
     impossible.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         fit: fitter of the model with the effect.
         observed: noise-free observations, (R, T, C).
@@ -414,6 +431,8 @@ def _estimate_linear_step(
     """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
 
     Shape parameters that the system does not have are omitted.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
         fit: fits parameters, coefficients and initial states.

@@ -43,6 +43,10 @@ MAX_STEP = 0.05
 """Longest step of the solver, s."""
 
 
+STANDARD_GRAVITY = 9.80665
+"""Standard acceleration of gravity in m/s^2 (ISO 80000-3)."""
+
+
 class JointDynamics:
     """Equation of motion of one coordinate with effects and unmodelled causes.
 
@@ -63,7 +67,7 @@ class JointDynamics:
         coordinate rests. The inertia of driven loads is subtracted from that of the drive side.
 
         Args:
-            true_system: the true system.
+            true_system: true system of a case: constants, parameters and hidden effects.
             number: index of the run in the recording.
         """
         constants, parameters = true_system.constants, true_system.parameters
@@ -76,7 +80,7 @@ class JointDynamics:
             self.weight = lambda x: -arm * gravity * sin(x)
             self.sideways = lambda x: arm * cos(x)
         else:
-            self.inertia, gravity = parameters["mass"], 9.80665
+            self.inertia, gravity = parameters["mass"], STANDARD_GRAVITY
             self.weight = lambda x: 0.0
             self.sideways = lambda x: self.inertia
         self.gravity = gravity
@@ -471,8 +475,8 @@ def simulate_joint(
     """Simulate a run.
 
     Args:
-        true_system: the true system.
-        scenario: the run.
+        true_system: true system of a case: constants, parameters and hidden effects.
+        scenario: scenario of the run: times, initial state, inputs and constants.
         number: index of the run in the recording.
         instants: increasing times >= 0, (T,).
 

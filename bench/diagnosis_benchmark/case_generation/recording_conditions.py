@@ -72,6 +72,8 @@ class SensorNoise:
     def add_to(self, observed: Array, rng: np.random.Generator) -> Array:
         """Add noise to observations.
 
+        Shapes: T samples, C channels.
+
         Args:
             observed: noise-free observations, (T, C).
             rng: random generator.
@@ -83,8 +85,10 @@ class SensorNoise:
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded
         if self.kind == "ar1":
-            for k in range(1, len(white)):
-                white[k] = self.phi * white[k - 1] + np.sqrt(1 - self.phi**2) * white[k]
+            for sample in range(1, len(white)):
+                white[sample] = (
+                    self.phi * white[sample - 1] + np.sqrt(1 - self.phi**2) * white[sample]
+                )
         recorded: Array = observed + sigma * white
         return recorded
 
@@ -165,7 +169,7 @@ def draw_conditions(
     """Draw recording conditions in which the hidden effects can be observed.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         rng: random generator.
         hidden: names of the hidden effects.
         short: whether there are always three runs.
@@ -201,7 +205,7 @@ def _draw_sensor_noise(
 
     Args:
         rng: random generator.
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         channels: names of the recorded channels.
     """
     sigma = float(np.exp(rng.uniform(*np.log(NOISE_RANGES[system]))))
@@ -320,11 +324,11 @@ def _draw_slider_conditions(
             "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
         }
         # Lowest and highest frequency in Hz.
-        u = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
-        u -= u.mean()  # otherwise the slider drifts away
-        travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]
+        force = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
+        force -= force.mean()  # otherwise the slider drifts away
+        travel = np.ptp(np.cumsum(np.cumsum(force))) * times[1] ** 2 / parameters["mass"]
         scenarios.append(
-            Scenario(times, start, {"u": u * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
+            Scenario(times, start, {"u": force * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
         )
     return parameters, channels, scenarios
 

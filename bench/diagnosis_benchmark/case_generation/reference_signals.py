@@ -75,8 +75,8 @@ def compute_applied_input(
     """Compute the first input as applied to the plant, from time 0 to `end_time`.
 
     Args:
-        scenario: the run.
-        effects: the hidden effects.
+        scenario: scenario of the run: times, initial state, inputs and constants.
+        effects: coefficients of the hidden effects by name.
         end_time: end of the run, in seconds after its first sample.
 
     Raises:
@@ -111,7 +111,7 @@ def apply_input_effects(
     Args:
         levels: command at each sample.
         edges: time of each sample, s.
-        effects: the hidden effects.
+        effects: coefficients of the hidden effects by name.
 
     Returns:
         Levels and begins of the parts in which the command is constant, and the time constant of

@@ -71,7 +71,7 @@ def get_constants(system: str, **changed: float) -> dict[str, float]:
     """Return the constants of a system by name.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         **changed: constants with other values.
     """
     return {c.name: c.value for c in SIMULATORS[system].constants} | changed
@@ -83,8 +83,8 @@ def simulate_with_scipy(
     """Simulate a run with scipy and return noise-free sensor readings.
 
     Args:
-        true_system: the true system.
-        scenario: the run.
+        true_system: true system of a case: constants, parameters and hidden effects.
+        scenario: scenario of the run: times, initial state, inputs and constants.
         channels: names of the C channels.
         number: index of the run in the recording.
 
@@ -131,8 +131,8 @@ def simulate_with_mujoco(
     with a step of 2.5 ms.
 
     Args:
-        true_system: the true system.
-        scenario: the run.
+        true_system: true system of a case: constants, parameters and hidden effects.
+        scenario: scenario of the run: times, initial state, inputs and constants.
         channels: names of the C channels.
 
     Returns:
@@ -162,7 +162,7 @@ def _get_read_column(system: str, channels: Sequence[str]) -> int:
     If that channel is not recorded, it is the first recorded one of the others.
 
     Args:
-        system: name of the system.
+        system: name of the system, such as ``pendulum``.
         channels: names of the recorded channels.
     """
     preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
@@ -203,11 +203,11 @@ def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
         Lagging readings y, (G, C); at the first grid point y = x.
     """
     lagged, y = values.copy(), values[0].copy()
-    for k, h in enumerate(np.diff(grid).tolist()):
-        slope = (values[k + 1] - values[k]) / h
+    for sample, step in enumerate(np.diff(grid).tolist()):
+        slope = (values[sample + 1] - values[sample]) / step
         particular_solution = (
-            values[k] - slope * lag
+            values[sample] - slope * lag
         )  # particular solution: `lag` seconds behind the line
-        y = particular_solution + slope * h + (y - particular_solution) * exp(-h / lag)
-        lagged[k + 1] = y
+        y = particular_solution + slope * step + (y - particular_solution) * exp(-step / lag)
+        lagged[sample + 1] = y
     return lagged

@@ -131,7 +131,7 @@ class _ForwardSelection(Diagnoser):
         Args:
             evidence: fitted base model and directions of the effects.
             first: the base model.
-            best: the selected model.
+            best: selected model with its effects, refitted to the runs.
             causes: each selected effect with its alternatives.
             samples: number of samples.
         """
@@ -164,7 +164,7 @@ class _ForwardSelection(Diagnoser):
         """Compute the criterion, which is minimised.
 
         Args:
-            model: a fitted model.
+            model: model with its effects, refitted to the runs.
             samples: number of samples.
         """
 
@@ -173,7 +173,7 @@ class _ForwardSelection(Diagnoser):
         """Return whether a model is sufficient, so that the search can stop.
 
         Args:
-            model: a fitted model.
+            model: model with its effects, refitted to the runs.
             samples: number of samples.
         """
 
@@ -182,7 +182,7 @@ class _ForwardSelection(Diagnoser):
         """Compute the p-value of the base model under the hypothesis that nothing is missing.
 
         Args:
-            first: the fitted base model.
+            first: model without effects, refitted to the runs.
             samples: number of samples.
 
         Returns:
@@ -198,9 +198,6 @@ class ForwardBIC(_ForwardSelection):
 
     def compute_criterion(self, model: RefittedModel, samples: int) -> float:
         """Compute the Bayesian information criterion, BIC = n log(S / n) + k log n, equation (1).
-
-        For n samples and k numbers, BIC = n log(S / n) + k log n, with the sum of squares S in
-        units of the noise (1).
 
         Args:
             model: a fitted model, with sum of squares S and k numbers.
@@ -242,7 +239,7 @@ class ForwardBIC(_ForwardSelection):
         Args:
             evidence: fitted base model and directions of the effects.
             first: the base model; unused here.
-            best: the selected model.
+            best: selected model with its effects, refitted to the runs.
             causes: each selected effect with its alternatives.
             samples: number of samples; unused here.
         """
@@ -267,7 +264,7 @@ class ForwardChi2(_ForwardSelection):
         """Return the sum of squares.
 
         Args:
-            model: the fitted model.
+            model: model with its effects, refitted to the runs.
             samples: unused.
         """
         return model.squares
@@ -276,7 +273,7 @@ class ForwardChi2(_ForwardSelection):
         """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`.
 
         Args:
-            model: the fitted model.
+            model: model with its effects, refitted to the runs.
             samples: number of samples.
         """
         return self._compute_p_value(model, samples) > FALSE_ALARM_RATE
@@ -285,7 +282,7 @@ class ForwardChi2(_ForwardSelection):
         """Compute the chi-squared p-value of the base model.
 
         Args:
-            first: the fitted base model.
+            first: model without effects, refitted to the runs.
             samples: number of samples.
         """
         return self._compute_p_value(first, samples)
@@ -306,7 +303,7 @@ def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedMode
     """Compute sum of squares and number of parameters of a fit, by which models are compared.
 
     Args:
-        evidence: the recording and its noise.
+        evidence: base fit, noise, and directions of the effects on a recording.
         fit: a fitted model. A fit that diverged gets an infinite sum of squares.
     """
     residual = (evidence.evaluator.observed - fit.simulated) / evidence.noise.sigma
@@ -394,7 +391,7 @@ def _choose_starts(
     Args:
         evidence: directions of the effects at the current model.
         current_fit: the current model.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         column: the best column of the effect.
         residual: residual after parameters and initial states are projected out, (N,).
         effects: columns of all directions after this projection, (N, K).
@@ -406,14 +403,14 @@ def _choose_starts(
     starts = []
     # The second start is smaller than the linear estimate, for effects that are not linear.
     for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
-        c = probes[0].coefficients.copy()
+        start_coefficients = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
             if not probe.is_single_size:
-                c[probe.coefficient_index] = np.clip(
+                start_coefficients[probe.coefficient_index] = np.clip(
                     factor * size, *bounds[probe.coefficient_index]
                 )
         theta = current_fit.theta.copy()
-        theta[evaluator.coefficient_slices[name]] = c
+        theta[evaluator.coefficient_slices[name]] = start_coefficients
         starts.append(FitStart((*current_fit.effects, name), theta, current_fit.initial_states))
     return starts
 
@@ -427,8 +424,8 @@ def _compute_intervals(
     noise variance estimated from the residual.
 
     Args:
-        evidence: the recording and its noise.
-        model: the fitted model.
+        evidence: base fit, noise, and directions of the effects on a recording.
+        model: model with its effects, refitted to the runs.
     """
     evaluator, fit = evidence.evaluator, model.fit
     columns = compute_base_jacobian(evaluator, fit) / evidence.noise.sigma[:, None]
@@ -457,7 +454,7 @@ def _select_effect_intervals(
 
     Args:
         intervals: intervals by ``effect.coefficient``, or by the name of a base parameter.
-        effect: name of the effect.
+        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     prefix = f"{effect}."
     return {

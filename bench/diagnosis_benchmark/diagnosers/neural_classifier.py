@@ -208,7 +208,7 @@ def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple
 
     Args:
         training_task: simulator, library and random numbers of the training.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     rng = training_task.rng
     values = []
@@ -233,7 +233,7 @@ def _compute_network_input(
 
     Args:
         kind: simulator class.
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
 
     Returns:
         Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
@@ -254,29 +254,31 @@ def _compute_network_input(
             (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
         )
         grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
-        for r, run_data in enumerate(evaluator.prepared_runs):
-            size = int(evaluator.lengths[r])
+        for run_index, run_data in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[run_index])
             relative_times = np.linspace(0.0, 1.0, size)
             for c, name in enumerate(evaluator.channels):
                 channel_index = names.index(name)
-                is_recorded = np.isfinite(residual[r, :size, c])
+                is_recorded = np.isfinite(residual[run_index, :size, c])
                 clipped_residual = np.clip(
-                    np.nan_to_num(residual[r, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP
+                    np.nan_to_num(residual[run_index, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP
                 )
-                image[r, channel_index] = np.arcsinh(
+                image[run_index, channel_index] = np.arcsinh(
                     np.interp(grid, relative_times[is_recorded], clipped_residual[is_recorded])
                 )
-                motion = fit.simulated[r, :size, c]
+                motion = fit.simulated[run_index, :size, c]
                 spread = float(motion.std()) or 1.0
-                image[r, len(names) + channel_index] = np.interp(
+                image[run_index, len(names) + channel_index] = np.interp(
                     grid, relative_times, (motion - motion.mean()) / spread
                 )
-                image[r, 2 * len(names) + channel_index] = 1.0
+                image[run_index, 2 * len(names) + channel_index] = 1.0
             for i, name in enumerate(inputs):
                 signal = np.asarray(run_data.scenario.inputs.get(name, np.zeros(size)))[:size]
                 spread = float(np.abs(signal).max()) or 1.0
-                image[r, 3 * len(names) + i] = np.interp(grid, relative_times, signal / spread)
-            image[r, -1] = np.log(run_data.duration)
+                image[run_index, 3 * len(names) + i] = np.interp(
+                    grid, relative_times, signal / spread
+                )
+            image[run_index, -1] = np.log(run_data.duration)
     return np.nan_to_num(image), rms
 
 
@@ -320,6 +322,8 @@ def _make_network(features: int, classes: int) -> Any:
         def forward(self, images: Any, weights: Any) -> Any:
             """Compute class scores.
 
+            Shapes: R runs.
+
             Args:
                 images: inputs, (B, R, F, POINTS).
                 weights: 1 for runs that exist, otherwise 0, (B, R).
@@ -362,6 +366,8 @@ def _train_network(
     """Train the network with Adam, and return the weights with the best validation loss.
 
     The loss is the cross entropy. The first `VALIDATION_SHARE` of the examples are not trained on.
+
+    Shapes: R runs.
 
     Args:
         images: inputs, one (R, F, POINTS) per example.
@@ -415,6 +421,8 @@ def _predict_probabilities(
     trained_arrays: Mapping[str, Array], image: Array, classes: int
 ) -> Array:
     """Compute the class probabilities of one recording, (classes,).
+
+    Shapes: R runs.
 
     Args:
         trained_arrays: trained weights by the name of the layer.

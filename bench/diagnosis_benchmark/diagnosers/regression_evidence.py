@@ -102,10 +102,6 @@ class RegressionData:
 class RegressionEvidence:
     """Base model fitted to the recording of a case, and the directions of the effects.
 
-    Args:
-        case: the case.
-        has_held_out: whether held-out runs are fitted too.
-
     Attributes:
         evaluator: the runs and the simulator.
         noise: noise of each channel, stated or estimated.
@@ -121,6 +117,10 @@ class RegressionEvidence:
         Runs for fitting come first, held-out runs after them. Systems without an engine of their
         own are simulated by the batch engine. The directions of the effects are computed when they
         are first used.
+
+        Args:
+            case: case: recording, simulator and library of effects, without the hidden causes.
+            has_held_out: whether held-out runs are fitted too.
         """
         recording = case.recording
         runs = [*recording.training(), *(recording.held_out() if has_held_out else ())]
@@ -221,6 +221,8 @@ class RegressionEvidence:
         Each row is divided by its noise. Rows that are masked, or not finite because of an impact,
         are left out.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             residual: residual, (R, T, C).
             base: columns of parameters and initial states, (R, T, C, B).
@@ -247,17 +249,19 @@ class RegressionEvidence:
         """Return time, channels of the base model and inputs, (R, T, F).
 
         They are the arguments of a discrepancy function, such as a Gaussian process.
+
+        Shapes: R runs, T samples.
         """
         evaluator = self.evaluator
         runs, length, channels = evaluator.observed.shape
         names = [channel.name for channel in evaluator.simulator.inputs]
         states = np.zeros((runs, length, 1 + channels + len(names)))
-        for r, run_data in enumerate(evaluator.prepared_runs):
-            size = int(evaluator.lengths[r])
+        for run_index, run_data in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[run_index])
             times, inputs = run_data.scenario.times, run_data.scenario.inputs
-            states[r, :size, 0] = times - times[0]
+            states[run_index, :size, 0] = times - times[0]
             for i, name in enumerate(names):
-                states[r, :size, 1 + channels + i] = inputs.get(name, np.zeros(size))
+                states[run_index, :size, 1 + channels + i] = inputs.get(name, np.zeros(size))
         states[..., 1 : 1 + channels] = np.nan_to_num(self.base.fit.simulated)
         return states
 
@@ -268,6 +272,8 @@ class RegressionEvidence:
         omitted. Channels that are neither coordinates nor rates are not used.
 
         It is L r = r'' - A r - B r' (2), with the stiffness A and damping B of the motion.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             values: trajectories, (R, T, C, K).
@@ -285,18 +291,18 @@ class RegressionEvidence:
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
-        for r, run_data in enumerate(evaluator.prepared_runs):
-            size = int(evaluator.lengths[r])
+        for run_index, run_data in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[run_index])
             step = float(np.median(np.diff(run_data.scenario.times)))
             window = _round_down_to_odd(
                 min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2)
             )
-            stiffness, damping = self._linearise(r)
-            for c, name in enumerate(evaluator.channels):
+            stiffness, damping = self._linearise(run_index)
+            for channel_index, name in enumerate(evaluator.channels):
                 is_rate = name in pairs
                 if not is_rate and name not in system.coordinates:
                     continue
-                channel_values = values[r, :size, c]
+                channel_values = values[run_index, :size, channel_index]
                 order = 1 if is_rate else 2
 
                 def smooth(
@@ -327,10 +333,14 @@ class RegressionEvidence:
                 else:
                     filtered_residual -= stiffness[:size, coordinate, None] * smooth(0)
                     filtered_residual -= damping[:size, coordinate, None] * smooth(1)
-                filtered_runs[r, :size, c] = filtered_residual
+                filtered_runs[run_index, :size, channel_index] = filtered_residual
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
-                sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
-                is_used[r, :size, c] = self._find_smooth_samples(r, size, window)
+                sigma[run_index, :size, channel_index] = self.noise.sigma[channel_index] * np.sqrt(
+                    np.square(weights).sum()
+                )
+                is_used[run_index, :size, channel_index] = self._find_smooth_samples(
+                    run_index, size, window
+                )
         return filtered_runs, sigma, is_used & self.observed_mask
 
     def _find_smooth_samples(self, run: int, size: int, window: int) -> Mask:
@@ -350,9 +360,9 @@ class RegressionEvidence:
         system = self.evaluator.simulator.system
         name = system.coordinates[-1] if system.bounces else ""
         if name in self.evaluator.channels:
-            c = self.evaluator.channels.index(name)
-            simulated = self.base.fit.simulated[run, :size, c]
-            for path in (simulated, self.evaluator.observed[run, :size, c]):
+            channel_index = self.evaluator.channels.index(name)
+            simulated = self.base.fit.simulated[run, :size, channel_index]
+            for path in (simulated, self.evaluator.observed[run, :size, channel_index]):
                 lowest = np.flatnonzero((path[1:-1] < path[:-2]) & (path[1:-1] <= path[2:])) + 1
                 for impact in lowest[path[lowest] < _IMPACT_HEIGHT]:
                     is_smooth[max(0, impact - half_window - 1) : impact + half_window + 2] = False
@@ -421,8 +431,10 @@ def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     A parameter affects all runs. An unknown initial state affects its own run only, so its column
     is zero in the other runs.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
-        evaluator: the runs and the simulator.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         fit: a fitted model with its Jacobian.
 
     Returns:
@@ -463,6 +475,7 @@ def find_strongest_columns(
     for column in columns:
         part = effects[:, list(column.places)]
         scale = np.sqrt(np.square(part).sum(axis=0))
+        # Columns below 1e-9 are zero up to rounding, and cannot be normalised.
         if not (scale > 1e-9).any():
             continue
         part = part[:, scale > 1e-9] / scale[scale > 1e-9]

@@ -220,6 +220,7 @@ def _drop_duplicate_columns(
     for effect, place in terms:
         column = effects[:, place]
         size = float(np.sqrt(column @ column))
+        # A column that is zero up to rounding has no term.
         if size < 1e-9 * max(len(column), 1):
             continue
         unit = column / size

@@ -78,9 +78,11 @@ def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
 
     p_values = []
     runs, _, channels = evidence.residual.shape
-    for r in range(runs):
-        for c in range(channels):
-            values = evidence.residual[r][evidence.observed_mask[r, :, c], c]
+    for run_index in range(runs):
+        for channel_index in range(channels):
+            values = evidence.residual[run_index][
+                evidence.observed_mask[run_index, :, channel_index], channel_index
+            ]
             if values.size > 2 * LAG_COUNT and np.ptp(values) > 0:
                 table = acorr_ljungbox(values, lags=[LAG_COUNT])
                 p_values.append(float(table["lb_pvalue"].iloc[0]))

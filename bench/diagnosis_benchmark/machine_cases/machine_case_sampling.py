@@ -166,16 +166,18 @@ def _hide_one_effect(
         The case; None if it is rejected or no coefficients give this size.
     """
     name = _draw_place(case, effect, rng)
-    c = _find_sized_coefficients(name, conditions, target_size, rng)
-    if c is None:
+    coefficients = _find_sized_coefficients(name, conditions, target_size, rng)
+    if coefficients is None:
         return None
     effect, _, place = name.partition("@")
     unexplained = None
     if effect in SIMPLER_EFFECTS and target_size >= 1.0:
         simpler_effect = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
         other_effects = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
-        unexplained = _compute_unexplained_size(conditions, {name: c}, {}, other_effects, rng)
-    return case.hide({name: c}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
+        unexplained = _compute_unexplained_size(
+            conditions, {name: coefficients}, {}, other_effects, rng
+        )
+    return case.hide({name: coefficients}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
 
 
 def _find_sized_coefficients(
@@ -272,10 +274,10 @@ def _hide_unmodelled_cause(
     chosen_cause = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
     joint = str(rng.choice(MACHINES[case.system].joints))
     name = f"{chosen_cause}@{joint}" if joint else chosen_cause
-    c = _find_sized_coefficients(name, conditions, target_size, rng, is_modelled=False)
-    if c is None:
+    coefficients = _find_sized_coefficients(name, conditions, target_size, rng, is_modelled=False)
+    if coefficients is None:
         return None
-    hidden = {name: c}
+    hidden = {name: coefficients}
     library_effects = [
         n
         for e in hidden_causes.EFFECTS_BY_MACHINE[case.system]
@@ -323,9 +325,6 @@ def _compute_unexplained_size(
 class _ResidualGauge:
     """Sizes of changes, in units of the noise, with parameters and initial states projected out.
 
-    Args:
-        conditions: recording conditions; only the runs for fitting are used.
-
     Attributes:
         bare: readings without hidden causes, (R, T, N).
     """
@@ -336,6 +335,9 @@ class _ResidualGauge:
         All simulations are one batch of R runs times 1 + P + 2 N variants: unchanged, each of P
         parameters, each of N angles and each of N velocities. A parameter changes all runs, an
         initial state only its own run.
+
+        Args:
+            conditions: recording conditions; only the runs for fitting are used.
         """
         self.conditions = conditions
         runs, joints = conditions.fitted_runs.q.shape
@@ -354,9 +356,9 @@ class _ResidualGauge:
         for k, name in enumerate(parameters):
             values[name][:, 1 + k] *= 1 + _FINITE_DIFFERENCE_STEP
         q, v = (part.reshape(runs, variants, joints).copy() for part in (fitted.q, fitted.v))
-        for j in range(joints):
-            q[:, 1 + len(parameters) + j, j] += _FINITE_DIFFERENCE_STEP
-            v[:, 1 + len(parameters) + joints + j, j] += _FINITE_DIFFERENCE_STEP
+        for joint in range(joints):
+            q[:, 1 + len(parameters) + joint, joint] += _FINITE_DIFFERENCE_STEP
+            v[:, 1 + len(parameters) + joints + joint, joint] += _FINITE_DIFFERENCE_STEP
         plant = MACHINES[conditions.system]({n: a.ravel() for n, a in values.items()}, {}, {})
         start_runs = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
         readings = read_encoders(simulate_machine(plant, start_runs), plant, conditions.runs.times)
@@ -364,8 +366,8 @@ class _ResidualGauge:
         slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
         shared = np.concatenate(slopes[:, : len(parameters)], axis=1).T
         state_columns = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
-        for r in range(runs):
-            state_columns[r, :, r] = slopes[r, len(parameters) :].T
+        for run_index in range(runs):
+            state_columns[run_index, :, run_index] = slopes[run_index, len(parameters) :].T
         columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
         self._basis = compute_orthonormal_basis(columns)
@@ -380,6 +382,8 @@ class _ResidualGauge:
 
     def compute_projected_size(self, change: Array, direction: Array) -> float:
         """Compute the size of a change after a further direction is projected out.
+
+        Shapes: R runs, T samples, N joints.
 
         Args:
             change: change of the readings, (R, T, N).
@@ -434,8 +438,10 @@ def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
 def record_case(case: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
     """Simulate the recording of a case with all its runs, and add the sensor noise.
 
+    Shapes: R runs, T samples, N joints.
+
     Args:
-        case: the case.
+        case: case of the benchmark: its recording conditions and hidden causes.
 
     Returns:
         The recording conditions and the noisy encoder readings, (R, T, N).
@@ -510,8 +516,8 @@ def build_description(
     """Build the description of the recording, as the document of a TOML file.
 
     Args:
-        case: the case.
-        conditions: its recording conditions.
+        case: case of the benchmark: its recording conditions and hidden causes.
+        conditions: recording conditions: parameters, commands, initial states and noise.
     """
     is_arm = case.system == "arm2"
     plant = MACHINES[case.system]
@@ -541,9 +547,11 @@ def format_table(
 ) -> str:
     """Format the recording as CSV text.
 
+    Shapes: R runs, T samples, N joints.
+
     Args:
-        case: the case.
-        conditions: its recording conditions.
+        case: case of the benchmark: its recording conditions and hidden causes.
+        conditions: recording conditions: parameters, commands, initial states and noise.
         readings: encoder readings, (R, T, N).
     """
     plant, is_arm = MACHINES[case.system], case.system == "arm2"
@@ -561,7 +569,7 @@ def write_case(case: BenchmarkCase, folder: Path) -> Path:
     """Write the recording, its description and, for an arm, its model file.
 
     Args:
-        case: the case.
+        case: case of the benchmark: its recording conditions and hidden causes.
         folder: folder for the files.
 
     Returns:

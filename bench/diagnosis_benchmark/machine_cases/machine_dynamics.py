@@ -42,11 +42,6 @@ GRAVITY = 9.81
 class MachineDynamics(ABC):
     """Machine with hidden causes.
 
-    Args:
-        numbers: parameters, see `MachineParameters`.
-        effects: hidden effects of the library.
-        foreign: hidden causes that the library does not contain.
-
     Attributes:
         joints: names of the joints; one empty name if the machine has one place per effect.
         channels: sensor channel of each joint.
@@ -69,6 +64,13 @@ class MachineDynamics(ABC):
         Further attributes are `added`, additional rotor inertia (N,); `patch`, (joint, friction
         limit, centre, half width) of dry friction in a region; and `dull`, the deadband of a servo
         in rad. Effects on commands and sensors stay in `effects`; `reference_motion` applies them.
+
+        Shapes: N joints.
+
+        Args:
+            numbers: parameters, see `MachineParameters`.
+            effects: hidden effects of the library.
+            foreign: hidden causes that the library does not contain.
         """
         self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
         self.effects, self.foreign = effects, foreign
@@ -79,12 +81,12 @@ class MachineDynamics(ABC):
         self.dull = 0.0
         self.heavier = 1.0
         self.acts: list[ForceLaw] = []
-        for name, c in effects.items():
+        for name, coefficients in effects.items():
             effect, _, place = name.partition("@")
-            self._add_effect(effect, place, list(c))
-        for name, c in foreign.items():
+            self._add_effect(effect, place, list(coefficients))
+        for name, coefficients in foreign.items():
             cause, _, place = name.partition("@")
-            self._add_unmodelled_cause(cause, place, list(c))
+            self._add_unmodelled_cause(cause, place, list(coefficients))
 
     @property
     def has_dry_friction(self) -> NDArray[np.bool_]:
@@ -96,6 +98,8 @@ class MachineDynamics(ABC):
 
     def compute_friction_limit(self, q: Array, v: Array) -> Array:
         """Compute the dry friction limit.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             q: positions, (L, N).
@@ -116,6 +120,8 @@ class MachineDynamics(ABC):
 
     def compute_force(self, t: float, q: Array, v: Array, u: Array) -> Array:
         """Compute the force of drives, gravity and effects, without dry friction.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             t: time.
@@ -138,6 +144,8 @@ class MachineDynamics(ABC):
     @abstractmethod
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
         """Compute all other terms of the equations of motion of the machine without effects.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             q: positions, (L, N).
@@ -169,7 +177,7 @@ class MachineDynamics(ABC):
         `reference_motion` applies them.
 
         Args:
-            effect: name of the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             place: joint or body on which it acts; empty if the machine has only one place.
             c: coefficients.
         """
@@ -266,6 +274,8 @@ class ServoDynamics(MachineDynamics):
     def compute_mass_matrix(self, q: Array) -> Array:
         """Compute the inertia J + m l^2 (L, 1, 1) about the joint, with that of hidden causes.
 
+        Shapes: L batch elements.
+
         Args:
             q: positions, (L, 1); only their number is used.
         """
@@ -279,6 +289,8 @@ class ServoDynamics(MachineDynamics):
 
         The position controller sets the duty d from the error of the goal; the motor's back EMF, k
         q', reduces the torque.
+
+        Shapes: L batch elements.
 
         Args:
             q: positions, (L, 1).
@@ -298,6 +310,8 @@ class ServoDynamics(MachineDynamics):
     def compute_gravity_force(self, q: Array) -> Array:
         """Compute the gravity force -m g l sin q of equation (1), (L, 1).
 
+        Shapes: L batch elements.
+
         Args:
             q: angle from hanging down, rad, (L, 1).
         """
@@ -309,6 +323,8 @@ class ServoDynamics(MachineDynamics):
         """Compute the force m l cos q of a unit acceleration along x, (L, 1).
 
         It is positive where a mass at positive q is on the right.
+
+        Shapes: L batch elements.
 
         Args:
             q: angle from hanging down, rad, (L, 1).
@@ -332,6 +348,8 @@ class ArmDynamics(MachineDynamics):
     def compute_mass_matrix(self, q: Array) -> Array:
         """Compute the mass matrices (L, 2, 2) of the arm, equations (2) and (3).
 
+        Shapes: L batch elements.
+
         Args:
             q: positions, (L, 2).
         """
@@ -351,6 +369,8 @@ class ArmDynamics(MachineDynamics):
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
         """Compute the forces of inputs, gravity, Coriolis effects and damping, as in (4).
+
+        Shapes: L batch elements.
 
         Args:
             q: positions, (L, 2).
@@ -374,6 +394,8 @@ class ArmDynamics(MachineDynamics):
 
     def _compute_mass_moment(self, function: Callable[[Array], Array], q: Array) -> Array:
         """Sum mass times lever arm of both links for each joint, as in equation (5), kg m, (L, N).
+
+        Shapes: L batch elements, N joints.
 
         Args:
             function: sine for the lever arm of gravity, cosine for that of a horizontal

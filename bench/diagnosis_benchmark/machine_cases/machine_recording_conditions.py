@@ -107,6 +107,8 @@ class MachineRecordingConditions:
 
         The held-out runs at the end of `runs` are left out.
 
+        Shapes: R runs, T samples, N joints.
+
         Args:
             effects: hidden effects of the library.
             foreign: hidden causes that no effect of the library models.
@@ -132,6 +134,8 @@ class MachineRecordingConditions:
         Strengths of hidden causes are relative to them. ``force`` (inertia force minus gravity),
         ``speed`` and ``position`` are RMS values, ``travel`` is the mean range of a run,
         ``inertia`` the mean diagonal of the mass matrix.
+
+        Shapes: N joints.
         """
         q, v = self.base_motion.q, self.base_motion.v
         a = np.gradient(v, self.base_motion.times, axis=0)

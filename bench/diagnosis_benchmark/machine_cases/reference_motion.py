@@ -63,7 +63,7 @@ def simulate_machine(
     """Simulate the motion of a machine.
 
     Args:
-        plant: the machine.
+        plant: machine with its parameters and hidden causes.
         runs: initial states and commands.
         coarse: factor of the step size.
     """
@@ -71,13 +71,14 @@ def simulate_machine(
     max_step = coarse * (
         FRICTION_STEP_SECONDS if plant.has_dry_friction.any() else SMOOTH_STEP_SECONDS
     )
+    # The small number prevents a further part by rounding.
     parts = int(np.ceil(rate / max_step - 1e-9))
     times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
     applied_inputs = compute_applied_inputs(runs, plant, times)
     integrator = _MachineIntegrator(plant, runs.q, runs.v)
     q, v = [integrator.q], [integrator.v]
-    for k, t in enumerate(times[:-1].tolist()):
-        integrator.step(t, float(times[k + 1]) - t, applied_inputs[:, k])
+    for step_index, time in enumerate(times[:-1].tolist()):
+        integrator.step(time, float(times[step_index + 1]) - time, applied_inputs[:, step_index])
         q.append(integrator.q)
         v.append(integrator.v)
     return MachineMotion(times, np.array(q), np.array(v))
@@ -97,8 +98,10 @@ class _MachineIntegrator:
     def __init__(self, plant: MachineDynamics, q: Array, v: Array) -> None:
         """Start at given positions and velocities.
 
+        Shapes: L batch elements, N joints.
+
         Args:
-            plant: the machine.
+            plant: machine with its parameters and hidden causes.
             q: initial positions, (L, N).
             v: initial velocities, (L, N).
         """
@@ -113,6 +116,8 @@ class _MachineIntegrator:
 
         With dry friction, the direction of friction is fixed for the step; joints that come to rest
         within it are corrected afterwards.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             t: time at the begin of the step, s.
@@ -137,6 +142,8 @@ class _MachineIntegrator:
     def _compute_accelerations(self, t: float, q: Array, v: Array, u: Array) -> Array:
         """Compute the accelerations (L, N), with dry friction against the direction of motion.
 
+        Shapes: L batch elements, N joints.
+
         Args:
             t: time, s.
             q: positions, (L, N).
@@ -150,6 +157,8 @@ class _MachineIntegrator:
 
     def _solve_accelerations(self, q: Array, force: Array) -> Array:
         """Solve M q'' = force for the accelerations (L, N); those of stuck joints are zero.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             q: positions, (L, N).
@@ -173,6 +182,8 @@ class _MachineIntegrator:
         """Decide which joints at rest are stuck, and in which direction the others move.
 
         A joint breaks away if holding it needs more force than its friction limit.
+
+        Shapes: L batch elements, N joints.
 
         Args:
             t: time, s.
@@ -202,6 +213,8 @@ class _MachineIntegrator:
         The time of rest is estimated by linear interpolation of the velocity. For the time that is
         left (`remaining_time`), the joint sticks or moves with constant acceleration.
 
+        Shapes: L batch elements, N joints.
+
         Args:
             t: time at the begin of the step, s.
             h: length of the step, s.
@@ -228,9 +241,11 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
 
     Effects without memory act first, then delay and lag.
 
+    Shapes: L batch elements, N joints.
+
     Args:
         runs: the runs with their commands.
-        plant: the machine with its effects.
+        plant: machine with its parameters and hidden causes.
         times: times of the steps, (K + 1,).
 
     Returns:
@@ -297,8 +312,11 @@ def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> 
     lagged_at_samples = np.empty_like(levels)
     lagged_at_samples[0] = levels[0]
     decay = np.exp(-np.diff(stamps) / lag)
-    for k in range(len(stamps) - 1):
-        lagged_at_samples[k + 1] = levels[k] + (lagged_at_samples[k] - levels[k]) * decay[k]
+    for level_index in range(len(stamps) - 1):
+        lagged_at_samples[level_index + 1] = (
+            levels[level_index]
+            + (lagged_at_samples[level_index] - levels[level_index]) * decay[level_index]
+        )
     sample_before = np.clip(np.searchsorted(stamps, query_times, side="right") - 1, 0, None)
     seconds_since = np.maximum(query_times - stamps[sample_before], 0.0)
     lagged: Array = levels[sample_before] + (
@@ -310,9 +328,11 @@ def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> 
 def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -> Array:
     """Compute the encoder readings at the sample times.
 
+    Shapes: L batch elements, T samples, N joints.
+
     Args:
         motion: simulated motion.
-        plant: the machine with its effects.
+        plant: machine with its parameters and hidden causes.
         times: sample times, (T,).
 
     Returns:
@@ -354,15 +374,17 @@ def select_signal_effects(
 def _interpolate_positions(motion: MachineMotion, query_times: Array) -> Array:
     """Interpolate positions (T, L, N) by cubic Hermite polynomials, which use velocities too.
 
+    Shapes: L batch elements, T samples, N joints.
+
     Args:
         motion: simulated motion with steps of equal length.
         query_times: times, s, (T,).
     """
-    h = motion.times[1] - motion.times[0]
-    place = np.clip((query_times / h).astype(int), 0, len(motion.times) - 2)
-    s = ((query_times - motion.times[place]) / h)[:, None, None]
+    step = motion.times[1] - motion.times[0]
+    place = np.clip((query_times / step).astype(int), 0, len(motion.times) - 2)
+    s = ((query_times - motion.times[place]) / step)[:, None, None]
     q0, q1 = motion.q[place], motion.q[place + 1]
-    v0, v1 = motion.v[place] * h, motion.v[place + 1] * h
+    v0, v1 = motion.v[place] * step, motion.v[place + 1] * step
     positions: Array = (
         q0 * (1 + 2 * s) * (1 - s) ** 2
         + v0 * s * (1 - s) ** 2

@@ -76,7 +76,7 @@ def find_order_by_model(
     """Find the order of columns with which a model explains a motion best.
 
     Args:
-        robot: The model.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         driven: Joints with their actuators, in the model's order.
         times: (T,) seconds.
         commands: (T,) command of each actuator, SI units.
@@ -151,7 +151,7 @@ def _compute_order_residual(
     mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order, about 1 otherwise.
 
     Args:
-        robot: The model.
+        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         driven: Joints with their actuators.
         commands: (J, T) their commands.
         motion: (3, J, T) their positions, velocities and accelerations.
@@ -252,12 +252,18 @@ def _compute_square_distances(
     """Return the (J, J) mean square distance of each command from each position.
 
     Returns None if the motion is too short, or of one joint only.
+
+    Args:
+        commands: Command of each joint, (T,) in SI units.
+        positions: Position in each column, (T,) in SI units.
     """
-    u, q = np.array(commands), np.array(positions)
-    finite = np.isfinite(u).all(axis=0) & np.isfinite(q).all(axis=0)
-    if finite.sum() < MIN_SAMPLES or len(u) < 2:
+    command_table, position_table = np.array(commands), np.array(positions)
+    finite = np.isfinite(command_table).all(axis=0) & np.isfinite(position_table).all(axis=0)
+    if finite.sum() < MIN_SAMPLES or len(command_table) < 2:
         return None
-    squares: Array = np.mean((u[:, None, finite] - q[None][:, :, finite]) ** 2, axis=2)
+    squares: Array = np.mean(
+        (command_table[:, None, finite] - position_table[None][:, :, finite]) ** 2, axis=2
+    )
     return squares
 
 
@@ -320,7 +326,7 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
     orders.
 
     Args:
-        logs: the logs.
+        logs: logs of all runs, with their time stamps and columns.
         signals: signals and their columns.
     """
     joints = [
@@ -383,7 +389,7 @@ def _prefer_model(
     """Exchange unnamed columns if the model then explains the motion far better.
 
     Args:
-        logs: the logs.
+        logs: logs of all runs, with their time stamps and columns.
         signals: signals and their columns, exchanged in place.
         servos: joints with a servo and their signals.
         result: result of the import, to which a message is added.

@@ -138,12 +138,6 @@ MAX_RUNS = 8
 class RunLogs:
     """Logs of the runs that are imported. The first run decides which columns there are.
 
-    Args:
-        runs: Files of each run.
-        rate: Rate of the rows in Hz, if the logs have no time stamps.
-        joint_names: Names of the robot's joints, for messages.
-        result: Result to which messages are added.
-
     Attributes:
         runs: Files of each run.
         rate: Rate of the rows in Hz; None if the logs have time stamps.
@@ -167,6 +161,12 @@ class RunLogs:
 
         Without time stamps (`rate` is given), the time of row k is k / rate in seconds. `_starts`
         has the first time stamp of each file, and `_cache` the files that were read already.
+
+        Args:
+            runs: Files of each run.
+            rate: Rate of the rows in Hz, if the logs have no time stamps.
+            joint_names: Names of the robot's joints, for messages.
+            result: Result to which messages are added.
         """
         self.runs, self.rate = runs, rate
         self.time_column, self.time_unit = "", "s"

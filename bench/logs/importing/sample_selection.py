@@ -80,7 +80,7 @@ def _preserves_motion(recording: Recording, stride: int) -> bool:
     than if every second sample is kept, which is noise.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         stride: the number k.
     """
     for run in recording.runs:
@@ -124,7 +124,7 @@ def _thin_run(run: Run, stride: int) -> Run:
     """Keep every k-th sample of a run, and average its inputs from each one to the next.
 
     Args:
-        run: the run.
+        run: recorded run: times, channels and inputs.
         stride: the number k.
     """
     thinned_run = run.part(slice(None, None, stride))

@@ -143,6 +143,10 @@ def _compute_transfer_functions(
     The servo is q'' = w^2 (u - q) - 2 d w q' (1), with the command u, natural frequency w and
     damping ratio d.
 
+    Args:
+        responses: n pairs of natural frequency w in rad/s and damping ratio d.
+        step: Sampling interval in s.
+
     Returns:
         (n, 3) coefficients of the numerators and of the denominators, by descending powers of z.
     """

@@ -279,7 +279,7 @@ def _compare_with_derivative(
         logs: files of the runs.
         column: velocity column.
         position: position signal of the joint.
-        joint: the joint.
+        joint: joint of the robot.
     """
     runs = []
     for name in list(logs.runs)[:MAX_RUNS]:
@@ -368,14 +368,7 @@ COMMAND_QUANTITIES = {"motor": "force", "position": "position", "velocity": "vel
 
 
 class ColumnAssigner:
-    """Assignment of columns to the signals of a robot, with messages.
-
-    Args:
-        logs: Logs that are imported.
-        signals: Assignment to which signals are added.
-        options: Information that the user states.
-        result: Result to which messages are added.
-    """
+    """Assignment of columns to the signals of a robot, with messages."""
 
     def __init__(
         self,
@@ -387,6 +380,12 @@ class ColumnAssigner:
         """Store the inputs; nothing is assigned yet.
 
         `normalised` is set later if the log has positions as shares of a joint's range.
+
+        Args:
+            logs: Logs that are imported.
+            signals: Assignment to which signals are added.
+            options: Information that the user states.
+            result: Result to which messages are added.
         """
         self._logs, self._signals, self._result = logs, signals, result
         self._options = options

@@ -153,6 +153,9 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
     """Find samples that repeat the previous one in every channel although the system moves.
 
     Such samples were not measured anew, and look like a delay.
+
+    Args:
+        recording: Recording of a moving system.
     """
     repeated_count, sample_count, runs = 0, 0, []
     for run in recording.runs:
@@ -306,8 +309,8 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     one may belong to a link without inertia in the model file.
 
     Args:
-        recording: the recording.
-        run: the recorded run.
+        recording: recorded runs, with their channels, inputs and constants.
+        run: recorded run: times, channels and inputs.
         kind: simulator class.
     """
     # The forces of a system with its own stepping are not accessible.
@@ -324,15 +327,15 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     typical_sizes = {channel.name: channel.scale for channel in system.channels}
     doubtful: Anomaly | None = None
     for column, name in enumerate(system.coordinates):
-        x = run.channels.get(name)
-        if x is None:
+        values = run.channels.get(name)
+        if values is None:
             continue
-        spread = float(np.nanstd(x))
+        spread = float(np.nanstd(values))
         rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
         if not (spread > MIN_MOTION_SHARE * typical_sizes.get(name, 1.0) and rms_acceleration > 0):
             continue
         expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
-        recorded_seconds = interval * _estimate_lag(x)
+        recorded_seconds = interval * _estimate_lag(values)
         ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
             moves = (
@@ -371,8 +374,8 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     The system is at rest, so drag and friction do not act; D is the number of coordinates.
 
     Args:
-        recording: the recording.
-        run: the recorded run.
+        recording: recorded runs, with their channels, inputs and constants.
+        run: recorded run: times, channels and inputs.
         system: system of the recording.
     """
     count = run.times.size
@@ -384,11 +387,13 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
         run.channels.get(name, default_position)
         for name, default_position in zip(system.coordinates, default, strict=True)
     ]
-    x = np.stack(columns, axis=1)
+    positions = np.stack(columns, axis=1)
     zeros = np.zeros((count, 1))
     inputs = {c.name: zeros for c in system.inputs}
     inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
-    moment = StateSnapshot(system, theta, constants, zeros, x, np.zeros_like(x), inputs)
+    moment = StateSnapshot(
+        system, theta, constants, zeros, positions, np.zeros_like(positions), inputs
+    )
     with np.errstate(all="ignore"):
         accelerations: Array = system.force(moment) / system.mass(theta, constants)
     return accelerations
@@ -509,6 +514,11 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
 
     The response to commands is p(t) = c + d t + sum_k h_k <u>_k(t) (1); a delay T that grows by a
     share e of the time gives y(t) = p - (T + e t) p' to first order (2).
+
+    Args:
+        run: Run with its times, inputs and channels.
+        command: Name of the input.
+        position: Name of the channel that follows it.
     """
     t, u, y = run.times, run.inputs[command], run.channels[position]
     is_recorded = np.isfinite(y)

@@ -399,7 +399,7 @@ def _compare_position_with_command(recording: Recording, command: str, position:
     sqrt(<u^2> <q^2>) (1).
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         command: name of the input.
         position: name of the channel.
     """

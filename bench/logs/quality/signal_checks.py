@@ -124,7 +124,7 @@ def _find_saturated_commands(
     """Find commands of a robot that are often at or beyond the range of their actuator.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: class of the simulator; only robots specify ranges.
     """
     if not kind.has_model:
@@ -194,7 +194,7 @@ def _iterate_channels(
     """Yield each recorded channel with its times and values in every run.
 
     Args:
-        recording: the recording.
+        recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class, which declares the channels.
     """
     for channel in kind.channels:

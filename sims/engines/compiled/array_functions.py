@@ -34,16 +34,7 @@ _lock = Lock()
 
 
 class ArrayFunctions:
-    """Functions on arrays of a module, compiled on first use into one piece of machine code.
-
-    Args:
-        module: name of the module, which holds this object under the name ``COMPILED``.
-        description: what is compiled, for messages to the user.
-        shapes: shapes of the arguments of each function (`data_layout`). A function with one
-            parameter receives them as one tuple, whose class is its annotation.
-        can_run_uncompiled: whether the functions run as Python where llvmlite is not installed, a
-            hundred times slower.
-    """
+    """Functions on arrays of a module, compiled on first use into one piece of machine code."""
 
     def __init__(
         self,
@@ -52,6 +43,16 @@ class ArrayFunctions:
         shapes: Mapping[Callable[..., None], Sequence[str]],
         can_run_uncompiled: bool = False,
     ) -> None:
+        """Store what is compiled; nothing is compiled before the first use.
+
+        Args:
+            module: name of the module, which holds this object under the name ``COMPILED``.
+            description: what is compiled, for messages to the user.
+            shapes: shapes of the arguments of each function (`data_layout`). A function with one
+                parameter receives them as one tuple, whose class is its annotation.
+            can_run_uncompiled: whether the functions run as Python where llvmlite is not installed,
+                a hundred times slower.
+        """
         self._module, self._description = module, description
         self._shapes = dict(shapes)
         self._can_run_uncompiled = can_run_uncompiled

@@ -88,8 +88,6 @@ def record_arc(block: Block, record: int, time: float) -> None:
     The position is x + v s + a s^2 / 2 and the velocity v + a s, with the time s since the
     beginning of the parabola. The record is position, velocity and acceleration, D numbers each.
 
-    Between impacts x(s) = x + v s + a s^2 / 2 (1) and v(s) = v + a s (2).
-
     Args:
         block: force program, batch elements, and buffers of the slots.
         record: index of the record.

@@ -62,7 +62,7 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     If all elements have the same steps, one row of steps is stored for all of them.
 
     Args:
-        batch: the batch.
+        batch: batch: system, initial states, inputs and effects of all elements.
         max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
     """

@@ -331,9 +331,6 @@ def handle_impact(block: Block, i: int, k: int) -> None:
     The remaining distance d to the ground is removed by the time correction (10), which is
     -d / r (1 + d a / (2 r^2)) with the rate r and acceleration a. Then the velocity changes.
 
-    The correction is s = -d / r (1 + d a / (2 r^2)) (10), with distance d to the event, its rate r
-    and acceleration a.
-
     Args:
         block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.

@@ -169,10 +169,6 @@ class EffectProgram(NamedTuple):
 class SystemTracer:
     """Traced system; effects are traced on first use.
 
-    Args:
-        system: system to trace.
-        names: input names and sizes.
-
     Raises:
         NotTraceableError: the system cannot be traced.
     """
@@ -182,6 +178,10 @@ class SystemTracer:
 
         Time, state and inputs change in each evaluation, parameters only between batch elements.
         `e`, `mu` and `speed` are restitution, friction coefficient and normal speed of an impact.
+
+        Args:
+            system: system to trace.
+            names: input names and sizes.
         """
         graph = ExpressionGraph()
         self.graph = graph
@@ -483,7 +483,7 @@ def _is_traceable(
 
     Args:
         tracer: tracer of the system.
-        effect: the effect.
+        effect: effect: a force, friction, input, sensor or contact law.
         batch: batch in which the effect acts, from which states for the check are taken.
         elements: indices of the elements on which it acts.
         names: names and sizes of the inputs.

@@ -46,14 +46,6 @@ class NumpyForces:
 
     Attributes:
         error: first exception of an array function; all later results are NaN.
-
-    Args:
-        system: system whose forces are evaluated.
-        names: input names and sizes.
-        effects: effects that act.
-        rows: registers of inputs and outputs; see `ProgramArrays`.
-        out: registers of the force.
-        r: (registers, W) registers.
     """
 
     def __init__(
@@ -68,6 +60,14 @@ class NumpyForces:
         """Make the C callback with which the compiled instructions call the array functions.
 
         `_snapshots` caches, by the number of slots, arrays that are views of the registers.
+
+        Args:
+            system: system whose forces are evaluated.
+            names: input names and sizes.
+            effects: effects that act.
+            rows: registers of inputs and outputs; see `ProgramArrays`.
+            out: registers of the force.
+            r: (registers, W) registers.
         """
         self.error: BaseException | None = None
         self._system = system

@@ -349,9 +349,6 @@ class BallRollout:
         The engine's velocity w belongs to the time half a step before the position. The applied
         force per unit mass, (v + h/2 a - w) / h - g (4), makes the velocity v' = w' + h/2 a' (3)
         of second order in the step h.
-
-        The additional force per unit mass is f = (v + h/2 a - w) / h - g (4), with the engine's
-        velocity w half a step before the position.
         """
         half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)

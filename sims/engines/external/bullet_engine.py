@@ -213,12 +213,12 @@ class _BulletMover:
 
     def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
         """Advance by each number of steps in `counts` under gravity alone; return the states."""
-        p = bullet_world.import_pybullet()
+        pybullet = bullet_world.import_pybullet()
         client = self._client
         body = self._body
-        step = p.stepSimulation
-        get_position = p.getBasePositionAndOrientation
-        get_velocity = p.getBaseVelocity
+        step = pybullet.stepSimulation
+        get_position = pybullet.getBasePositionAndOrientation
+        get_velocity = pybullet.getBaseVelocity
         states: list[BallState] = []
         for count in counts:
             for _ in range(count):
@@ -324,12 +324,16 @@ class BulletNativeBall(_BulletMover):
         if friction:
             ball_friction = self._lateral_friction**2 + friction
             ground_friction = 1.0
-        p = bullet_world.import_pybullet()
+        pybullet = bullet_world.import_pybullet()
         if friction or self._contact[1]:
-            floor = p.getBodyUniqueId(0, self._client)
+            floor = pybullet.getBodyUniqueId(0, self._client)
             for body, value in ((floor, ground_friction), (self._body, ball_friction)):
-                p.changeDynamics(body, -1, lateralFriction=value, physicsClientId=self._client)
-        p.changeDynamics(self._body, -1, restitution=restitution, physicsClientId=self._client)
+                pybullet.changeDynamics(
+                    body, -1, lateralFriction=value, physicsClientId=self._client
+                )
+        pybullet.changeDynamics(
+            self._body, -1, restitution=restitution, physicsClientId=self._client
+        )
         self._contact = restitution, friction
 
     def is_near_contact(self, gap: float) -> bool:

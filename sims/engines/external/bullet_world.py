@@ -52,14 +52,15 @@ class PersistentBulletWorld:
     Building a world costs as much as simulating a hundred samples, so it is built once for each set
     of constants. At the start of each rollout, the owner must reset everything that a rollout may
     have changed.
-
-    Args:
-        build: Function called with (client, constants) on an empty world; returns the id of the
-            moving body.
     """
 
     def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
-        """Store the build function; Bullet is connected when the body is first requested."""
+        """Store the build function; Bullet is connected when the body is first requested.
+
+        Args:
+            build: Function called with (client, constants) on an empty world; returns the id of the
+                moving body.
+        """
         self._build = build
         self._client = -1
         self._body = -1
@@ -201,14 +202,14 @@ class BulletJoint:
         Returns:
             Position and velocity after each count.
         """
-        p = import_pybullet()
+        pybullet = import_pybullet()
         client = self._client
         body = self._body
         # The attributes are looked up once, because a rollout has thousands of steps.
-        step = p.stepSimulation
-        push = p.setJointMotorControl2
-        torque = p.TORQUE_CONTROL
-        get_joint_state = p.getJointState
+        step = pybullet.stepSimulation
+        push = pybullet.setJointMotorControl2
+        torque = pybullet.TORQUE_CONTROL
+        get_joint_state = pybullet.getJointState
         states = []
         for count in counts:
             for _ in range(count):

@@ -104,6 +104,8 @@ class ElementWork:
     ) -> StateSnapshot:
         """Make a snapshot of n states of this element.
 
+        Shapes: D coordinates.
+
         Args:
             t: (n, 1) times in seconds.
             x: (n, D) positions.
@@ -147,14 +149,16 @@ def integrate_batch(
         *(np.full((len(batch.theta), count, batch.x.shape[1]), np.nan) for _ in range(3))
     )
     work: list[tuple[int, ElementWork, Indices]] = []
-    for i in range(len(batch.theta)):
+    for element_index in range(len(batch.theta)):
         # Elements of one run are adjacent and have the same steps.
-        if i == 0 or not np.array_equal(batch.steps[i], batch.steps[i - 1]):
-            timing = _compute_timing(batch.steps[i], batch.steps_per_sample)
-        element = _make_element(batch, i, *timing[:3])
+        if element_index == 0 or not np.array_equal(
+            batch.steps[element_index], batch.steps[element_index - 1]
+        ):
+            timing = _compute_timing(batch.steps[element_index], batch.steps_per_sample)
+        element = _make_element(batch, element_index, *timing[:3])
         # A rollout that is certain to fail would cost the engine its world.
         if all(np.isfinite(values).all() for values in _list_numbers(element)):
-            work.append((i, element, timing[3]))
+            work.append((element_index, element, timing[3]))
 
     def integrate_share(k: int) -> None:
         """Integrate every n-th element from the k-th on with rollout k of n, in its own thread.
@@ -162,7 +166,7 @@ def integrate_batch(
         A failed element stays NaN, and the world is discarded, because it may be in any
         state.
         """
-        for i, element, output_rows in work[k :: len(rollouts)]:
+        for element_index, element, output_rows in work[k :: len(rollouts)]:
             trajectory = rollouts[k](element)
             if not is_finite(trajectory):
                 discard()
@@ -170,7 +174,7 @@ def integrate_batch(
             for result, values in zip(
                 (trajectories.x, trajectories.v, trajectories.a), trajectory, strict=True
             ):
-                result[i] = values[output_rows]
+                result[element_index] = values[output_rows]
 
     try:
         if len(rollouts) == 1:
@@ -191,6 +195,8 @@ def is_finite(path: Trajectory) -> bool:
 
 def _compute_timing(steps: Array, steps_per_sample: int) -> tuple[Indices, Array, Indices, Indices]:
     """Return which steps of one element have a length, and when its state is recorded.
+
+    Shapes: S steps.
 
     Args:
         steps: (S,) step sizes in seconds; zero where the element waits.
@@ -263,6 +269,8 @@ def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
 
     A change of the step size costs an engine more than a step.
 
+    Shapes: S steps.
+
     Args:
         steps: (S,) step sizes in seconds, > 0.
         steps_per_sample: number of steps from one sample to the next.
@@ -283,6 +291,8 @@ def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
 
 def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, list[int]]]:
     """Split the steps into legs in which neither the step size nor any signal changes.
+
+    Shapes: S steps.
 
     Args:
         element: batch element.
@@ -338,10 +348,6 @@ class ElementForces:
 
     Attributes:
         acts: whether forces act in addition to gravity.
-
-    Args:
-        element: batch element.
-        states: number of states that are evaluated in one call.
     """
 
     def __init__(self, element: ElementWork, states: int) -> None:
@@ -349,6 +355,10 @@ class ElementForces:
 
         A register holds one number for each of the `states`. The offsets are positions of
         first numbers in the flat memory of all registers.
+
+        Args:
+            element: batch element.
+            states: number of states that are evaluated in one call.
         """
         prepared = element.program.prepare(states)
         rows, flags = prepared.arrays.rows, prepared.arrays.flags

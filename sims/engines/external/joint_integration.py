@@ -263,6 +263,8 @@ def integrate_velocity(
 def _compute_drive_forces(element: ElementWork) -> Array:
     """Return the generalised force (S,) of the inputs over each step, at least one value.
 
+    Shapes: S steps.
+
     Args:
         element: Batch element with inputs that are constant over each step.
     """
@@ -365,9 +367,6 @@ def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step:
     The engine's velocity w belongs to the time half a step h before. All arguments are numbers or
     arrays.
 
-    It is v = (w + h/2 (G + u) / M) / (1 + h/2 c / M) (6), with gravity G, input u, mass M and
-    damping c.
-
     Args:
         w: the engine's velocity, half a step before the position.
         force: force at the position.
@@ -404,8 +403,6 @@ def _compute_transition_force(
     """Return the force over the step in which the input changes from u to u', equation (8).
 
     It is u' + (1/2 - h c / (4 M)) (u - u'), so that the step has half an impulse of each.
-
-    It is u' + (1/2 - h c / (4 M)) (u - u') (8).
 
     Args:
         drive_force: force of the input before the change.

@@ -56,14 +56,14 @@ def import_mujoco() -> Any:
 
 
 class CompiledWorld:
-    """MuJoCo model and its state, compiled on first use and again when the constants change.
-
-    Args:
-        model: function from constants to MJCF.
-    """
+    """MuJoCo model and its state, compiled on first use and again when the constants change."""
 
     def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
-        """Store the function that writes the MJCF; nothing is compiled before the first use."""
+        """Store the function that writes the MJCF; nothing is compiled before the first use.
+
+        Args:
+            model: function from constants to MJCF.
+        """
         self._compile = model
         self._built_for: dict[str, float] | None = None
         self._model: Any = None

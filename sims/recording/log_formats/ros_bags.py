@@ -139,17 +139,16 @@ _SECONDS_PER_NANOSECOND = 1e-9
 
 
 class MessageTable:
-    """Table to which the messages of a topic are added one by one.
-
-    Args:
-        wanted_names: Names of the numbers to store, in any case; all if empty.
-    """
+    """Table to which the messages of a topic are added one by one."""
 
     def __init__(self, wanted_names: Collection[str] = ()) -> None:
         """Start with no messages; the wanted names are compared in lower case.
 
         `_stamps` and `_written` hold the times of the messages in seconds: from their
         headers, and when they were written to the log.
+
+        Args:
+            wanted_names: Names of the numbers to store, in any case; all if empty.
         """
         # A column named run may number the runs of the log.
         self._wanted = (

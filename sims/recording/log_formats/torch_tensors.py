@@ -141,7 +141,7 @@ def _read_tensors(
 
     Args:
         path: path of the file, for messages.
-        archive: the open archive.
+        archive: archive, open for reading.
 
     Raises:
         InputError: the archive has no single pickle program, or one that is too large.
@@ -200,7 +200,7 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
 
     Args:
         path: path of the file, for messages.
-        archive: the open archive.
+        archive: archive, open for reading.
         folder: folder of the program in the archive.
         tensor: storage, offset, size and strides of the tensor.
 

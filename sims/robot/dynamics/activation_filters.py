@@ -71,8 +71,7 @@ class ActivationFilter(NamedTuple):
         They approach the control by the share h / T in each step (Euler's method) or by
         1 - exp(-h / T) (exactly).
 
-        With time constant T and step h, a[k+1] = a[k] + (h / T) (u[k] - a[k]) (1); the exact form
-        has the factor 1 - exp(-h / T) (2).
+        Shapes: S steps.
 
         Args:
             controls: (n, S) controls of the steps.
@@ -112,17 +111,17 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
     filterexact_id = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
     filters_found = []
     for actuator in robot.actuators:
-        i = actuator.id
-        if int(model.actuator_dyntype[i]) not in filters() or actuator.controls != 1:
+        actuator_id = actuator.id
+        if int(model.actuator_dyntype[actuator_id]) not in filters() or actuator.controls != 1:
             continue
-        is_limited = bool(model.actuator_actlimited[i])
-        low, high = model.actuator_actrange[i] if is_limited else (-np.inf, np.inf)
+        is_limited = bool(model.actuator_actlimited[actuator_id])
+        low, high = model.actuator_actrange[actuator_id] if is_limited else (-np.inf, np.inf)
         filters_found.append(
             ActivationFilter(
                 actuator,
-                int(model.actuator_actadr[i]),
-                float(model.actuator_dynprm[i, 0]),
-                int(model.actuator_dyntype[i]) == filterexact_id,
+                int(model.actuator_actadr[actuator_id]),
+                float(model.actuator_dynprm[actuator_id, 0]),
+                int(model.actuator_dyntype[actuator_id]) == filterexact_id,
                 (float(low), float(high)),
             )
         )

@@ -106,6 +106,8 @@ class RunInputs(NamedTuple):
     def find_steps_with_sample(self, step: float) -> Mask:
         """Return whether a sample is at the beginning of the first step and each step end (S + 1,).
 
+        Shapes: S steps.
+
         Args:
             step: step length in seconds.
         """
@@ -135,6 +137,8 @@ def compute_inputs_over_steps(
 
     An applied input is the command after all input effects (gain, delay, lag and so on). MuJoCo
     holds a control over a step, so that each value is a mean over the step.
+
+    Shapes: T samples, K coefficients.
 
     Args:
         step: step length in seconds.
@@ -182,6 +186,8 @@ def compute_changed_inputs(
 
     Effects with a state are integrated step by step, and a step costs about the same for few and
     for many batch elements.
+
+    Shapes: L batch elements, S steps.
 
     Args:
         step: step length in seconds.
@@ -259,6 +265,8 @@ def _group_by_active_effects(
 
     Yields: Indices of a group's elements, and the effects with the coefficients of these
     elements.
+
+    Shapes: K coefficients.
 
     Args:
         input_effects: effects with coefficients (K, n, 1).
@@ -376,6 +384,8 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     step and none at its beginning, -D is added to the previous step and +D to this one, since only
     the states at samples are observed. So a command that changes within a step is applied neither
     early nor late by a fraction of the step.
+
+    Shapes: S steps.
 
     Args:
         parts: (n, S, 4) means over the quarters.

@@ -55,9 +55,14 @@ def list_last_read_times(work: RobotRunBatch) -> Array:
     """
     end = work.times[-1:]
     latest = float(end[0])
-    for effect, c in work.acting:
+    for effect, coefficients in work.acting:
         if isinstance(effect, Sensor):
-            latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
+            latest = max(
+                latest,
+                float(
+                    np.max(effect.times(coefficients, np.broadcast_to(end, coefficients[0].shape)))
+                ),
+            )
     # Implausible values that a fit tries must not cost thousands of steps.
     return np.array([min(latest, MAX_DURATION_FACTOR * float(end[0]) + MAX_EXTRA_SECONDS)])
 

@@ -103,14 +103,7 @@ def step_in_callback(
 
 
 class _CallbackContexts:
-    """Contexts of the callback for all batch elements, and the arrays that they refer to.
-
-    Args:
-        mujoco_batch: the batch.
-        compiled: compiled forces of effects, begun.
-        losses: (n, D) dry friction of the model without effects.
-        steps: number of steps S.
-    """
+    """Contexts of the callback for all batch elements, and the arrays that they refer to."""
 
     def __init__(
         self, mujoco_batch: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
@@ -121,6 +114,14 @@ class _CallbackContexts:
         element (`batch_index`). `self._arrays` keeps all of them alive, because the callback holds
         only their addresses. The table of contexts has one row of 64-bit integers per
         element.
+
+        Shapes: D joints.
+
+        Args:
+            mujoco_batch: the batch.
+            compiled: compiled forces of effects, begun.
+            losses: (n, D) dry friction of the model without effects.
+            steps: number of steps S.
         """
         layout = compiled.layout
         self._dofs = compiled.addresses.velocities
@@ -213,10 +214,10 @@ def find_data_offsets() -> dict[str, int] | None:
         return None
     data_words = (ctypes.c_int64 * MAX_DATA_WORDS).from_address(data._address)
     offsets: dict[str, int] = {}
-    for i in range(MAX_DATA_WORDS):
-        name = field_at_address.get(data_words[i])
+    for word in range(MAX_DATA_WORDS):
+        name = field_at_address.get(data_words[word])
         if name is not None:
-            offsets[name] = i
+            offsets[name] = word
         # Nothing is read beyond the last of the fields.
         if name == LAST_FIELD:
             break

@@ -82,12 +82,7 @@ class _Program(NamedTuple):
 
 
 class _Tracing:
-    """Traced state of a robot, and programs of the effects that are evaluated at it.
-
-    Args:
-        system: system of the robot.
-        inputs: names of the inputs.
-    """
+    """Traced state of a robot, and programs of the effects that are evaluated at it."""
 
     def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
         """Make graph inputs for everything that effects may read, and snapshots from them.
@@ -96,6 +91,10 @@ class _Tracing:
         arithmetic. There are two instants: the beginning of a step, and its middle with the
         predicted state (midpoint rule). Time, states and inputs change in each step; the servo
         stiffness is constant for a batch element.
+
+        Args:
+            system: system of the robot.
+            inputs: names of the inputs.
         """
         graph = ExpressionGraph()
         joints = len(system.coordinates)
@@ -228,10 +227,6 @@ class CompiledForces:
         has_dry_friction: as in `EffectForces`.
         addresses: as in `EffectForces`.
         loaded: as in `EffectForces`.
-
-    Args:
-        forces: effects to evaluate.
-        program: program of these effects.
     """
 
     def __init__(self, forces: EffectForces, program: _Program) -> None:
@@ -240,6 +235,10 @@ class CompiledForces:
         Constant are the step length, the servo stiffness and the coefficients. Instructions
         that depend only on them, from `first` to `moment`, run once here; the rest runs in
         each step.
+
+        Args:
+            forces: effects to evaluate.
+            program: program of these effects.
         """
         self.has_dry_friction = forces.has_dry_friction
         self.addresses = forces.addresses
@@ -331,6 +330,8 @@ class CompiledForces:
     def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Run the program for step k of all batch elements; see `EffectForces.compute`.
 
+        Shapes: L batch elements, D joints.
+
         Args:
             k: number of the step.
             joint_states: states of the joints at the beginning of the step.
@@ -338,22 +339,22 @@ class CompiledForces:
         Returns:
             Forces (L, D) and limits of dry friction (L, D), in N or N m.
         """
-        r = self._registers
+        registers = self._registers
         for rows, values in zip(self._motion, joint_states, strict=True):
-            r[rows] = values.T
-        r[self._t] = k * self._source.step
-        r[self._midpoint_time] = (k + 0.5) * self._source.step
+            registers[rows] = values.T
+        registers[self._t] = k * self._source.step
+        registers[self._midpoint_time] = (k + 0.5) * self._source.step
         if self._source.applied_inputs:
-            r[self._u] = self._stacked_inputs[k]
+            registers[self._u] = self._stacked_inputs[k]
         hidden = self._source.hidden
         if hidden and k < 2:
-            r[self._state_interval] = self._source.step if k else 0.5 * self._source.step
+            registers[self._state_interval] = self._source.step if k else 0.5 * self._source.step
         if not k:
             self.begin(joint_states)
         self._run()
         if hidden:
-            r[self._states] = r[self._program.states]
-        return r[self._program.force].T, r[self._program.limit].T
+            registers[self._states] = registers[self._program.states]
+        return registers[self._program.force].T, registers[self._program.limit].T
 
 
 def compile_forces(forces: EffectForces) -> CompiledForces | None:
@@ -387,7 +388,7 @@ def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> boo
     Args:
         tracing: traced state of the robot.
         forces: effects of the batch, evaluated by NumPy.
-        effect: the effect.
+        effect: effect: a force, friction, input, sensor or contact law.
     """
     if not effect.is_traceable:
         return False
@@ -426,11 +427,13 @@ def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
     compiled = CompiledForces(forces, program)
     rng = np.random.default_rng(0)
     steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.applied_inputs.values())])
-    for k in range(steps):
+    for step_index in range(steps):
         shape = (len(JointStates._fields), *forces.stiffness.shape)
         joint_states = JointStates(*(rng.normal(size=shape) * rng.choice(TEST_STATE_SIZES)))
         for result, expected in zip(
-            compiled.compute(k, joint_states), forces.compute(k, joint_states), strict=True
+            compiled.compute(step_index, joint_states),
+            forces.compute(step_index, joint_states),
+            strict=True,
         ):
             tolerance = MAX_PROGRAM_DEVIATION * np.abs(expected[np.isfinite(expected)]).max(
                 initial=0.0

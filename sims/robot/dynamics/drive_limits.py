@@ -97,6 +97,8 @@ class ForceRanges:
 def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
     """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
 
+    Shapes: D joints.
+
     Args:
         robot: robot whose actuators are meant.
         velocities: (D,) addresses of the velocities of the coordinates in `qvel`.
@@ -152,16 +154,16 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
     force_limits: list[tuple[int, tuple[str, int], float, float]] = []
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
-        for k in range(model.nu):
-            dof = _find_dof(model, k)
+        for actuator_id in range(model.nu):
+            dof = _find_dof(model, actuator_id)
             if dof is None:
                 continue
-            gear = abs(float(model.actuator_gear[k, 0]))
-            gain = -float(model.actuator_biasprm[k, 2]) * gear**2
+            gear = abs(float(model.actuator_gear[actuator_id, 0]))
+            gain = -float(model.actuator_biasprm[actuator_id, 2]) * gear**2
             gains[dof] += gain
-            if model.actuator_forcelimited[k] and _is_stiff(model, dof, gain):
-                limit = float(np.abs(model.actuator_forcerange[k]).max())
-                force_limits.append((dof, ("actuator_force", k), limit, limit * gear))
+            if model.actuator_forcelimited[actuator_id] and _is_stiff(model, dof, gain):
+                limit = float(np.abs(model.actuator_forcerange[actuator_id]).max())
+                force_limits.append((dof, ("actuator_force", actuator_id), limit, limit * gear))
         for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
             dof = int(model.jnt_dofadr[joint])
             if _is_stiff(model, dof, float(gains[dof])):

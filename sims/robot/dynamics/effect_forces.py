@@ -51,6 +51,8 @@ def make_snapshot(
     The system of a robot has neither parameters nor constants: all its numbers are in MuJoCo's
     model.
 
+    Shapes: L batch elements, D joints.
+
     Args:
         system: system of the robot.
         t: (L, 1) time since the start in seconds.
@@ -74,6 +76,8 @@ def compute_time_dependent_forces(
 
     They are known before the simulation and applied as generalised forces, so that the batch
     needs no evaluation of effects in each step.
+
+    Shapes: S steps, K coefficients.
 
     Args:
         system: system of the robot.
@@ -115,14 +119,6 @@ class EffectForces:
         hidden: effects with hidden states, with their coefficients.
         working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all are
             on.
-
-    Args:
-        system: see the attributes.
-        acting: effects at one place each.
-        applied_inputs: see the attributes.
-        addresses: see the attributes.
-        stiffness: see the attributes.
-        step: see the attributes.
     """
 
     def __init__(
@@ -139,6 +135,14 @@ class EffectForces:
         Left out are effects that a batch handles otherwise: those written into model
         fields, those whose force depends only on time (precomputed), and those in series
         with joints.
+
+        Args:
+            system: see the attributes.
+            acting: effects at one place each.
+            applied_inputs: see the attributes.
+            addresses: see the attributes.
+            stiffness: see the attributes.
+            step: see the attributes.
         """
         self.system = system
         self.applied_inputs = applied_inputs
@@ -178,6 +182,8 @@ class EffectForces:
     def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Compute forces and dry friction limits (L, D) at the middle of step k.
 
+        Shapes: L batch elements, D joints.
+
         Args:
             k: number of the step; must increase by one from call to call.
             joint_states: joint states at the beginning of the step.
@@ -210,6 +216,8 @@ class EffectForces:
     def _make_snapshot(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
         """Return the snapshot after a number of steps, with the inputs of step k.
 
+        Shapes: L batch elements, D joints.
+
         Args:
             steps: number of steps since the beginning; not whole within a step.
             k: index of the step.
@@ -235,6 +243,8 @@ def is_in_drive(effect: Effect) -> bool:
 def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) -> Array:
     """Compute the forces (L, D) that effects in drives add to the drives.
 
+    Shapes: L batch elements, D joints, K coefficients.
+
     Args:
         acting: effects with their coefficients (K, L, 1).
         snapshot: state of the batch.
@@ -246,6 +256,8 @@ def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) 
 
 def compute_effect_forces(forces: Sequence[tuple[Force, Array]], snapshot: RobotSnapshot) -> Array:
     """Add up the forces of all effects, (L, D) in N or N m.
+
+    Shapes: L batch elements, D joints, K coefficients.
 
     Args:
         forces: effects with their coefficients (K, L, 1).
@@ -263,6 +275,8 @@ def compute_friction_limits(
     """Add up the limits of dry friction of all effects, (L, D) in N or N m.
 
     MuJoCo's solver then finds the friction force within these limits.
+
+    Shapes: L batch elements, D joints, K coefficients.
 
     Args:
         frictions: friction effects with their coefficients (K, L, 1).
@@ -283,6 +297,8 @@ def compute_hidden_state_forces(
     step: float,
 ) -> tuple[Array, list[HiddenState]]:
     """Advance hidden states of effects, and compute their forces afterwards.
+
+    Shapes: L batch elements, D joints.
 
     Args:
         hidden: effects with their coefficients.
@@ -342,6 +358,8 @@ def find_active_elements(
     which an effect depends on the state. An effect with only zero coefficients counts as
     absent.
 
+    Shapes: K coefficients.
+
     Args:
         acting: effects with their coefficients (K, L, 1).
         count: number L of batch elements.
@@ -360,6 +378,8 @@ def find_active_elements(
 def slice_active_effects(acting: ActiveEffects, batch_indices: IndexArray) -> ActiveEffects:
     """Restrict active effects to some batch elements, and drop effects that are zero there.
 
+    Shapes: L batch elements, K coefficients.
+
     Args:
         acting: effects with their coefficients (K, L, 1).
         batch_indices: indices of the batch elements.
@@ -373,6 +393,8 @@ def slice_active_effects(acting: ActiveEffects, batch_indices: IndexArray) -> Ac
 
 def pad_coefficients(acting: ActiveEffects, n: int, count: int) -> ActiveEffects:
     """Pad coefficients with zeros to the size of a batch.
+
+    Shapes: K coefficients.
 
     Args:
         acting: effects with their coefficients (K, n, 1).

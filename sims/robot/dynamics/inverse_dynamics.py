@@ -54,15 +54,15 @@ def motion_forces(
     positions = np.array([joint.position for joint in joints], dtype=np.intp)
     dofs = np.array([joint.velocity for joint in joints], dtype=np.intp)
     needed, driven = np.zeros(motion.shape[1:]), np.zeros(motion.shape[1:])
-    for k in range(motion.shape[1]):
-        qpos[positions], qvel[dofs], qacc[dofs] = motion[:, k]
+    for step_index in range(motion.shape[1]):
+        qpos[positions], qvel[dofs], qacc[dofs] = motion[:, step_index]
         mujoco.mj_inverse(model, data)
-        needed[k] = inverse_forces[dofs]
-        ctrl[:] = controls[k]
+        needed[step_index] = inverse_forces[dofs]
+        ctrl[:] = controls[step_index]
         if activations is not None:
-            act[:] = activations[k]
+            act[:] = activations[step_index]
         mujoco.mj_fwdActuation(model, data)
-        driven[k] = actuator_forces[dofs]
+        driven[step_index] = actuator_forces[dofs]
     return MotionForces(needed, driven)
 
 
@@ -142,6 +142,8 @@ def coefficient_scales(robot: RobotModel) -> JointScales:
     of the parent joint
     of the same kind. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges
     of its joint vanish.
+
+    Shapes: D joints.
     """
     joint_scales = compute_joint_scales(robot)
     force, inertia = joint_scales.force.copy(), joint_scales.inertia.copy()

@@ -103,21 +103,7 @@ class IntervalMaps:
 
 
 class MeasuredLinear(RunLinearisation):
-    """The linear model of one run about a given motion.
-
-    Args:
-        simulator: simulator of the robot.
-        theta: (dim,) parameters.
-        scenario: scenario of the run.
-        start: (D,) positions and velocities at which the simulated motion begins.
-        trajectory: given motion.
-        measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
-            samples, by joint number; all other joints follow the simulation.
-        nearby: linear model of a similar motion, whose commands and readings are reused.
-        reuses_jacobians: whether its Jacobians are reused as well.
-        reuses_loads: whether the loads of its transmissions are reused as well, unless an active
-            effect depends on them.
-    """
+    """The linear model of one run about a given motion."""
 
     def __init__(
         self,
@@ -136,6 +122,21 @@ class MeasuredLinear(RunLinearisation):
         Difference quotients are held for one sample interval, but not for less than
         `LINEARISATION_INTERVAL_SECONDS` or more than `MAX_JACOBIAN_SECONDS`. `knots` (T,) are the
         numbers of the steps at the samples.
+
+        Shapes: T samples, D joints.
+
+        Args:
+            simulator: simulator of the robot.
+            theta: (dim,) parameters.
+            scenario: scenario of the run.
+            start: (D,) positions and velocities at which the simulated motion begins.
+            trajectory: given motion.
+            measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
+                samples, by joint number; all other joints follow the simulation.
+            nearby: linear model of a similar motion, whose commands and readings are reused.
+            reuses_jacobians: whether its Jacobians are reused as well.
+            reuses_loads: whether the loads of its transmissions are reused as well, unless an
+                active effect depends on them.
         """
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
         self._reuses_loads = reuses_loads
@@ -285,6 +286,8 @@ class MeasuredLinear(RunLinearisation):
 
         Both models have the same motion and Jacobians.
 
+        Shapes: T samples, C channels.
+
         Args:
             similar: the other model.
 
@@ -363,6 +366,8 @@ class MeasuredLinear(RunLinearisation):
         applied to predicted readings: a gain applied to the recorded reading would contain the
         noise that it has to explain.
 
+        Shapes: T samples, C channels.
+
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
             predicted: δ (T, Z) at the samples, each predicted from the preceding samples.
@@ -428,6 +433,8 @@ class MeasuredLinear(RunLinearisation):
         may be nonlinear, so they are applied to the predicted readings and the readings
         without them are subtracted.
 
+        Shapes: S steps, T samples, C channels.
+
         Args:
             read: (S, O, K) direct changes of readings by effects in the model.
             sensors: sensor effects of each of the K candidates.
@@ -462,6 +469,8 @@ class MeasuredLinear(RunLinearisation):
         """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
 
         In each step a deviation δ becomes A δ - d + B f, with the defect d of the step.
+
+        Shapes: S steps, T samples.
 
         Args:
             deviations: δ (T, Z) at the samples.
@@ -517,6 +526,8 @@ def compute_transmission_loads(
     simulator: RobotSimulator, acting: ActiveEffects, motion: RobotMotion
 ) -> Array:
     """Compute the loads (2, S, D) of the transmissions in a motion.
+
+    Shapes: S steps, D joints.
 
     Args:
         simulator: simulator of the robot.

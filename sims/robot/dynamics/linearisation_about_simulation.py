@@ -53,13 +53,6 @@ SPRING_EFFECTS = frozenset({"spring.linear", "spring.cubic"})
 class RunLinearisation:
     """Linearisation of one run of a robot.
 
-    Args:
-        simulator: simulator of the robot.
-        theta: (dim,) parameters.
-        scenario: scenario of the run.
-        x: (D,) initial positions.
-        v: (D,) initial velocities.
-
     Attributes:
         held: time in seconds for which difference quotients are reused.
         quotients: difference quotients of another motion nearby, to be reused.
@@ -77,6 +70,15 @@ class RunLinearisation:
         `self._sensor_channels` are the channels that observe MuJoCo's sensors: drive forces
         (tau.) and sensors (s.). `self._preparation_count` is the number of batch elements that the
         preparation took; it is part of the cost.
+
+        Shapes: D joints.
+
+        Args:
+            simulator: simulator of the robot.
+            theta: (dim,) parameters.
+            scenario: scenario of the run.
+            x: (D,) initial positions.
+            v: (D,) initial velocities.
         """
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
@@ -223,6 +225,8 @@ class RunLinearisation:
 
         Effects in series with joints have no small size, so they are simulated.
 
+        Shapes: T samples, C channels.
+
         Args:
             added: effects with their coefficients.
 
@@ -287,6 +291,8 @@ class RunLinearisation:
         """Simulate observations (K, T, C) of the run with each effect added.
 
         An added effect replaces the simpler effects of the run that it contains.
+
+        Shapes: T samples, C channels.
         """
         count, work = len(added), self._work
         acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
@@ -326,7 +332,7 @@ class RunLinearisation:
 
         Args:
             owner: number of the candidate.
-            effect: the effect.
+            effect: effect: a force, friction, input, sensor or contact law.
             c: (K, 1, 1) its coefficients.
         """
         name = effect.of or effect.name
@@ -358,7 +364,7 @@ class RunLinearisation:
         than a changed model.
 
         Args:
-            name: name of the effect.
+            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             joint: index of its joint; None if it acts elsewhere.
         """
         if name not in SPRING_EFFECTS or joint is None:
@@ -372,6 +378,8 @@ class RunLinearisation:
 
         The responses to input effects are computed together, with one batch element for each effect
         and coefficient vector.
+
+        Shapes: K coefficients.
 
         Args:
             rows: For each batch element: an index that is not used here, the effect, and its
@@ -394,6 +402,8 @@ class RunLinearisation:
         self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]
     ) -> Array:
         """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
+
+        Shapes: S steps, T samples, C channels.
 
         Args:
             states: (n, S, Z) changes of the states at the beginnings of steps.

@@ -86,17 +86,6 @@ class RobotMotion:
 class LinearisationPoints:
     """Linearisation points of one motion.
 
-    Args:
-        mujoco_batch: batch of the robot; its size is the number of points evaluated together.
-        system: system of the robot.
-        motion: the motion.
-        acting: effects active in it, with coefficients (K, 1, 1).
-        outputs: fields of MuJoCo's data and their columns that are read, in addition to the state.
-        joints: addresses of the joints.
-        drives: for each output, the number of the joint whose drive force it is; -1 for other
-            outputs.
-        held: interval of the linearisation in seconds.
-
     Attributes:
         motion: the given motion.
         acting: the given effects.
@@ -125,6 +114,20 @@ class LinearisationPoints:
         needs them. `self._stepwise_effects` are the effects whose forces are evaluated here,
         because no model field represents them, and `self._drive_effect_forces` (n, D) are the
         forces that they exert in drives.
+
+        Shapes: D joints, K coefficients.
+
+        Args:
+            mujoco_batch: batch of the robot; its size is the number of points evaluated together.
+            system: system of the robot.
+            motion: motion at all steps: states, controls and forces.
+            acting: effects active in it, with coefficients (K, 1, 1).
+            outputs: fields of MuJoCo's data and their columns that are read, in addition to the
+                state.
+            joints: addresses of the joints.
+            drives: for each output, the number of the joint whose drive force it is; -1 for other
+                outputs.
+            held: interval of the linearisation in seconds.
         """
         self.motion, self.acting = motion, acting
         self._mujoco_batch, self._system = mujoco_batch, system
@@ -494,6 +497,8 @@ class LinearisationPoints:
         Such an effect is a force at an actuator, for example that of a supply that sags. A sensor
         of the drive force shows it at once, before the motion changes.
 
+        Shapes: K coefficients.
+
         Args:
             effect: effect in a drive.
             c: coefficients (K, 1, 1).
@@ -518,6 +523,8 @@ class LinearisationPoints:
 
         The effect is evaluated along the unperturbed motion, at all steps at once. Dry
         friction is the force within its limit that the motion determines.
+
+        Shapes: S steps, D joints, K coefficients.
 
         Args:
             effect: effect with a force, a friction or a hidden state.
@@ -551,6 +558,8 @@ class LinearisationPoints:
 
         So f changes its sign about 1 / b before v does: 9.5 ms with MuJoCo's defaults, and up to a
         step in the stiff form.
+
+        Shapes: S steps.
         """
         motion, robot = self.motion, self._mujoco_batch.robot
         dof, steps = int(self._joints.velocities[joint]), len(motion.controls)
@@ -563,8 +572,10 @@ class LinearisationPoints:
     def integrate_hidden_state(self, effect: Effect, c: Array) -> HiddenState:
         """Integrate an effect's hidden state (S + 1, 1) along the motion; empty if it has none.
 
+        Shapes: S steps.
+
         Args:
-            effect: the effect.
+            effect: effect: a force, friction, input, sensor or contact law.
             c: (K, 1, 1) its coefficients.
         """
         if not isinstance(effect, HiddenStateEffect):
@@ -592,8 +603,10 @@ def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, Index
 
     The count begins again where a piecewise constant command jumps or an actuator is switched.
 
+    Shapes: S steps.
+
     Args:
-        motion: the motion.
+        motion: motion at all steps: states, controls and forces.
         spacing: regular number of steps between two points.
 
     Returns:

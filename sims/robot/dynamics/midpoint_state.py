@@ -99,12 +99,6 @@ class MidpointPredictor:
 
     Attributes:
         dof_indices: addresses of the joints' velocities, as a slice if they are contiguous.
-
-    Args:
-        batch: the mujoco.batch.Batch.
-        positions: addresses of the joints' positions.
-        velocities: addresses of the joints' velocities.
-        loaded: (L,) whether the load of transmissions matters; L is the number of elements in use.
     """
 
     def __init__(
@@ -114,6 +108,15 @@ class MidpointPredictor:
 
         `self._last` (2, L, D) holds the transmission loads at the beginning of the previous
         step.
+
+        Shapes: D joints.
+
+        Args:
+            batch: the mujoco.batch.Batch.
+            positions: addresses of the joints' positions.
+            velocities: addresses of the joints' velocities.
+            loaded: (L,) whether the load of transmissions matters; L is the number of elements in
+                use.
         """
         self._batch = batch
         self._forces_are_at_end = forces_are_at_step_end(batch.model)
@@ -129,6 +132,8 @@ class MidpointPredictor:
 
     def read_joint_states(self, has_new_command: Mask) -> JointStates:
         """Return the joint states at the beginning of a step.
+
+        Shapes: L batch elements.
 
         Args:
             has_new_command: (L,) whether commands have changed since the previous step; they are
@@ -154,6 +159,8 @@ class MidpointPredictor:
 
         The load at the middle is d_k + (d_{k-1, end} - d_{k-1}) / 2 (2), so that a jump with a
         command appears in d_k alone.
+
+        Shapes: L batch elements, D joints.
 
         Args:
             has_new_command: (L,) whether the command changes at the beginning of the step.
@@ -195,6 +202,8 @@ def forces_are_at_step_end(model: Any) -> bool:
 def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
     """Compute transmission loads (2, S, D) at the middle of every step of a motion.
 
+    Shapes: S steps, D joints.
+
     Args:
         end_loads: (2, S, D) loads at the ends of the steps, each with its own command.
         controls: (S, nu) commands.
@@ -230,7 +239,7 @@ def advance_state(
     phi(z) = (e^z - 1) / z, which is exact if the rate is linear in w. The derivative dr/dw is a
     difference quotient.
 
-    With the rate r(w), w(t + h) = w + h phi(h dr/dw) r(w), phi(z) = (e^z - 1) / z (3).
+    Shapes: L batch elements, K coefficients.
 
     Args:
         effect: effect with the hidden state.
@@ -293,6 +302,8 @@ def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array)
     """Integrate a hidden state whose rate is linear in the state throughout the motion.
 
     The step is w + h phi(z) r(w), phi(z) = (e^z - 1) / z, z = h dr/dw (3).
+
+    Shapes: S steps.
 
     Args:
         state: initial state, (1, 1).

@@ -167,7 +167,7 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
 
     Args:
         model: batch model, to which the sensors were added.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
     """
     one_coordinate_joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     file_joints = [name for name in one_coordinate_joints if name not in robot.series]
@@ -202,12 +202,6 @@ class MujocoBatch:
         all_joints: addresses of all these joints, in this order.
         floating: free and ball joints.
         drives: columns of the sensor data with actuator forces, by joint.
-
-    Args:
-        robot: robot to simulate.
-        derived: whether masses or armatures change, from which MuJoCo derives constants.
-        settings: options of the model by name, such as timestep (seconds).
-        count: batch size.
     """
 
     def __init__(
@@ -221,6 +215,12 @@ class MujocoBatch:
 
         Expanded fields have separate values for each batch element. `self._file_values` keeps
         the values of the model file, which are restored before other effects are written.
+
+        Args:
+            robot: robot to simulate.
+            derived: whether masses or armatures change, from which MuJoCo derives constants.
+            settings: options of the model by name, such as timestep (seconds).
+            count: batch size.
         """
         import mujoco
         from mujoco import batch
@@ -280,6 +280,8 @@ class MujocoBatch:
         """Write model-field effects, with coefficients (K, N, 1), into the batch's fields.
 
         Nothing is done if the fields have them already.
+
+        Shapes: K coefficients.
         """
         written_effects = tuple((effect.name, c.tobytes()) for effect, c in acting)
         if written_effects == self._written_effects:
@@ -331,6 +333,8 @@ class MujocoBatch:
 
         Recordings do not contain the state of joints in series, such as the deflection of a
         flexible gear. So their equilibrium is computed.
+
+        Shapes: D joints.
 
         Args:
             positions: (n, D) positions of the joints of the file.
@@ -428,6 +432,8 @@ class MujocoBatch:
         Within a part no switch changes. An actuator is switched off by a force range of
         zero. `off` (n, S, K) says which of the K actuators are off; None means that all are
         on.
+
+        Shapes: S steps.
         """
         if off is None or not off.any():
             yield from self._split_for_interrupts(n, steps)
@@ -493,19 +499,21 @@ class MujocoBatch:
         if ranges is not None:
             ranges.write(switches[0])
         self.batch.forward(ids)
-        for k in range(steps):
-            ctrl[:batch_size] = controls[:, k]
-            if ranges is not None and k in switches:
-                ranges.write(switches[k])
-                changes[:, k] = True
-            force, limit = step_forces.compute(k, predictor.read_joint_states(changes[:, k]))
-            applied[:batch_size] = forces[:, k]
+        for step_index in range(steps):
+            ctrl[:batch_size] = controls[:, step_index]
+            if ranges is not None and step_index in switches:
+                ranges.write(switches[step_index])
+                changes[:, step_index] = True
+            force, limit = step_forces.compute(
+                step_index, predictor.read_joint_states(changes[:, step_index])
+            )
+            applied[:batch_size] = forces[:, step_index]
             applied[:batch_size, dofs_in_use] += force
             if has_friction:
                 loss[:batch_size, dofs_in_use] = file_friction + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in records.items():
-                values[:, k] = data_fields[name]
+                values[:, step_index] = data_fields[name]
         if ranges is not None:
             ranges.restore()
         self._record_failures(batch_size)
@@ -515,6 +523,8 @@ class MujocoBatch:
         """Set the solver parameters of dry friction where effects add it.
 
         Where no effect adds friction, the file's friction keeps its solver parameters.
+
+        Shapes: D joints.
 
         Args:
             step_forces: effects to evaluate in every step.
@@ -622,18 +632,17 @@ class _Variant:
 
 
 class BatchCache:
-    """Cache of batches by the added elements, the options of the model, and the batch size.
-
-    Args:
-        robot: robot as read from its model file.
-        limit: maximum memory in bytes, see `CACHE_BYTES`.
-    """
+    """Cache of batches by the added elements, the options of the model, and the batch size."""
 
     def __init__(self, robot: RobotModel, limit: int = CACHE_BYTES) -> None:
         """Start with the robot's own model and no batch; batches are made on first request.
 
         Elements without influence on the motion are removed here, so that batches take less
         memory.
+
+        Args:
+            robot: robot as read from its model file.
+            limit: maximum memory in bytes, see `CACHE_BYTES`.
         """
         self._limit = limit
         self._own = _Variant(strip_assets(robot))

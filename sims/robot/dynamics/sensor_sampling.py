@@ -51,6 +51,8 @@ def sample_readings(
 ) -> Array:
     """Compute the recorded readings (L, T) of a channel, including sensor effects.
 
+    Shapes: L batch elements, S steps, T samples.
+
     Args:
         values: (L, S + 1) values at the start and at the end of each step.
         slopes: (L, S + 1) time derivatives of the values; None if unknown.
@@ -81,6 +83,8 @@ def apply_effects_to_readings(
     readings: Array, times: Array, sensors: ActiveEffects, clock: float = 0.0
 ) -> Array:
     """Apply sensor effects that act on each sample alone, without filters and time shifts.
+
+    Shapes: L batch elements, T samples.
 
     Args:
         readings: (L, T) readings; changed in place.
@@ -148,6 +152,8 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
 
     With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
 
+    Shapes: L batch elements, S steps, T samples.
+
     Args:
         values: (L, S + 1) values at the ends of steps.
         slopes: (L, S + 1) derivatives per second; None if they are unknown.
@@ -206,6 +212,8 @@ class DriveSensorModel:
         """Shift readings (n, S, k) from the mean command of a step to its initial command.
 
         The readings are changed in place.
+
+        Shapes: S steps.
         """
         given, mujoco_batch = self.given, self.batch
         batch_size = len(readings)
@@ -235,6 +243,8 @@ class DriveSensorModel:
 
         The simulation applies these effects as external forces, so MuJoCo's sensors do not contain
         them.
+
+        Shapes: S steps, D joints.
 
         Args:
             readings: (n, S, k) sensor readings; changed in place.

@@ -183,6 +183,8 @@ def write_series_effects(
 
     `convert_flank_parameters` must be called after MuJoCo has derived its constants.
 
+    Shapes: L batch elements, K coefficients.
+
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
@@ -204,6 +206,8 @@ def write_series_effects(
 
 def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
     """Make the series element of an effect from its coefficients (L,).
+
+    Shapes: L batch elements.
 
     Args:
         kind: class of the effect.
@@ -337,6 +341,8 @@ def _limit_to_stable_values(
 ) -> tuple[Array, Array]:
     """Limit stiffness and damping (L,) to values that are stable for a time step.
 
+    Shapes: L batch elements.
+
     Args:
         elements: elements in series.
         inertia: inertia of the joint.
@@ -408,6 +414,8 @@ def list_added_elements(effect: Effect | type[Effect]) -> AddedElements:
 
 def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElements, list[int]]:
     """Group the numbers of batch elements by the elements that their effects add to the model.
+
+    Shapes: K coefficients.
 
     Args:
         acting: effects with their coefficients (K, L, 1).

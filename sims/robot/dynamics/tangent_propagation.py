@@ -104,11 +104,6 @@ class Perturbation(NamedTuple):
 class TangentModel:
     """Tangent linear model about one motion.
 
-    Args:
-        at: linearisation points of the motion.
-        sizes: (E,) typical forces.
-        quotients: difference quotients of another motion nearby; computed for this one if None.
-
     Attributes:
         quotients: difference quotients in use.
     """
@@ -121,6 +116,13 @@ class TangentModel:
         `self._share` (S,) is the time from its linearisation point to each step, as a share of the
         regular distance between points. `self._earlier` and `self._later` (S,) are the indices of
         the points between which the quotients of each step are interpolated.
+
+        Shapes: S steps.
+
+        Args:
+            at: linearisation points of the motion.
+            sizes: (E,) typical forces.
+            quotients: difference quotients of another motion nearby; computed for this one if None.
         """
         self._at, self._motion = at, at.motion
         self._sizes = sizes
@@ -282,6 +284,8 @@ class TangentModel:
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the changes by an effect's force, one for each joint that it acts on.
 
+        Shapes: K coefficients.
+
         Args:
             owner: number of the effect candidate.
             effect: effect with a force.
@@ -324,6 +328,8 @@ class TangentModel:
         times that of controls (2). An owner is the candidate to which a change belongs; all n
         owners are propagated in one matrix product per step.
 
+        Shapes: S steps.
+
         Args:
             changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
@@ -332,8 +338,8 @@ class TangentModel:
         Returns:
             Changes of states (n, S + 1, Z) and of readings (n, S, O).
         """
-        q = self.quotients
-        state_size = q.forces.shape[1]
+        quotients = self.quotients
+        state_size = quotients.forces.shape[1]
         steps = self._steps
         inputs, readings = self.sum_inputs_and_readings(changes, count)
         # States, forces and controls are stacked, so that a step is one matrix product.
@@ -341,14 +347,20 @@ class TangentModel:
         stacked[:-1, state_size:] = inputs
         if initial is not None:
             stacked[0, :state_size] = initial
-        step_matrices = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
+        step_matrices = list(
+            np.concatenate([quotients.states, quotients.forces, quotients.controls], axis=2)
+        )
         stacked_steps = list(stacked)
-        for t, point in enumerate(self._at.point_of_step.tolist()):
+        for step_index, point in enumerate(self._at.point_of_step.tolist()):
             np.matmul(
-                step_matrices[point], stacked_steps[t], out=stacked_steps[t + 1][:state_size]
+                step_matrices[point],
+                stacked_steps[step_index],
+                out=stacked_steps[step_index + 1][:state_size],
             )  # (2)
         if readings.shape[1]:
-            readings += np.matmul(q.read_states[self._at.point_of_step], stacked[:-1, :state_size])
+            readings += np.matmul(
+                quotients.read_states[self._at.point_of_step], stacked[:-1, :state_size]
+            )
         states = stacked[:, :state_size]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
 
@@ -357,6 +369,8 @@ class TangentModel:
     ) -> tuple[Array, Array]:
         """Add up the forces and controls of changes, and their direct changes of readings.
 
+        Shapes: S steps.
+
         Args:
             changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
@@ -364,11 +378,11 @@ class TangentModel:
         Returns:
             Forces and controls (S, E + nu, n); readings (S, O, n) at unchanged states.
         """
-        q = self.quotients
-        force_count = q.forces.shape[2]
+        quotients = self.quotients
+        force_count = quotients.forces.shape[2]
         steps, control_count, reading_count = (
             self._steps,
-            q.controls.shape[2],
+            quotients.controls.shape[2],
             self._at.output_count,
         )
         # The series of one owner are contiguous in memory while they are added up.
@@ -395,9 +409,9 @@ class TangentModel:
             forces = stepwise_inputs[:, :force_count].copy()
             # Changes of model parameters already contain their effect on readings.
             forces[:, :, self._find_parameter_changes(changes, count)] = 0.0
-            readings += np.matmul(q.read_forces[self._at.point_of_step], forces)
+            readings += np.matmul(quotients.read_forces[self._at.point_of_step], forces)
             instants = np.ascontiguousarray(instant_inputs.transpose(2, 0, 1))
-            readings += np.matmul(q.read_controls[self._at.point_of_step], instants)
+            readings += np.matmul(quotients.read_controls[self._at.point_of_step], instants)
         return stepwise_inputs, readings
 
     @property
@@ -413,6 +427,8 @@ class TangentModel:
     @property
     def motion_readings(self) -> Array:
         """Readings (S, O) of the motion at the beginnings of steps, as computed by the model.
+
+        Shapes: S steps.
 
         Returns:
             (S, O) values of O sensor outputs, with the command of that time instead of the step's
@@ -447,6 +463,8 @@ class TangentModel:
 
         The model starts each step from the state of the motion. The defect is zero for a
         simulated motion, and not zero for a measured one.
+
+        Shapes: S steps.
         """
         motion, joints = self._motion, self._motion.x.shape[1]
         predicted_states, _ = self._every_step
@@ -465,6 +483,8 @@ class TangentModel:
 
         One step in the middle of those that a linearisation point stands for represents them all,
         unless commands differ too.
+
+        Shapes: S steps.
 
         Args:
             similar: model of the same motion.
@@ -497,6 +517,8 @@ class TangentModel:
         between two points of one command, and extrapolated after the last of them. Each step has
         the value at its point plus `_share` times the difference of two neighbouring points of
         the same command, `_earlier` and `_later`.
+
+        Shapes: S steps.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
@@ -514,6 +536,8 @@ class TangentModel:
 
         The first D changes are unit changes of the positions, the others those of the velocities.
 
+        Shapes: S steps.
+
         Returns:
             Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
         """
@@ -525,6 +549,8 @@ def compute_runge_kutta_step(
     by_state: Array, by_force: Array, by_control: Array, step: float
 ) -> tuple[Array, Array, Array]:
     """Compute the derivatives of a Runge-Kutta step from those of the acceleration, by (3).
+
+    Shapes: D joints.
 
     Args:
         by_state: (N, D, 2 D) derivatives of accelerations by positions and velocities.

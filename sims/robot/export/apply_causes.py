@@ -237,8 +237,8 @@ def _write_cause(
 
     Args:
         target_values: fields of the model, changed in place.
-        robot: the robot.
-        cause: the cause.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        cause: effect at a place with its fitted numbers.
         series: elements in series, by place, that are not yet written.
     """
     # A coupling is an element of the robot, which has been added before.
@@ -283,7 +283,7 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
     Several rounds are needed, because a change may also modify values that should stay.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         target_values: wanted fields of the compiled model.
 
     Returns:

@@ -46,11 +46,6 @@ _LIST_ATTRIBUTES = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
 class MjcfWriter:
     """Writer of attribute statements into a document.
 
-    Args:
-        document: the MJCF.
-        model: model that the document compiles to.
-        wanted: fields of the model that it should compile to.
-
     Attributes:
         degrees: whether the document specifies angles in degrees.
     """
@@ -60,6 +55,11 @@ class MjcfWriter:
 
         MJCF uses degrees unless a compiler element states radians; the last one takes
         precedence.
+
+        Args:
+            document: the MJCF.
+            model: model that the document compiles to.
+            target_values: fields of the model that it should compile to.
         """
         self.document, self.model, self.wanted = document, model, target_values
         self.tags = document.map_to_compiled_ids(model)

@@ -54,7 +54,7 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
 
     Args:
         f: fields of the model with the effects.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         place: name of the actuator.
     """
     actuator_id = robot.actuator(place).id
@@ -73,7 +73,7 @@ def _make_solref_reader(index: int) -> Read:
 
         Args:
             f: fields of the model with the effects.
-            robot: the robot.
+            robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
             place: name of the contact.
         """
         values = f["pair_solref"][0, find_pair(robot, place)]
@@ -153,7 +153,7 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
 
     Args:
         fields: fields of the model.
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         effect: class of the effect at its place.
     """
     name, place = _get_effect_name(effect), effect.place
@@ -200,7 +200,7 @@ def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:
     """Return whether an effect acts at an actuator of a slide joint.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         effect: class of the effect at its place.
     """
     if effect.at != "actuator":

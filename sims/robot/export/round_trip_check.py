@@ -208,6 +208,8 @@ def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
     Each actuator has a constant control within its range, different for each actuator, so that
     swapped actuators change the motion.
 
+    Shapes: S steps.
+
     Args:
         model: the mujoco.MjModel.
         pose: initial pose (nq,); that of `displace_reference_pose` by default.

@@ -43,16 +43,17 @@ _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class UrdfWriter:
     """Writer of causes into the text of a URDF.
 
-    Args:
-        robot: robot as read from its model file.
-        recording: title of the recording to which the causes were fitted.
-
     Raises:
         NotEditableError: the file is not XML in UTF-8.
     """
 
     def __init__(self, robot: RobotModel, recording: str) -> None:
-        """Parse the URDF of the robot, and index its links and joints by name."""
+        """Parse the URDF of the robot, and index its links and joints by name.
+
+        Args:
+            robot: robot as read from its model file.
+            recording: title of the recording to which the causes were fitted.
+        """
         self.robot, self.recording = robot, recording
         self.markup = XmlText(robot.path.read_bytes(), robot.path)
         top = self.markup.root.children
@@ -98,7 +99,7 @@ class UrdfWriter:
         state the cause.
 
         Args:
-            cause: the cause.
+            cause: effect at a place with its fitted numbers.
             attribute: ``damping`` or ``friction``.
         """
         joint = self.joints.get(cause.place)

@@ -264,19 +264,19 @@ def _render_urdf(
 
 
 class MjcfEditor:
-    """Writer of the wanted attributes into an MJCF text.
-
-    Args:
-        robot: robot with the text.
-        applied: model that the text should compile to.
-        recording: title of the recording.
-        text: text of the model file.
-    """
+    """Writer of the wanted attributes into an MJCF text."""
 
     def __init__(
         self, robot: RobotModel, applied: ModifiedModel, recording: str, text: bytes
     ) -> None:
-        """Compile the unchanged document, which is the reference for later comparisons."""
+        """Compile the unchanged document, which is the reference for later comparisons.
+
+        Args:
+            robot: robot with the text.
+            applied: model that the text should compile to.
+            recording: title of the recording.
+            text: text of the model file.
+        """
         self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
         self.folder = robot.path.resolve().parent
         self.original = compile_mjcf(self._parse_document().to_text())

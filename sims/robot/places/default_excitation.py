@@ -98,7 +98,7 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     Each command oscillates about a holding value that balances gravity in the reference pose.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         joints: joints to excite.
     """
     holding, forces = _compute_reference_forces(robot, joints)
@@ -123,7 +123,7 @@ def _compute_reference_forces(
     """Return the holding force of each joint in the reference pose, and a force amplitude.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         joints: joints to excite.
 
     Returns:
@@ -171,7 +171,7 @@ def _make_command(
     Position and velocity servos receive a motion instead of a force.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         actuator: the actuator.
         joint: joint of the actuator.
         holding: force that holds the reference pose, N or N m.
@@ -206,7 +206,7 @@ def _stays_within_ranges(
     """Return whether no joint leaves its range under commands of reduced amplitude in phase.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         joints: joints to check.
         commands: commands with full amplitude.
         share: share of the amplitude, from 0 to 1.

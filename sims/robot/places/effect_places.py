@@ -196,6 +196,8 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
         A supply is shared by several drives, so its voltage sags with the sum of their forces.
         `joints` and `effect` are bound by the enclosing function.
 
+        Shapes: L batch elements, D joints, K coefficients.
+
         Args:
             self: Effect at the place.
             c: (K, L, 1) coefficients.
@@ -286,6 +288,8 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     ) -> tuple[Array, Array]:
         """Compute the force (L, D) along the effect's joint, and the rate of its hidden state.
 
+        Shapes: L batch elements, D joints, K coefficients.
+
         Args:
             self: the effect at its joint.
             c: (K, L, 1) coefficients.
@@ -314,17 +318,17 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
     coefficients: list[Coefficient] = list(first) if shared else []
     if not shared:
         for member in members:
-            for c in member.coefficients:
-                coefficients.append(replace(c, name=f"{c.name}@{member.place}"))
+            for coefficient in member.coefficients:
+                coefficients.append(replace(coefficient, name=f"{coefficient.name}@{member.place}"))
     count = len(first)
     instances = tuple(member() for member in members)
 
-    def parts(_: Effect, c: Array) -> ActiveEffects:
+    def parts(_: Effect, coefficient: Array) -> ActiveEffects:
         """Return the effect at each place, with its share of the coefficients."""
         if shared:
-            return tuple((member_effect, c) for member_effect in instances)
+            return tuple((member_effect, coefficient) for member_effect in instances)
         return tuple(
-            (member_effect, c[i * count : (i + 1) * count])
+            (member_effect, coefficient[i * count : (i + 1) * count])
             for i, member_effect in enumerate(instances)
         )
 

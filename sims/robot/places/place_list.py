@@ -308,7 +308,7 @@ def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     """Return the servo gains of an actuator in the model file; zero if it is not a servo.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         actuator: number of the actuator.
     """
     bias = robot.compiled.actuator_biasprm[actuator]
@@ -332,7 +332,7 @@ def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float
     """Return the numbers that the model file specifies at a joint, by effect.
 
     Args:
-        robot: the robot.
+        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
         dof: address of the joint's velocity.
         joint: number of the joint in the compiled model.
     """
@@ -365,13 +365,13 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     joint_of_dof = {int(dof): joint for joint, dof in enumerate(dofs)}
     constraint_types, object_types = mujoco.mjtEq, mujoco.mjtObj
     groups: list[set[int]] = []
-    for k in range(model.neq):
-        kind = int(model.eq_type[k])
-        first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+    for constraint in range(model.neq):
+        kind = int(model.eq_type[constraint])
+        first, second = int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])
         if kind == int(constraint_types.mjEQ_JOINT):
             coupled_dofs = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
         elif kind in (int(constraint_types.mjEQ_CONNECT), int(constraint_types.mjEQ_WELD)):
-            if int(model.eq_objtype[k]) == int(object_types.mjOBJ_SITE):
+            if int(model.eq_objtype[constraint]) == int(object_types.mjOBJ_SITE):
                 first, second = (int(model.site_bodyid[site]) for site in (first, second))
             first_ancestors, second_ancestors = (
                 _list_ancestors(model, first),

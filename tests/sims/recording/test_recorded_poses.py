@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sims.core.rotations import compute_yaw_pitch_roll
 from sims.core.simulator import InputError
 from sims.recording.recorded_poses import (
-    compute_angles,
     convert_quaternions,
     find_recorded_bases,
     list_channel_names,
@@ -26,7 +26,7 @@ def test_angles_are_those_of_scipy_relative_to_the_model_file():
     angles = np.random.default_rng(3).uniform(-1.2, 1.2, (40, 3))
     reference = Rotation.from_euler("XYZ", [0.4, -0.9, 2.0])
     rotations = Rotation.from_euler("ZYX", angles) * reference
-    found = compute_angles(quaternions_of(rotations), np.roll(reference.as_quat(), 1))
+    found = compute_yaw_pitch_roll(quaternions_of(rotations), np.roll(reference.as_quat(), 1))
     assert found == pytest.approx(angles, abs=1e-12)
 
 

@@ -1,7 +1,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sims.robot.inertia_tensors import compute_inertia_tensors, compute_quaternions
+from sims.core.rotations import compute_quaternions
+from sims.robot.inertia_tensors import compute_inertia_tensors
 
 
 def test_tensors_are_rotated_as_by_scipy_for_quaternions_of_any_length():

@@ -10,8 +10,8 @@ pytest.importorskip("cv2")
 
 from dataclasses import replace
 
+from sims.core import medians
 from sims.core.simulator import InputError
-from sims.vision import background_model
 from sims.vision import ball_tracker as tracking
 from sims.vision.ball_renderer import BallScene, SceneAppearance
 from sims.vision.ball_tracker import track_ball
@@ -139,9 +139,7 @@ def test_the_background_is_the_median_of_what_is_seen():
     values = rng.uniform(0, 255, (9, 50, 3)).astype(np.float32)
     values[rng.uniform(size=(9, 50)) < 0.6] = np.nan
     values[0] = 7.0  # each pixel is observed at least once
-    np.testing.assert_array_equal(
-        background_model._compute_nan_median(values), np.nanmedian(values, axis=0)
-    )
+    np.testing.assert_array_equal(medians.compute_nan_median(values), np.nanmedian(values, axis=0))
 
 
 def test_frames_without_the_ball_stay_missing():

@@ -13,10 +13,10 @@ from bench.diagnosis.search.candidate_directions import (
     compute_directions,
     simulate_with_effect,
 )
-from bench.diagnosis.search.initial_values import (
+from bench.diagnosis.search.coefficient_start_values import (
     END_STOP_DEPTH_SHARES as DEEPER,
 )
-from bench.diagnosis.search.initial_values import (
+from bench.diagnosis.search.coefficient_start_values import (
     END_STOP_STIFFNESS_FACTORS,
     EVENT_TIME_COUNT,
     MAX_EVENT_TIME_SUBDIVISIONS,

@@ -40,8 +40,8 @@ def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]
     """Return the coefficients of an effect as parameters, with units and plausible ranges.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     return evaluator.parameters[evaluator.coefficient_slices[name]]
 
@@ -50,8 +50,8 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     """Return the largest values (k,) that the limited quantity of an effect reaches in the runs.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
 
     Returns:
         One value for each member of the effect (a family has several).
@@ -88,7 +88,7 @@ def _get_command(run_data: RunData, effect: Effect) -> Array:
     It is the first input if the effect names none, and zero if the run has no such input.
 
     Args:
-        run_data: the recorded run.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on an input.
     """
     signals = run_data.scenario.inputs
@@ -102,7 +102,7 @@ def _get_largest_input(evaluator: RunEvaluator, run_data: RunData, effect: Effec
 
     Args:
         evaluator: unused; all level functions have the same arguments.
-        run_data: the recorded run.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on an input.
     """
     return float(np.abs(_get_command(run_data, effect)).max())
@@ -113,7 +113,7 @@ def _compute_max_input_rate(evaluator: RunEvaluator, run_data: RunData, effect: 
 
     Args:
         evaluator: unused; all level functions have the same arguments.
-        run_data: the recorded run.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on an input.
     """
     changes = np.abs(np.diff(_get_command(run_data, effect)))
@@ -132,7 +132,7 @@ def _compute_max_input_acceleration(
 
     Args:
         evaluator: unused; all level functions have the same arguments.
-        run_data: the recorded run.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on an input.
     """
     return 4.0 * float(np.ptp(_get_command(run_data, effect))) / MIN_PROFILE_SECONDS**2
@@ -144,7 +144,7 @@ def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
     It is empty if the quantity is not recorded.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         effect: effect that limits a stored quantity.
     """
     name = effect.place or evaluator.simulator.system.levels[0]
@@ -155,8 +155,8 @@ def _compute_max_level(evaluator: RunEvaluator, run_data: RunData, effect: Effec
     """Return the maximum of the stored quantity, such as a tank's level, recorded in a run.
 
     Args:
-        evaluator: the runs.
-        run_data: the recorded run.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect that limits the quantity.
     """
     levels = run_data.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
@@ -169,8 +169,8 @@ def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect:
     It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
 
     Args:
-        evaluator: the runs.
-        run_data: the recorded run.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on the command of the servo.
     """
     system = evaluator.simulator.system
@@ -195,8 +195,8 @@ def generate_end_stops(
     There are none if the range of the coordinate is not recorded.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         side: 1 for the upper end, -1 for the lower end.
         stiffness_shares: stiffnesses, as shares of the largest plausible one.
         depth_shares: depths within the range of the coordinate, as shares of the range.
@@ -207,10 +207,10 @@ def generate_end_stops(
     for stiffness_share, depth_share in (
         product(stiffness_shares, depth_shares) if low < high else ()
     ):
-        c = np.zeros(len(parameters))
-        c[0] = side * stiffness_share * max_stiffness
-        c[1] = (high if side > 0 else low) - side * depth_share * (high - low)
-        yield c
+        coefficients = np.zeros(len(parameters))
+        coefficients[0] = side * stiffness_share * max_stiffness
+        coefficients[1] = (high if side > 0 else low) - side * depth_share * (high - low)
+        yield coefficients
 
 
 def generate_neighbouring_end_stops(
@@ -221,8 +221,8 @@ def generate_neighbouring_end_stops(
     All depths are tried, because the stiffness determines the depth of contact.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the given end stop.
     """
     if evaluator.available_effects[name].coefficients[0].of == "stop":
@@ -247,8 +247,8 @@ def generate_equal_travel_end_stops(
     `sims.effects.state_limits`.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the given end stop.
     """
     low, high = evaluator.get_coordinate_range(name)
@@ -269,8 +269,8 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
     without an event time.
 
     Args:
-        evaluator: the runs.
-        name: name of the effect.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) given coefficients.
     """
     for i, parameter in enumerate(list_coefficients(evaluator, name)):
@@ -300,8 +300,8 @@ def generate_frequency_neighbours(
     Least squares stops at the nearest of the many local minima that such effects have.
 
     Args:
-        evaluator: the runs.
-        fit: the fitted model.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
     """
     for name in fit.effects:
         for c in generate_equal_travel_end_stops(

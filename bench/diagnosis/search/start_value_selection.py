@@ -14,7 +14,7 @@ from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
 from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
 from bench.diagnosis.search.candidate_directions import DirectionSet
-from bench.diagnosis.search.initial_values import (
+from bench.diagnosis.search.coefficient_start_values import (
     generate_event_times,
     generate_neighbouring_end_stops,
 )
@@ -61,7 +61,7 @@ def select_refit_starts(
     """Return starts for fits with the most promising candidates.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise of each channel.
         model: the model to extend.
         direction_set: sensitivity directions of the candidates.
@@ -165,9 +165,9 @@ def add_effect_to_start(evaluator: RunEvaluator, start: FitStart, name: str, c: 
     """Add an effect to a model, in place of the effects that it contains.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         start: the model.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the effect.
     """
     effect = evaluator.available_effects[name]
@@ -195,11 +195,11 @@ def _predict_jacobian(
     all coefficients.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         model: the model without the effect.
         direction_set: directions of all candidates about this model.
         group: directions of the effect at one grid point.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     if not evaluator.has_linearisation:
         return None
@@ -244,11 +244,11 @@ def _list_start_sizes(
     They are the linear estimate, smaller shares of it, and shares of the plausible range.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         direction_set: directions of all candidates.
         group: directions of the effect at one grid point.
         estimate: linear estimate of the coefficient of each direction of the group.
-        name: name of the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     bounds = compute_coefficient_bounds(evaluator, name)
     first_probe = direction_set.candidates[group.column_indices[0]]
@@ -287,7 +287,7 @@ def _select_nearest_start(
     """Return the start with the lowest cost for each score peak of each set of effects.
 
     Args:
-        evaluator: the runs.
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
         noise: noise of each channel.
         numbered_starts: starts with the number of their score peak.
         run_share: initial share of the runs on which the cost is computed.
