@@ -168,6 +168,9 @@ class PredictionErrorSearch(EffectSearch):
         friction = fit_dry_friction(context, selected)
         best = friction
         if not is_explained(context, best):
+            # Friction of the wrong form leaves a small residual, which many effects would imitate.
+            if friction.effects and is_nearly_explained(context, friction):
+                check_fit(context, friction)
             best = select_more_likely(best, fit_quick_selection(context, selected))
         selected_with_shapes = selected
         if self._should_continue(best):

@@ -1,4 +1,6 @@
-"""Effects with many shapes are tried before the slow searches."""
+"""Quick decisions come before slow searches."""
+
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -6,6 +8,8 @@ import pytest
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
+from bench.diagnosis.prediction_error import prediction_error_search
+from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 
 ARM = """<mujoco model="arm">
 <option timestep="0.002" integrator="implicitfast"/>
@@ -60,3 +64,48 @@ def test_a_ripple_is_found_with_few_simulations(tmp_path):
     assert np.hypot(numbers["sine"], numbers["cosine"]) == pytest.approx(RIPPLE, rel=0.03)
     assert numbers["period"] == pytest.approx(PERIOD, rel=0.01)
     assert answer.simulations < 400
+
+
+class _OtherFormIsLikelierError(Exception):
+    pass
+
+
+class _OtherLawsAreFittedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("effects", "is_nearly_explained", "expected"),
+    [
+        (("friction.coulomb@hinge",), True, _OtherFormIsLikelierError),
+        (("friction.coulomb@hinge",), False, _OtherLawsAreFittedError),
+        ((), True, _OtherLawsAreFittedError),
+    ],
+)
+def test_friction_that_nearly_explains_is_compared_with_its_soft_form_before_other_laws(
+    monkeypatch, effects, is_nearly_explained, expected
+):
+    def fail_with(error):
+        def fail(*_):
+            raise error
+
+        return fail
+
+    friction = SimpleNamespace(effects=effects)
+    replaced = {
+        "fit_dry_friction": lambda *_: friction,
+        "is_explained": lambda *_: False,
+        "is_nearly_explained": lambda *_: is_nearly_explained,
+        "check_fit": fail_with(_OtherFormIsLikelierError),
+        "fit_quick_selection": fail_with(_OtherLawsAreFittedError),
+    }
+    for name, function in replaced.items():
+        monkeypatch.setattr(prediction_error_search, name, function)
+    monkeypatch.setattr(PredictionErrorSearch, "_identify_servos", lambda *_: None)
+    search = object.__new__(PredictionErrorSearch)
+    search.is_form_given = True
+    search.__dict__["_search_context"] = SimpleNamespace(
+        columns=SimpleNamespace(select=lambda: None)
+    )
+    with pytest.raises(expected):
+        search._search_effects()
