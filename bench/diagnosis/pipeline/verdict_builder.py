@@ -106,9 +106,14 @@ class VerdictBuilder:
             model: Fitted model of the search.
 
         Returns:
-            Estimates by index in the parameter vector; those that were not fitted have no interval.
+            Estimates by index in the parameter vector; those that were not fitted, or not to the
+            end, have no interval.
         """
         intervals = compute_intervals(self.result.search, model)
+        early_stop = self.result.finding.early_stop
+        if early_stop is not None and "base_fit" in early_stop.skipped_questions:
+            # The curvature of an unfinished fit says nothing about the distance to its optimum.
+            intervals = {i: (value, np.nan, np.nan) for i, (value, _, _) in intervals.items()}
         ranges = self._get_bounds(model)
         estimates = {}
         for index, parameter in enumerate(self._evaluator.parameters):

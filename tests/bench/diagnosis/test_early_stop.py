@@ -43,13 +43,16 @@ def test_without_a_base_model_nothing_is_said(swing):
     assert found.verdict == "unknown"
     assert not found.causes
     assert found.answer.cut.skipped_questions[0] == "base_fit"
-    assert found.answer.parameters["inertia"].value > 0
+    inertia = found.answer.parameters["inertia"]
+    assert inertia.value > 0
+    assert inertia.low is inertia.high is None, "an unfinished fit has no interval"
 
 
 def test_fits_leave_off_where_they_are(swing):
     found = until(swing, "refit of")
     assert found.verdict == "unknown"
     assert found.answer.cut.skipped_questions[0] == "search"
+    assert found.answer.parameters["inertia"].low is not None, "the base model was fitted"
     assert found.answer.candidates, "the scores were there already"
 
 
