@@ -39,6 +39,7 @@ from bench.diagnosis.kalman.filter_and_smoother import (
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
+from sims.robot.dynamics.contact_states import settle_contacts
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_about_recording import (
@@ -66,6 +67,8 @@ MEASURED_PRIOR = 10.0
 
 The noise of a velocity is that of positions per sample interval.
 """
+SMOOTHED_SHARES = (1.0, 0.5, 0.0)
+"""Shares of the smoothed change of a first state that are tried for a robot on the ground."""
 FIRST_FORCE = 0.1
 """Initial missing force of the process noise fit, as a share of a typical force."""
 MAX_LINEARISATIONS = 4
@@ -187,6 +190,7 @@ class FollowedRuns:
             [compute_joint_scales(robot).force, compute_floating_forces(robot)]
         )
         best: FollowedRuns | None = None
+        first_states: Array | None = None
         linear: list[MeasuredLinear] = []
         for iteration in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
@@ -204,16 +208,21 @@ class FollowedRuns:
                     run,
                     motion[run],
                     neighbour,
-                    reuses_jacobians=not robot.is_on_ground,
+                    first_state=None if first_states is None else first_states[run],
                 )
                 for run, neighbour in enumerate(neighbours)
             ]
             initial_force = FIRST_FORCE * typical if force is None else force
             followed = cls._filter_linear(evaluator, theta, noise, linear, initial_force, typical)
-            force, noise, trajectories = followed.force, followed.noise, followed.trajectories
+            force, noise = followed.force, followed.noise
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first linearisation is about the readings alone, which are not a possible motion.
-            best = followed if iteration < 2 or gain > 0.0 else best
+            is_first = iteration < (1 if robot.is_on_ground else 2)
+            best = followed if is_first or gain > 0.0 else best
+            if robot.is_on_ground:
+                first_states = followed.get_first_states()
+            else:
+                trajectories = followed.trajectories
             if not gain > LINEARISED_GAIN:
                 break
         assert best is not None
@@ -238,13 +247,21 @@ class FollowedRuns:
         reuses_jacobians = similar is not None or (
             simulator is None and self._has_jacobians_of(theta)
         )
+        neighbours = (similar or self).linear
+        motions: Sequence[Trajectory | None] = [None] * len(neighbours)
+        first_states: Sequence[Array | None] = [None] * len(neighbours)
+        if self._is_on_ground:
+            first_states = list(self.get_first_states())
+        else:
+            motions = self.trajectories
         linear = [
             _linearise_run(
                 *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
                 reuses_jacobians=reuses_jacobians,
+                first_state=first_state,
             )
-            for run, (motion, neighbour) in enumerate(
-                zip(self.trajectories, (similar or self).linear, strict=True)
+            for run, (motion, neighbour, first_state) in enumerate(
+                zip(motions, neighbours, first_states, strict=True)
             )
         ]
         filter_arguments = self.noise, linear, self.force, self.typical
@@ -326,7 +343,9 @@ class FollowedRuns:
         assert isinstance(evaluator.simulator, RobotSimulator)
         # With another step size, the motion at the ends of the steps is not known.
         has_same_step = known is not None and known.step == evaluator.simulator.time_step
-        motion = known.trajectories if known is not None and has_same_step else None
+        motion = None
+        if known is not None and has_same_step and not known._is_on_ground:
+            motion = known.trajectories
         followed = evaluator.filtered_runs = cls.follow(evaluator, theta, noise, motion)
         return followed
 
@@ -616,11 +635,11 @@ class FollowedRuns:
         """Return positions and velocities of the joints at the first samples (R, 2 D).
 
         For recorded joints they are estimated from the readings alone, because a stiff servo hides
-        the first velocity from a linear model; for other joints, and for robots on the ground, they
-        are smoothed states.
+        the first velocity from a linear model; for other joints they are smoothed states, and for
+        robots on the ground these with settled contacts.
         """
         if self._is_on_ground:
-            return self._get_smoothed_first_states()
+            return self._settled_first_states
         first_states = []
         for run, trajectory in enumerate(self.trajectories):
             first_step = int(self.linear[run].knots[0])
@@ -637,21 +656,40 @@ class FollowedRuns:
 
         A first state far from the readings would be in another state of the contacts.
         """
-        channels = list(self.evaluator.channels)
-        names = self.evaluator.simulator.system.coordinates
-        noise = np.array([self.noise.sigma[channels.index(name)] for name in names])
-        speeds = noise / self.evaluator.sample_interval
-        return np.concatenate([MEASURED_PRIOR * noise, MEASURED_PRIOR * speeds])
+        return MEASURED_PRIOR * np.concatenate(_get_noise_of_states(self.evaluator, self.noise))
 
-    def _get_smoothed_first_states(self) -> Array:
-        """Return smoothed positions and velocities of the joints at the first samples (R, 2 D)."""
-        first_states = []
+    @cached_property
+    def _settled_first_states(self) -> Array:
+        """Smoothed positions and velocities at the first samples (R, 2 D), with settled contacts.
+
+        A contact that begins or ends makes the motion nonlinear. So each run begins at the share of
+        the smoothed change whose simulation is closest to the readings.
+        """
+        evaluator, simulator = self.evaluator, self.evaluator.simulator
+        assert isinstance(simulator, RobotSimulator)
+        deviations = _get_noise_of_states(evaluator, self.noise)
+        first_states = np.zeros((len(SMOOTHED_SHARES), *evaluator.initial_state_guesses.shape))
         for run, linear in enumerate(self.linear):
-            first_step, deviation = int(linear.knots[0]), self.smoothed.states[run, 0]
+            first_step, change = int(linear.knots[0]), self.smoothed.states[run, 0]
             x, v = linear.trajectory.x[first_step], linear.trajectory.v[first_step]
-            velocities = deviation[linear.positions : linear.positions + v.size]
-            first_states.append(np.concatenate([x + deviation[: x.size], v + velocities]))
-        return np.array(first_states)
+            velocity_change = change[linear.positions : linear.positions + v.size]
+            scenario = evaluator.prepared_runs[run].scenario
+            for i, share in enumerate(SMOOTHED_SHARES):
+                start = x + share * change[: x.size], v + share * velocity_change
+                settled = settle_contacts(simulator, self.theta, scenario, start, deviations)
+                first_states[i, run] = np.concatenate(settled)
+        count, runs, size = first_states.shape
+        simulated = evaluator.simulate(
+            np.tile(self.theta, (count * runs, 1)),
+            np.tile(np.arange(runs), count),
+            first_states.reshape(-1, size),
+        ).reshape(count, *evaluator.observed.shape)
+        with np.errstate(all="ignore"):
+            residuals = (simulated - evaluator.observed) / self.noise.sigma
+            squares = np.nansum(np.square(residuals), axis=(2, 3))
+        squares[~np.isfinite(simulated).any(axis=(2, 3))] = np.inf
+        best: Array = first_states[np.argmin(squares, axis=0), np.arange(runs)]
+        return best
 
     def _propagate_through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
@@ -748,42 +786,63 @@ def _linearise_run(
     simulator: RobotSimulator | None = None,
     reuses_jacobians: bool = True,
     reuses_loads: bool = False,
+    first_state: Array | None = None,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
-    For a robot on the ground the first one is simulated: contacts are less deep than the noise of
-    encoders, so that a measured motion has wrong contact forces. A motion that is smoothed with
-    a model that is linear about it has contacts of the right depth.
+    For a robot on the ground the motion is simulated from a first state with settled contacts:
+    contacts are less deep than the noise of encoders, so that a measured motion has wrong contact
+    forces.
 
     Args:
         evaluator: the runs.
         theta: (P,) parameters about which the model is linear.
         noise: sensor noise of each channel.
         run: index of the run.
-        trajectory: the motion; None to estimate it from the readings alone.
+        trajectory: the motion; None to estimate it from the readings alone, or to simulate it.
         neighbour: model of the same run at other parameters, whose matrices are reused; None if
             there is none.
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives are taken from the neighbour.
         reuses_loads: whether loads at the joints are taken from the neighbour.
+        first_state: (2 D,) first positions and velocities of a robot on the ground; None for those
+            of the readings.
     """
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
-    guess = evaluator.initial_state_guesses[run]
+    guess = evaluator.initial_state_guesses[run].copy()
+    start = guess[:half], guess[half:]
     robot = simulator or evaluator.simulator
     assert isinstance(robot, RobotSimulator)
     measured: Mapping[int, Array] | None = None
-    if trajectory is None:
+    is_simulated = robot.robot.is_on_ground and trajectory is None
+    if is_simulated and first_state is not None:
+        start = first_state[:half], first_state[half:]
+    elif trajectory is None:
         measured = estimate_measured_states(evaluator, noise.sigma, run)
-        if robot.robot.is_on_ground:
-            guess = guess.copy()
-            for joint, states in measured.items():
-                guess[joint], guess[half + joint] = states[0, :2]
-            measured = {}
+    if is_simulated:
+        for joint, states in (measured or {}).items():
+            start[0][joint], start[1][joint] = states[0, :2]
+        measured = None
+        deviations = _get_noise_of_states(evaluator, noise)
+        start = settle_contacts(robot, theta, scenario, start, deviations)
     return MeasuredLinear(
-        *(robot, theta, scenario, (guess[:half], guess[half:]), trajectory, measured, neighbour),
-        *(reuses_jacobians, reuses_loads),
+        *(robot, theta, scenario, start, trajectory, measured, neighbour),
+        *(reuses_jacobians and not is_simulated, reuses_loads),
     )
+
+
+def _get_noise_of_states(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Array, Array]:
+    """Return the noise (D,) of positions, and that of velocities if they are differences of these.
+
+    Args:
+        evaluator: the runs of a robot on the ground, whose joints are recorded.
+        noise: sensor noise of each channel.
+    """
+    channels = list(evaluator.channels)
+    names = evaluator.simulator.system.coordinates
+    positions = np.array([noise.sigma[channels.index(name)] for name in names])
+    return positions, positions / evaluator.sample_interval
 
 
 def _compute_prior_deviations(

@@ -144,10 +144,6 @@ class MeasuredLinear(RunLinearisation):
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
         self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, MAX_JACOBIAN_SECONDS))
-        assert isinstance(simulator, RobotSimulator)
-        if simulator.robot.is_on_ground:
-            # Contacts change from step to step.
-            self.held = simulator.time_step
         super().__init__(simulator, theta, scenario, *start)
         if self._sensor_channels:
             # The readings belong to the given motion, not to the simulated one.

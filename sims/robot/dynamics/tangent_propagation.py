@@ -175,7 +175,8 @@ class TangentModel:
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the derivatives of a step by states, forces and controls at all points.
 
-        They are forward differences (1). `displacements` lists the displacements as (quantity,
+        They are forward differences (1); with contacts, those by positions are the smaller ones of
+        forward and backward differences. `displacements` lists the displacements as (quantity,
         index, size). The quantities are q position, v velocity, a activation, w hidden state of an
         effect, p and r displacement and velocity of floating bodies, f force, u control.
         The
@@ -211,6 +212,14 @@ class TangentModel:
                 changed, read = displaced(moved={name: (j, difference)})
                 changes[:, :, column] = (changed - unchanged_states) / difference
                 readings[:, :, column] = (read - unchanged_readings) / difference
+                if name == "q" and self._at.has_contacts:
+                    # The force of a contact that begins or ends within the difference jumps.
+                    changed, read = displaced(moved={name: (j, -difference)})
+                    backward = (unchanged_states - changed) / difference
+                    is_smaller = np.abs(backward).max(1) < np.abs(changes[:, :, column]).max(1)
+                    changes[is_smaller, :, column] = backward[is_smaller]
+                    reading_rates = (unchanged_readings - read) / difference
+                    readings[is_smaller, :, column] = reading_rates[is_smaller]
             quotients.append((changes, readings))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
         if self._at.steps_joints_by_runge_kutta:

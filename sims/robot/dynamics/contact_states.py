@@ -1,0 +1,250 @@
+"""States of a robot on the ground at which its contacts are in equilibrium.
+
+A contact of MuJoCo is a stiff spring and damper: its depth is a fraction of a millimetre, and it
+settles within some time constants of its reference, such as 60 ms. A measured pose has more noise
+than this depth. A simulation that begins at the measured state therefore lifts wheels and feet off,
+or throws the robot up. After the transient, the state is on a slow manifold (U. Maas, S. B. Pope,
+Combustion and Flame 88, 239, 1992, doi:10.1016/0010-2180(92)90034-M), on which the velocity u of
+each contact point changes only as slowly as the robot moves:
+
+    u_n = 0,    du/dt = J(x) a(x, v) + (dJ/dt) v = 0,    u = J(x) v                            (1)
+
+with the Jacobian J of the contact point and the acceleration a of the robot, which includes the
+contact forces. The normal part of du/dt determines the depth of the contact, and the tangential
+part determines its creep. The state that is most likely, given the measured one and its standard
+deviations, minimises
+
+    |(x - x_m) / sigma_x|^2 + |(v - v_m) / sigma_v|^2 + |u_n / e_v|^2 + |(du/dt) / e_a|^2      (2)
+
+by damped Gauss-Newton steps. Legged robots are observed with the same constraints (M. Bloesch et
+al., Robotics: Science and Systems VIII, 2012, doi:10.15607/RSS.2012.VIII.003).
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sims.core.simulator import Array, Scenario
+from sims.robot.dynamics.batch_work import RobotRunBatch
+from sims.robot.dynamics.effect_forces import select_model_field_effects
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_simulator import RobotSimulator
+
+SPEED_TOLERANCE = 1e-3
+"""Speed in m/s at which the points of a settled contact approach each other: e_v in (2)."""
+ACCELERATION_TOLERANCE = 0.1
+"""Acceleration in m/s^2 of the points of a settled contact: e_a in (2)."""
+DISTANCE_TOLERANCE = 1e-5
+"""Tolerance in m of the depth that an open contact is moved to."""
+FIRST_DEPTH = 1e-4
+"""Depth in m that an open contact is moved to."""
+MAX_DISTANCE_SIGMAS = 3.0
+"""Maximum measured distance of a contact that may be closed, in standard deviations."""
+SEARCH_GAP = 0.02
+"""Distance in m within which MuJoCo lists contacts."""
+MAX_ITERATIONS = 8
+"""Maximum number of Gauss-Newton steps."""
+MAX_HALVINGS = 5
+"""Maximum number of halvings of a step."""
+MIN_DECREASE = 0.01
+"""Minimum relative decrease of (2) for another step."""
+SETTLED_COST = 1.0
+"""Maximum of (2) per contact at which a measured state counts as settled."""
+DIFFERENCES = (1e-7, 1e-6)
+"""Sizes of finite differences of positions (rad or m) and velocities (per s)."""
+
+_Key = tuple[int, int, int]
+"""Geoms of a contact, and its number among the contacts of these geoms."""
+
+
+class _Contact(NamedTuple):
+    """State of a contact.
+
+    Attributes:
+        velocity: (n,) velocity u of the second geom against the first one at the contact point: its
+            normal part, and two tangential ones unless the contact is frictionless.
+        acceleration: (n,) its derivative du/dt.
+        distance: distance of the geoms in m.
+        is_closed: whether the contact exerts a force.
+        normal: (nv,) row of J for the normal velocity.
+    """
+
+    velocity: Array
+    acceleration: Array
+    distance: float
+    is_closed: bool
+    normal: Array
+
+
+class _ContactModel:
+    """A robot at the first instant of a run, whose contacts are evaluated at given states."""
+
+    def __init__(
+        self, simulator: RobotSimulator, theta: Array, scenario: Scenario, x: Array, v: Array
+    ) -> None:
+        """Take the model with the effects of `theta`, and the first inputs of the run."""
+        import mujoco
+
+        acting = simulator.get_active_effects(theta[None])
+        commands = simulator.run_inputs(scenario)
+        inputs = simulator.compute_controls(
+            RobotRunBatch(scenario, commands, acting, x[None], v[None]), 1
+        )
+        mujoco_batch = simulator.make_linearisation_batch(acting)
+        mujoco_batch.write_effects(
+            tuple(
+                (effect, np.repeat(c, mujoco_batch.count, axis=1))
+                for effect, c in select_model_field_effects(acting)
+            )
+        )
+        self._model = copy(mujoco_batch.batch.get_model(0))
+        self._model.geom_gap[:] = SEARCH_GAP
+        self._data = mujoco.MjData(self._model)
+        self._data.ctrl[:] = inputs.controls[0, 0]
+        self._data.qfrc_applied[:] = mujoco_batch.map_forces(inputs.forces[0, 0])
+        self._data.act[:] = inputs.activations[0]
+        self._joints = mujoco_batch.file_joints
+
+    def evaluate(self, state: Array) -> dict[_Key, _Contact]:
+        """Return all contacts at a state (2 D,) of the joints."""
+        import mujoco
+
+        model, data, joints = self._model, self._data, self._joints
+        positions, velocities = np.split(state, 2)
+        data.qpos[joints.positions] = positions
+        data.qvel[joints.velocities] = velocities
+        mujoco.mj_forward(model, data)
+        v, a = data.qvel.copy(), data.qacc.copy()
+        contacts = self._compute_jacobians()
+        distances = {key: (dist, closed) for key, (_, dist, closed) in contacts.items()}
+        mujoco.mj_integratePos(model, data.qpos, v, model.opt.timestep)
+        mujoco.mj_fwdPosition(model, data)
+        moved = self._compute_jacobians()
+        result = {}
+        for key, (jacobian, *_) in contacts.items():
+            later = moved[key][0] if key in moved else jacobian
+            acceleration = jacobian @ a + (later - jacobian) @ v / model.opt.timestep
+            result[key] = _Contact(
+                jacobian @ v, acceleration, *distances[key], jacobian[0, joints.velocities]
+            )
+        return result
+
+    def _compute_jacobians(self) -> dict[_Key, tuple[Array, float, bool]]:
+        """Return Jacobian (n, nv), distance and closedness of all contacts of the data."""
+        import mujoco
+
+        model, data = self._model, self._data
+        contacts: dict[_Key, tuple[Array, float, bool]] = {}
+        jacobians = np.zeros((2, 3, model.nv))
+        for contact in data.contact:
+            geoms = int(contact.geom[0]), int(contact.geom[1])
+            for jacobian, geom in zip(jacobians, geoms, strict=True):
+                mujoco.mj_jac(model, data, jacobian, None, contact.pos, model.geom_bodyid[geom])
+            rows = 3 if contact.dim > 1 else 1
+            relative = contact.frame.reshape(3, 3)[:rows] @ (jacobians[1] - jacobians[0])
+            number = sum(key[:2] == geoms for key in contacts)
+            contacts[(*geoms, number)] = relative, float(contact.dist), contact.efc_address >= 0
+        return contacts
+
+
+def settle_contacts(
+    simulator: RobotSimulator,
+    theta: Array,
+    scenario: Scenario,
+    start: tuple[Array, Array],
+    sigma: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Return the likeliest first state of a run at which the contacts are in equilibrium.
+
+    Args:
+        simulator: simulator of the robot.
+        theta: (P,) parameters.
+        scenario: scenario of the run, whose first commands act.
+        start: (D,) measured positions and velocities.
+        sigma: (D,) their standard deviations.
+
+    Returns:
+        (D,) positions and velocities; the measured ones if no contact may be closed.
+    """
+    measured, deviations = np.concatenate(start), np.concatenate(sigma)
+    differences = np.repeat(DIFFERENCES, start[0].size)
+    with capture_mujoco_warnings():
+        model = _ContactModel(simulator, theta, scenario, *start)
+        state, present = measured, model.evaluate(measured)
+        keys = [
+            key
+            for key, contact in present.items()
+            if contact.distance
+            < MAX_DISTANCE_SIGMAS * float(np.linalg.norm(contact.normal * sigma[0]))
+        ]
+        if not keys:
+            return start
+        cost = _compute_cost(present, keys)
+        for _ in range(MAX_ITERATIONS):
+            if cost <= SETTLED_COST * len(keys):
+                break
+            residual = _compute_residual(present, present, keys)
+            jacobian = np.empty((residual.size, state.size))
+            for i, difference in enumerate(differences):
+                moved = state.copy()
+                moved[i] += difference
+                changed = _compute_residual(model.evaluate(moved), present, keys)
+                jacobian[:, i] = (changed - residual) / difference
+            step = _solve(jacobian, residual, (state - measured) / deviations, deviations)
+            for _ in range(MAX_HALVINGS):
+                contacts = model.evaluate(state + step)
+                offset = (state + step - measured) / deviations
+                new_cost = _compute_cost(contacts, keys) + float(offset @ offset)
+                if new_cost < cost:
+                    break
+                step = step / 2.0
+            else:
+                break
+            has_converged = cost - new_cost < MIN_DECREASE * cost
+            state, present, cost = state + step, contacts, new_cost
+            if has_converged:
+                break
+    positions, velocities = np.split(state, 2)
+    return positions, velocities
+
+
+def _solve(jacobian: Array, residual: Array, offset: Array, deviations: Array) -> Array:
+    """Return the Gauss-Newton step (2 D,) of (2).
+
+    Args:
+        jacobian: (m, 2 D) derivatives of the residual.
+        residual: (m,) weighted residual of the contacts.
+        offset: (2 D,) weighted distance from the measured state.
+        deviations: (2 D,) standard deviations of the measured state.
+    """
+    scaled = np.concatenate([np.eye(offset.size), jacobian * deviations])
+    step: Array = np.linalg.lstsq(scaled, -np.concatenate([offset, residual]), rcond=None)[0]
+    return step * deviations
+
+
+def _compute_residual(
+    contacts: dict[_Key, _Contact], reference: dict[_Key, _Contact], keys: list[_Key]
+) -> npt.NDArray[np.float64]:
+    """Return the weighted residual of (1), with the distance of contacts that are open."""
+    rows: list[Array] = []
+    for key in keys:
+        contact = contacts.get(key, reference[key])
+        rows.append(contact.velocity[:1] / SPEED_TOLERANCE)
+        if reference[key].is_closed:
+            rows.append(contact.acceleration / ACCELERATION_TOLERANCE)
+        else:
+            rows.append(np.array([(contact.distance + FIRST_DEPTH) / DISTANCE_TOLERANCE]))
+    return np.concatenate(rows)
+
+
+def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
+    """Return the sum of squares of the contacts; an open one costs at least its free fall."""
+    if not all(key in contacts for key in keys):
+        return float("inf")
+    residual = _compute_residual(contacts, contacts, keys)
+    falling = sum(not contacts[key].is_closed for key in keys) * 9.81 / ACCELERATION_TOLERANCE
+    return float(residual @ residual + falling**2)
