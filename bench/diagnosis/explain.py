@@ -29,12 +29,12 @@ from bench.diagnosis.pipeline.recording_errors import (
     refuse_broken_conventions,
 )
 from bench.diagnosis.pipeline.recording_preparation import RecordingSource, prepare_runs
-from bench.diagnosis.pipeline.report_data_builder import DiagnosisReportDataBuilder
+from bench.diagnosis.pipeline.report_data_builder import build_report_data
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext, SimulatedRuns
 from bench.diagnosis.pipeline.solver_option_choice import SolverOptionChoice
 from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
+from bench.diagnosis.pipeline.verdict_builder import build_verdict
 from bench.diagnosis.verdict import Cause
 from sims.core.simulator import InputError
 
@@ -221,11 +221,11 @@ def _build_explanation(result: SearchResult, numerics_causes: Sequence[Cause]) -
         result: result of the search.
         numerics_causes: wrong numerical settings of the model file.
     """
-    verdict = add_numerics_causes(VerdictBuilder(result).build_verdict(), numerics_causes)
+    verdict = add_numerics_causes(build_verdict(result), numerics_causes)
     runs, theta = result.runs, result.finding.model.fit.theta
     unusual_values = describe_unusual_values(runs.fitting, theta, runs.context.wider)
     notes = *unusual_values, *runs.context.notes
-    report_data = DiagnosisReportDataBuilder(result, notes).build_report_data(verdict)
+    report_data = build_report_data(result, verdict, notes)
     return Explanation(verdict, report_data, build_extended_simulator(result))
 
 

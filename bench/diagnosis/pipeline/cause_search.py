@@ -20,7 +20,7 @@ from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.recording_errors import RecordingErrorCheck
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
+from bench.diagnosis.pipeline.verdict_builder import restrict_verdict
 from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
@@ -136,7 +136,7 @@ class CauseSearch:
         check = self._error_check
         if not check.errors:
             result = SearchResult(base, search, _search_and_decide(search, base.runs), rng)
-            result = replace(result, finding=VerdictBuilder(result).restrict_verdict())
+            result = replace(result, finding=restrict_verdict(result))
             check.check_result(result)
             if not check.errors:
                 return result

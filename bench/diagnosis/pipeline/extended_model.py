@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
 from sims import extended_simulator as extend
 from sims.extended_simulator import ExtendedSimulator
 
@@ -16,8 +15,7 @@ def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
     """
     runs, model = result.runs, result.finding.model
     evaluator, recording = runs.fitting, runs.recording
-    builder = VerdictBuilder(result)
-    estimates = builder.collect_parameter_estimates(model)
+    estimates = result.estimates.values
     base_values = {
         p.name: estimates[i]
         for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
@@ -29,7 +27,7 @@ def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
     }
     # The simulator's order keeps the file independent of the order of the search.
     added_effects = {
-        effect: builder.select_coefficients(effect, estimates)
+        effect: result.estimates.select_coefficients(effect)
         for effect in evaluator.coefficient_slices
         if effect in model.effects
     }

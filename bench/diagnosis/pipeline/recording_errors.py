@@ -6,7 +6,7 @@ from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, 
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns, list_free
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
+from bench.diagnosis.pipeline.verdict_builder import build_causes
 from bench.diagnosis.verdict import RecordingFault
 from sims.core.simulator import InputError
 from sims.recording.recording_description import read_meta
@@ -127,6 +127,6 @@ def _find_imitated_units(result: SearchResult) -> tuple[RecordingFault, ...]:
     runs, search = result.runs, result.search
     errors = [
         find_imitated_unit(_make_subject(runs), runs.fitting, cause, search.base_model.fit)
-        for cause in VerdictBuilder(result).build_causes()
+        for cause in build_causes(result)
     ]
     return tuple(error for error in errors if error is not None)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from bench.diagnosis import residual_analysis
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
+from bench.diagnosis.pipeline.held_out_gains import HeldOutGains
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
+from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.report.cause_text import format_effect_set
 from bench.diagnosis.report.effect_and_unit_text import END, format_file_change
 from bench.diagnosis.report.report_data import (
@@ -21,6 +21,8 @@ from bench.diagnosis.report.report_data import (
     ParameterChange,
 )
 from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.lack_of_fit import LackOfFitResult
 from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD
 from bench.diagnosis.validation.run_consistency import (
     ConsistencySummary,
@@ -30,6 +32,7 @@ from bench.diagnosis.validation.run_consistency import (
 from bench.diagnosis.verdict import Verdict
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue as Estimate
+from sims.recording.recording import Recording
 
 TRACK_COLUMNS = {"u", "v", "radius_px"}
 """Columns by which the recording of a tracked film is recognised."""
@@ -39,292 +42,273 @@ MAX_TRACK_FIGURE_BYTES = 1_000_000
 """Maximum size in bytes of the track figure that a page includes."""
 
 
-@dataclass(frozen=True)
-class DiagnosisReportDataBuilder:
-    """Builder of the report data of a finding.
+def build_report_data(
+    result: SearchResult, verdict: Verdict, notes: Sequence[str] = ()
+) -> DiagnosisReportData:
+    """Collect everything that text, figures and page of a report need, for a verdict.
 
-    Attributes:
+    Args:
         result: Result of the search.
+        verdict: Verdict that the report explains.
         notes: Further notes, one sentence each.
     """
+    evaluator, recording, finding = result.runs.fitting, result.runs.recording, result.finding
+    before, after = finding.base.fit.simulated, finding.model.fit.simulated
+    # The noise is that of the finding, because a good model estimates it better.
+    gains = HeldOutGains(result)
+    sigma = gains.noise_sigma
+    held_out, held_out_locations = _summarise_held_out(result, sigma)
+    changes = tuple(_list_parameter_changes(result))
+    # A wrong unit leaves nothing to explain.
+    unexplained, reasons, consistency = tuple[str, ...](), tuple[str, ...](), ConsistencySummary()
+    if not verdict.recording_faults:
+        unexplained = (*_list_unexplained(result), *_warn_of_bounds(changes), *notes)
+        reasons = tuple(_list_verdict_reasons(finding))
+        consistency = _assess_consistency(result)
+    return DiagnosisReportData(
+        # A recording without a title is identified by its file name.
+        recording.title or recording.path.stem,
+        recording.path,
+        verdict,
+        _list_channels(result.runs, sigma),
+        residual_analysis.build_data_split(evaluator, before, after),
+        held_out,
+        (
+            *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
+            *held_out_locations,
+        ),
+        tuple(residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)),
+        changes,
+        unexplained,
+        reasons,
+        finding.unidentified_parameters,
+        residual_analysis.get_robot(evaluator),
+        identifiability=_assess_identifiability(result.search),
+        consistency=consistency,
+        track=_read_track_figure(recording),
+        logs=max(1, len({run.log for run in recording.runs})),
+        thorough=result.search.thorough,
+        cross_validated=result.runs.is_cross_validated,
+        share_intervals=gains.compute_share_intervals(),
+    )
 
-    result: SearchResult
-    notes: tuple[str, ...] = ()
 
-    @property
-    def _finding(self) -> DiagnosisResult:
-        return self.result.finding
+def _read_track_figure(recording: Recording) -> bytes:
+    """Return the PNG figure that film tracking saved next to the recording; empty if none."""
+    path = recording.path.with_suffix(".png")
+    if not recording.extra.keys() >= TRACK_COLUMNS:
+        return b""
+    try:
+        with path.open("rb") as file:
+            picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
+    except OSError:
+        return b""
+    return (
+        picture
+        if picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
+        else b""
+    )
 
-    @property
-    def _builder(self) -> VerdictBuilder:
-        return VerdictBuilder(self.result)
 
-    def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
-        """Collect everything that text, figures and page of a report need, for a verdict.
+def _assess_consistency(result: SearchResult) -> ConsistencySummary:
+    """Assess the consistency of runs, logs and loads for the base and the extended model.
 
-        Args:
-            verdict: Verdict that the report explains.
-        """
-        evaluator = self.result.runs.fitting
-        recording = self.result.runs.recording
-        before = self._finding.base.fit.simulated
-        after = self._finding.model.fit.simulated
-        # The noise is that of the finding, because a good model estimates it better.
-        sigma = self._builder.estimate_noise_sigma()
-        held_out, held_out_locations = self._summarise_held_out(sigma)
-        return DiagnosisReportData(
-            # A recording without a title is identified by its file name.
-            recording.title or recording.path.stem,
-            recording.path,
-            verdict,
-            self._list_channels(sigma),
-            residual_analysis.build_data_split(evaluator, before, after),
-            held_out,
-            (
-                *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
-                *held_out_locations,
-            ),
-            tuple(residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)),
-            tuple(self._list_parameter_changes()),
-            () if verdict.recording_faults else tuple(self._list_unexplained()),
-            () if verdict.recording_faults else tuple(self._list_verdict_reasons()),
-            self._finding.unidentified_parameters,
-            residual_analysis.get_robot(evaluator),
-            identifiability=self._assess_identifiability(),
-            consistency=ConsistencySummary()
-            if verdict.recording_faults
-            else self._assess_consistency(),
-            track=self._read_track_figure(),
-            logs=max(1, len({run.log for run in recording.runs})),
-            thorough=self.result.search.thorough,
-            cross_validated=self._is_cross_validated,
-            share_intervals=self._builder.share_intervals(),
-        )
+    Consistency means that groups of runs give the same parameters as all runs together.
+    """
+    search, finding = result.search, result.finding
+    if finding.early_stop is not None or finding.unidentified_parameters:
+        return ConsistencySummary()
+    before = assess_consistency(search, finding.base)
+    after = assess_consistency(search, finding.model) if finding.model.effects else before
+    return ConsistencySummary(before, after, _estimate_parameters_by_group(search, finding))
 
-    def _read_track_figure(self) -> bytes:
-        """Return the PNG figure that film tracking saved next to the recording; empty if none."""
-        recording = self.result.runs.recording
-        path = recording.path.with_suffix(".png")
-        if not recording.extra.keys() >= TRACK_COLUMNS:
-            return b""
-        try:
-            with path.open("rb") as file:
-                picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
-        except OSError:
-            return b""
-        return (
-            picture
-            if picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
-            else b""
-        )
 
-    def _assess_consistency(self) -> ConsistencySummary:
-        """Assess the consistency of runs, logs and loads for the base and the extended model.
+def _estimate_parameters_by_group(
+    search: EffectSearch, finding: DiagnosisResult
+) -> tuple[ParameterConsistency, ...]:
+    """Return the estimates by run, log or load of the best effect other than a single cause.
 
-        Consistency means that groups of runs give the same parameters as all runs together.
-        """
-        if self._finding.early_stop is not None or self._finding.unidentified_parameters:
-            return ConsistencySummary()
-        before = assess_consistency(self.result.search, self._finding.base)
-        after = (
-            assess_consistency(self.result.search, self._finding.model)
-            if self._finding.model.effects
-            else before
-        )
-        return ConsistencySummary(before, after, self._estimate_parameters_by_group())
+    They let the report compare how consistent the cause and its best competitor are.
+    """
+    if len(finding.causes) != 1:
+        return ()
+    (cause,) = finding.causes
+    related_effects = {cause.effect, *cause.alternatives, *finding.model.effects}
+    singles = [m for m in search.models.values() if len(m.effects) == 1]
+    other_models = [
+        model
+        for model in singles
+        if not related_effects & set(model.effects)
+        and np.isfinite(model.penalised_log_likelihood)
+        # A trend of a coefficient is only visible in effects with a single coefficient.
+        and len(search.evaluator.get_coefficient_indices(model.effects[0])) == 1
+    ]
+    if not other_models:
+        return ()
+    best = max(other_models, key=lambda model: model.penalised_log_likelihood)
+    (name,) = best.effects
+    group_estimates = [
+        consistency
+        for consistency in assess_consistency(search, best)
+        if consistency.number.startswith(name)
+    ]
+    return tuple(group_estimates)
 
-    def _estimate_parameters_by_group(self) -> tuple[ParameterConsistency, ...]:
-        """Return the estimates by run, log or load of the best effect other than a single cause.
 
-        They let the report compare how consistent the cause and its best competitor are.
-        """
-        if len(self._finding.causes) != 1:
+def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiability, ...]:
+    """Assess identifiability from the directions that the search has simulated.
+
+    If no directions are known, those of the scan of the base model are used; without them, the
+    result is empty.
+    """
+    key: frozenset[str] = frozenset()
+    directions = search.get_known_directions()
+    if directions is None:
+        scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
+        if scan is None:
             return ()
-        (cause,) = self._finding.causes
-        related_effects = {cause.effect, *cause.alternatives, *self._finding.model.effects}
-        singles = [m for m in self.result.search.models.values() if len(m.effects) == 1]
-        other_models = [
-            model
-            for model in singles
-            if not related_effects & set(model.effects)
-            and np.isfinite(model.penalised_log_likelihood)
-            # A trend of a coefficient is only visible in effects with a single coefficient.
-            and len(self.result.search.evaluator.get_coefficient_indices(model.effects[0])) == 1
-        ]
-        if not other_models:
-            return ()
-        best = max(other_models, key=lambda model: model.penalised_log_likelihood)
-        (name,) = best.effects
-        group_estimates = [
-            consistency
-            for consistency in assess_consistency(self.result.search, best)
-            if consistency.number.startswith(name)
-        ]
-        return tuple(group_estimates)
+        directions = scan.fit, scan.directions
+    return assess_identifiability(search.evaluator, search.noise, *directions)
 
-    def _assess_identifiability(self) -> tuple[ParameterIdentifiability, ...]:
-        """Assess identifiability from the directions that the search has simulated.
 
-        If no directions are known, those of the scan of the base model are used; without them, the
-        result is empty.
-        """
-        key: frozenset[str] = frozenset()
-        search = self.result.search
-        directions = search.get_known_directions()
-        if directions is None:
-            scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
-            if scan is None:
-                return ()
-            directions = scan.fit, scan.directions
-        return assess_identifiability(search.evaluator, search.noise, *directions)
+def _summarise_held_out(
+    result: SearchResult, sigma: Array
+) -> tuple[DataSplit | None, list[GapLocation]]:
+    """Return the held-out runs and their gap locations; None and empty if not measured.
 
-    @property
-    def _is_cross_validated(self) -> bool:
-        """True if the gain was measured by cross-validation instead of on held-out runs."""
-        validation = self.result.runs.validation
-        return validation is not None and validation.is_cross_validation
+    Args:
+        result: result of the search.
+        sigma: (C,) standard deviation of the noise of each channel.
+    """
+    evaluator, held_out_fits = result.runs.predicted, result.finding.held_out_fits
+    names = result.finding.model.effects
+    # If the data do not identify the base model, it is not validated on held-out runs.
+    if evaluator is None or held_out_fits is None or names not in held_out_fits:
+        return None, []
+    before = held_out_fits[()].simulated
+    after = held_out_fits[names].simulated
+    how_validated = "left out" if result.runs.is_cross_validated else "held out"
+    locations = residual_analysis.compute_gap_locations(
+        evaluator, before, after, sigma, f" ({how_validated})"
+    )
+    # Channels and phases are reported for the fitted runs only; held-out gaps by run.
+    runs = [location for location in locations if location.kind == "run"]
+    return residual_analysis.build_data_split(evaluator, before, after), runs
 
-    @property
-    def _how_validated(self) -> str:
-        return "left out" if self._is_cross_validated else "held out"
 
-    def _summarise_held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
-        """Return the held-out runs and their gap locations; None and empty if not measured.
+def _list_channels(runs: SimulatedRuns, sigma: Array) -> tuple[ChannelInfo, ...]:
+    """Return name, unit and noise of each channel.
 
-        Args:
-            sigma: (C,) standard deviation of the noise of each channel.
-        """
-        evaluator = self.result.runs.predicted
-        held_out_fits = self._finding.held_out_fits
-        names = self._finding.model.effects
-        # If the data do not identify the base model, it is not validated on held-out runs.
-        if evaluator is None or held_out_fits is None or names not in held_out_fits:
-            return None, []
-        before = held_out_fits[()].simulated
-        after = held_out_fits[names].simulated
-        locations = residual_analysis.compute_gap_locations(
-            evaluator, before, after, sigma, f" ({self._how_validated})"
-        )
-        # Channels and phases are reported for the fitted runs only; held-out gaps by run.
-        runs = [location for location in locations if location.kind == "run"]
-        return residual_analysis.build_data_split(evaluator, before, after), runs
+    `sigma` (C,) is the noise standard deviation of each channel in its unit.
+    """
+    floor = runs.floor
+    rows = zip(
+        runs.fitting.simulator.channels,
+        sigma.tolist(),
+        floor.is_stated.tolist(),
+        floor.quantisation_step.tolist(),
+        strict=True,
+    )
+    return tuple(
+        ChannelInfo(c.name, c.unit, noise_sigma, is_stated, step)
+        for c, noise_sigma, is_stated, step in rows
+    )
 
-    def _list_channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
-        """Return name, unit and noise of each channel.
 
-        `sigma` (C,) is the noise standard deviation of each channel in its unit.
-        """
-        floor = self.result.runs.floor
-        rows = zip(
-            self.result.runs.fitting.simulator.channels,
-            sigma.tolist(),
-            floor.is_stated.tolist(),
-            floor.quantisation_step.tolist(),
-            strict=True,
-        )
-        return tuple(
-            ChannelInfo(c.name, c.unit, noise_sigma, is_stated, step)
-            for c, noise_sigma, is_stated, step in rows
+def _list_parameter_changes(result: SearchResult) -> Iterator[ParameterChange]:
+    """Yield each base parameter with its value before and after the causes were added.
+
+    A parameter is marked if the data do not determine it, so that it was kept at its nominal
+    value.
+    """
+    evaluator = result.runs.fitting
+    before = result.estimate(result.finding.base).values
+    after = result.estimates.values
+    for i in evaluator.base_indices.tolist():
+        parameter = evaluator.parameters[i]
+        is_free = i not in result.base.fit.fixed_parameters
+        yield ParameterChange(
+            parameter.name,
+            parameter.unit,
+            _get_value_and_interval(before[i]),
+            _get_value_and_interval(after[i]),
+            is_free,
+            (before[i].at_bound, after[i].at_bound),
+            format_file_change(after[i]),
         )
 
-    def _list_parameter_changes(self) -> Iterator[ParameterChange]:
-        """Yield each base parameter with its value before and after the causes were added.
 
-        A parameter is marked if the data do not determine it, so that it was kept at its nominal
-        value.
-        """
-        evaluator = self.result.runs.fitting
-        before = self._builder.collect_parameter_estimates(self._finding.base)
-        after = self._builder.collect_parameter_estimates(self._finding.model)
-        for i in evaluator.base_indices.tolist():
-            parameter = evaluator.parameters[i]
-            is_free = i not in self.result.base.fit.fixed_parameters
-            yield ParameterChange(
-                parameter.name,
-                parameter.unit,
-                _get_value_and_interval(before[i]),
-                _get_value_and_interval(after[i]),
-                is_free,
-                (before[i].at_bound, after[i].at_bound),
-                format_file_change(after[i]),
-            )
+def _list_unexplained(result: SearchResult) -> Iterator[str]:
+    """Yield sentences on what the extended model does not explain, and on fixed parameters."""
+    evaluator, lack_of_fit = result.runs.fitting, result.finding.lack_of_fit
+    for channel in lack_of_fit.channels_above_noise:
+        times = lack_of_fit.excess[evaluator.channels.index(channel)]
+        yield f"the residual of channel {channel} is {times:.3g} times its noise"
+    # Without a result of the test for unmodelled forces there is no dependence to report.
+    if lack_of_fit.has_structure and lack_of_fit.where:
+        yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
+    base = result.base
+    if names := base.join_names(base.fit.insensitive_parameters):
+        yield f"the data do not depend on {names}: kept at the nominal value"
+    if names := base.join_names(base.fit.unidentified_parameters):
+        yield (
+            f"the data do not identify {names} together with the other parameters: kept at the "
+            "nominal value"
+        )
 
-    def _list_unexplained(self) -> Iterator[str]:
-        """Yield sentences on what the extended model does not explain, and further notes.
 
-        The notes name parameters that the data do not determine, and bounds that a fit has reached.
-        """
-        evaluator = self.result.runs.fitting
-        lack_of_fit = self._finding.lack_of_fit
-        for channel in lack_of_fit.channels_above_noise:
-            times = lack_of_fit.excess[evaluator.channels.index(channel)]
-            yield f"the residual of channel {channel} is {times:.3g} times its noise"
-        # Without a result of the test for unmodelled forces there is no dependence to report.
-        if lack_of_fit.has_structure and lack_of_fit.where:
-            yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
-        base = self.result.base
-        if names := base.join_names(base.fit.insensitive_parameters):
-            yield f"the data do not depend on {names}: kept at the nominal value"
-        if names := base.join_names(base.fit.unidentified_parameters):
+def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
+    """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
+    for parameter in changes:
+        values = parameter.before[0], parameter.after[0]
+        for fit_text, value, bound in zip(
+            ("in the base fit ", ""), values, parameter.bounds, strict=True
+        ):
+            if bound is None:
+                continue
             yield (
-                f"the data do not identify {names} together with the other parameters: kept at the "
-                "nominal value"
+                f"{fit_text}{parameter.name} lies at the {END[bound]} bound of its range, "
+                f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
+                "cause may compensate for a value beyond the bound. Check the "
+                "units and constants of the recording"
             )
-        yield from self._warn_of_bounds()
-        yield from self.notes
+            break
 
-    def _warn_of_bounds(self) -> Iterator[str]:
-        """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
-        for parameter in self._list_parameter_changes():
-            values = parameter.before[0], parameter.after[0]
-            for fit_text, value, bound in zip(
-                ("in the base fit ", ""), values, parameter.bounds, strict=True
-            ):
-                if bound is None:
-                    continue
-                yield (
-                    f"{fit_text}{parameter.name} lies at the {END[bound]} bound of its range, "
-                    f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
-                    "cause may compensate for a value beyond the bound. Check the "
-                    "units and constants of the recording"
-                )
-                break
 
-    def _list_verdict_reasons(self) -> Iterator[str]:
-        """Yield the reasons for the verdict as sentences, the most important first.
+def _list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
+    """Yield the reasons for the verdict as sentences, the most important first.
 
-        A search that was stopped early has no such reasons.
-        """
-        finding = self._finding
-        if finding.early_stop is not None:
-            return
-        if finding.verdict == "unknown" and finding.causes:
-            yield "the best effects do not close enough of the gap to explain it"
-        if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
-            yield self._describe_residual_structure()
-        for cause in finding.causes:
-            if cause.alternatives:
-                names = [cause.effect, *cause.alternatives]
-                names_joints = any("@" in name for name in names)
-                effects_text = (
-                    format_effect_set(names, "and") if names_joints else _join_effect_names(names)
-                )
-                yield (
-                    f"{effects_text} have the same influence on these runs, "
-                    "once parameters and initial states are fitted with each: "
-                    "their likelihoods differ by odds of less than 33 to 1"
-                )
-
-    def _describe_residual_structure(self) -> str:
-        """Say how the residual of the final model still differs from the noise of the sensors."""
-        p_value = self._finding.lack_of_fit.p_value
-        # Lack of fit is either a residual with a pattern, or one that is only too large.
-        if p_value < STRUCTURE_P_VALUE_THRESHOLD:
-            return (
-                "the residual has structure that sensor noise does not explain "
-                f"(p-value {p_value:.2g})"
+    A search that was stopped early has no such reasons.
+    """
+    if finding.early_stop is not None:
+        return
+    if finding.verdict == "unknown" and finding.causes:
+        yield "the best effects do not close enough of the gap to explain it"
+    if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
+        yield _describe_residual_structure(finding.lack_of_fit)
+    for cause in finding.causes:
+        if cause.alternatives:
+            names = [cause.effect, *cause.alternatives]
+            names_joints = any("@" in name for name in names)
+            effects_text = (
+                format_effect_set(names, "and") if names_joints else _join_effect_names(names)
             )
-        return "the residual exceeds the stated noise of the sensors"
+            yield (
+                f"{effects_text} have the same influence on these runs, "
+                "once parameters and initial states are fitted with each: "
+                "their likelihoods differ by odds of less than 33 to 1"
+            )
+
+
+def _describe_residual_structure(lack_of_fit: LackOfFitResult) -> str:
+    """Say how the residual of the final model still differs from the noise of the sensors."""
+    p_value = lack_of_fit.p_value
+    # Lack of fit is either a residual with a pattern, or one that is only too large.
+    if p_value < STRUCTURE_P_VALUE_THRESHOLD:
+        return (
+            f"the residual has structure that sensor noise does not explain (p-value {p_value:.2g})"
+        )
+    return "the residual exceeds the stated noise of the sensors"
 
 
 def _join_effect_names(effects: list[str]) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.parameter_estimates import ParameterEstimates
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -46,6 +48,17 @@ class SearchResult:
         """The best fit of the base model, which the search may have improved."""
         search = self.search
         return BaseModel(self.runs, BaseFit(search.base_model.fit, search.fixed_parameters))
+
+    @cached_property
+    def estimates(self) -> ParameterEstimates:
+        """Estimates of the parameters and coefficients of the found model."""
+        return self.estimate(self.finding.model)
+
+    def estimate(self, model: FittedModel) -> ParameterEstimates:
+        """Return the estimates of a model of the search, which may have ended early."""
+        stop = self.finding.early_stop
+        is_finished = stop is None or "base_fit" not in stop.skipped_questions
+        return ParameterEstimates(self.search, model, is_finished)
 
     @property
     def is_explained(self) -> bool:

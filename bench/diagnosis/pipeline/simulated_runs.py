@@ -161,6 +161,11 @@ class SimulatedRuns:
         return [self.fitting]
 
     @property
+    def is_cross_validated(self) -> bool:
+        """True if models are validated by cross-validation instead of on held-out runs."""
+        return self.validation is not None and self.validation.is_cross_validation
+
+    @property
     def engine(self) -> str | None:
         """Name of the engine; None for a simulator with its own integrator."""
         return self.fitting.engine

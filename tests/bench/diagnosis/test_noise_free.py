@@ -14,7 +14,7 @@ from bench.diagnosis.evaluation.noise_floor import (
     compute_value_range,
 )
 from bench.diagnosis.explain import explain
-from bench.diagnosis.pipeline.verdict_builder import VerdictBuilder
+from bench.diagnosis.pipeline.verdict_builder import _is_refuted
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
@@ -114,7 +114,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     )
     finding = DiagnosisResult("unknown", base, base, (), left, held_out_fits=measured)
     result = SimpleNamespace(runs=runs, search=search, finding=finding)
-    return VerdictBuilder(result)._is_refuted()
+    return _is_refuted(result)
 
 
 @pytest.mark.parametrize(

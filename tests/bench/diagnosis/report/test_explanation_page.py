@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
-from bench.diagnosis.pipeline.report_data_builder import DiagnosisReportDataBuilder
+from bench.diagnosis.pipeline.report_data_builder import _read_track_figure
 from bench.diagnosis.report.explanation_figures import RenderedFigure
 from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
 from bench.pages.html_page import make_iframe
@@ -395,9 +395,7 @@ def test_the_track_of_a_film_is_drawn_next_to_the_curves(figures, tmp_path):
 
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
-        return DiagnosisReportDataBuilder._read_track_figure(
-            SimpleNamespace(result=SimpleNamespace(runs=SimpleNamespace(recording=recording)))
-        )
+        return _read_track_figure(recording)
 
     tracked = ("u", "v", "radius_px")
     assert track(tracked) == b""

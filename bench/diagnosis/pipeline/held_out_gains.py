@@ -1,0 +1,155 @@
+"""Gains of the prediction of held-out runs, by the causes together and by single effects."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fitted_models import EffectNames
+from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.validation.gain_and_intervals import HeldOutGain, compute_held_out_gain
+from bench.diagnosis.verdict import HeldOutResult, to_finite_or_none
+from sims.core.simulator import Array
+
+MIN_REPORTED_GAIN = -9.0
+"""Lower limit of a candidate's reported share of the held-out gap; it only means "worse"."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutGains:
+    """Gains of the prediction of held-out runs over that of the base model.
+
+    Attributes:
+        result: Result of the search, with the predicted runs.
+    """
+
+    result: SearchResult
+
+    @cached_property
+    def noise_sigma(self) -> Array:
+        """Noise floor (C,).
+
+        It is the specified noise, or else the residual of a model without lack of fit.
+        """
+        finding, floor = self.result.finding, self.result.runs.floor
+        residual_sigma = finding.model.likelihood.sigma
+        # The noise estimate assumes white noise, so the residual of a good model may exceed it.
+        is_usable = ~floor.is_stated & np.isfinite(residual_sigma) & (residual_sigma > floor.sigma)
+        has_no_structure = not finding.lack_of_fit.has_structure
+        return np.where(is_usable & has_no_structure, residual_sigma, floor.sigma)
+
+    @cached_property
+    def _channels(self) -> list[int]:
+        """Indices of the channels with the same unit as the channel that sensor effects act on."""
+        evaluator = self.result.runs.fitting
+        units = [channel.unit for channel in evaluator.simulator.channels]
+        reading = evaluator.simulator.system.reading(evaluator.channels)
+        # Errors of different units cannot be added.
+        unit = units[evaluator.channels.index(reading)]
+        return [c for c, channel_unit in enumerate(units) if channel_unit == unit]
+
+    @property
+    def _noise_floor(self) -> float:
+        """RMS of the noise floor over the channels that count."""
+        sigma = self.noise_sigma[self._channels]
+        return float(np.sqrt(np.square(sigma).mean()))
+
+    def measure(self) -> HeldOutResult | None:
+        """Measure by how much the causes improve the prediction of held-out runs.
+
+        Return None if the prediction of the base model failed, or if no runs were predicted with
+        both models.
+        """
+        runs, finding = self.result.runs.predicted, self.result.finding
+        held_out_fits, names = finding.held_out_fits, finding.model.effects
+        if runs is None or held_out_fits is None or names not in held_out_fits:
+            return None
+        before, after = held_out_fits[()].simulated, held_out_fits[names].simulated
+        if self.result.runs.before is not None:
+            before = self.result.runs.before
+        # Without a prediction of the base model there is no gap to measure.
+        if not np.isfinite(before[np.isfinite(runs.observed)]).all():
+            return None
+        gain = self._compute_gain(runs, before, after, self.result.rng)
+        channel = self.result.runs.fitting.simulator.channels[self._channels[0]]
+        # An interval that the data do not give is None.
+        base, extended, floor, share, low, high = map(to_finite_or_none, astuple(gain))
+        return HeldOutResult(base, extended, floor, share, low, high, channel.unit)
+
+    def _compute_gain(
+        self, runs: RunEvaluator, before: Array, after: Array, rng: np.random.Generator
+    ) -> HeldOutGain:
+        """Compute the gain of a prediction over that of the base model.
+
+        Args:
+            runs: the predicted runs.
+            before: (R, T, C) prediction of the base model.
+            after: (R, T, C) the other prediction.
+            rng: source of the bootstrap samples.
+        """
+        # Cross-validated runs are few, and gains are resampled by segments.
+        by_segments = self.result.runs.is_cross_validated
+        return compute_held_out_gain(
+            runs, before, after, self._channels, self._noise_floor, rng, by_segments
+        )
+
+    def get_closed_share(self, names: EffectNames) -> float | None:
+        """Return the share of the held-out gap that a model closes; None if it is not measured.
+
+        Args:
+            names: names of the effects of the model.
+        """
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
+        if runs is None or held_out_fits is None or names not in held_out_fits:
+            return None
+        floor = self._noise_floor
+        # As for the gain of the whole model, an error below the noise floor is not a gain.
+        before = _compute_rmse(runs, held_out_fits[()].simulated, self._channels)
+        after = _compute_rmse(runs, held_out_fits[names].simulated, self._channels)
+        share = 0.0
+        # At the noise floor there is no gap, and the quotient would be a rounding error.
+        if before > floor * 1.001:
+            share = (before - max(after, floor)) / (before - floor)
+        return float(np.clip(share, MIN_REPORTED_GAIN, 1.0)) if np.isfinite(share) else None
+
+    def compute_share_intervals(self) -> dict[str, tuple[float, float]]:
+        """Compute 95 % intervals of the share of the held-out gap that single effects close.
+
+        Returns:
+            Low and high end by effect, for effects that were simulated alone on held-out runs.
+        """
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
+        if runs is None or held_out_fits is None:
+            return {}
+        before = held_out_fits[()].simulated
+        intervals = {}
+        for names, simulated in held_out_fits.items():
+            share = self.get_closed_share(names)
+            if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
+                continue
+            # Each effect has its own random stream, so that its interval does not depend on the
+            # others.
+            rng = make_rng("held-out share", *names)
+            result = self._compute_gain(runs, before, simulated.simulated, rng)
+            if np.isfinite(result.low) and np.isfinite(result.high):
+                intervals[names[0]] = result.low, result.high
+        return intervals
+
+
+def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]) -> float:
+    """Compute the RMS error over the channels that count, in their unit.
+
+    Shapes: R runs, T samples, C channels.
+
+    Args:
+        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        simulated: (R, T, C) simulated channels.
+        channels: indices of the channels that count.
+    """
+    observed_mask = np.isfinite(evaluator.observed)[..., channels]
+    error = (evaluator.observed - simulated)[..., channels][observed_mask]
+    return float(np.sqrt(np.square(error).mean()))

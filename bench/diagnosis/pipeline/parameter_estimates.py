@@ -1,0 +1,199 @@
+"""Estimates of parameters and coefficients of a fitted model, with intervals and file values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    bound_of,
+    get_bounds_by_index,
+    is_unusual,
+)
+from bench.diagnosis.evaluation.run_data import is_instant
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
+from bench.diagnosis.search.alternative_causes import CauseEvidence
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.validation.gain_and_intervals import compute_intervals
+from bench.diagnosis.verdict import Cause
+from sims.core.effect import Effect, members_of
+from sims.extended_simulator import FittedValue
+from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterEstimates:
+    """Estimates of the parameters and coefficients of a fitted model.
+
+    Attributes:
+        search: Search that fitted the model.
+        model: The model.
+        is_finished: Whether the base model was fitted to the end.
+    """
+
+    search: EffectSearch
+    model: FittedModel
+    is_finished: bool = True
+
+    @cached_property
+    def values(self) -> dict[int, FittedValue]:
+        """Estimates by index in the parameter vector; unfitted ones have no interval."""
+        evaluator, model = self.search.evaluator, self.model
+        intervals = compute_intervals(self.search, model)
+        if not self.is_finished:
+            # The curvature of an unfinished fit says nothing about the distance to its optimum.
+            intervals = {i: (value, np.nan, np.nan) for i, (value, _, _) in intervals.items()}
+        ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base_indices.tolist()}
+        ranges |= get_bounds_by_index(evaluator, model.effects)
+        estimates = {}
+        for index, parameter in enumerate(evaluator.parameters):
+            # Insensitive parameters stay nominal; effects that are not in the model are zero.
+            unfitted_estimate = float(model.fit.theta[index]), np.nan, np.nan
+            value, low, high = intervals.get(index, unfitted_estimate)
+            if is_instant(parameter):
+                # The time of an event is only known to one sample spacing.
+                half_interval = evaluator.sample_interval / 2
+                low, high = low - half_interval, high + half_interval
+            at_bound = bound_of(value, *ranges[index]) if index in intervals else None
+            # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
+            is_bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
+            plausible_range = (
+                self._get_plausible_range(index) if index in intervals else parameter.bounds
+            )
+            exceeded_range = (
+                plausible_range
+                if not is_instant(parameter) and is_unusual(value, *plausible_range)
+                else None
+            )
+            estimates[index] = FittedValue(
+                value,
+                parameter.unit,
+                low if is_bounded else None,
+                high if is_bounded else None,
+                at_bound,
+                usual_range=exceeded_range,
+            )
+        if evaluator.kind.has_model:
+            self._add_totals(estimates)
+        return estimates
+
+    def _get_plausible_range(self, index: int) -> tuple[float, float]:
+        """Return the plausible range, narrower than the bounds for a robot's free numbers."""
+        evaluator = self.search.evaluator
+        parameter = evaluator.parameters[index]
+        is_free = evaluator.kind.has_model and index in evaluator.base_indices
+        return parameter.training or parameter.bounds if is_free else parameter.bounds
+
+    def _add_totals(self, numbers: dict[int, FittedValue]) -> None:
+        """Add to each fitted number of a robot the model file's value and the resulting value.
+
+        Numbers of effects that change no number of the file remain as they are. `numbers` is by
+        index in the parameter vector.
+        """
+        kind: Any = self.search.evaluator.kind
+        # This import is needed for robots only.
+        from sims.robot.export.model_file_totals import compute_file_totals
+
+        placed_effects = list(self._iterate_fitted_effects())
+        fitted_effects = [
+            (effect, [numbers[i].value for i in indices]) for effect, indices in placed_effects
+        ]
+        for (effect, indices), effect_totals in zip(
+            placed_effects, compute_file_totals(kind.robot, fitted_effects), strict=True
+        ):
+            # The model file keeps its gravity if the bodies are gravity-compensated.
+            is_compensated = is_gravity_compensated(effect.name, {"": numbers[indices[0]]})
+            if is_compensated or not any(numbers[i].value for i in indices):
+                continue
+            for i, number_total in zip(indices, effect_totals, strict=True):
+                if number_total is not None:
+                    unit = number_total.unit if number_total.unit != numbers[i].unit else ""
+                    file_value, total = number_total.stated, number_total.total
+                    numbers[i] = replace(
+                        numbers[i], stated=file_value, total=total, total_unit=unit
+                    )
+
+    def _iterate_fitted_effects(self) -> Iterator[tuple[type[Effect], list[int]]]:
+        """Yield each fitted effect at one place, with the indices of its coefficients in theta.
+
+        An effect that acts at all places is divided into its members.
+        """
+        evaluator, kind = self.search.evaluator, cast(Any, self.search.evaluator.kind)
+        # The free numbers of the user come first, in the order of their effects.
+        indices = iter(range(evaluator.system_parameter_count))
+        for effect in kind.system.freed_effects:
+            yield effect, [next(indices) for _ in effect.coefficients]
+        for name in self.model.effects:
+            effect = evaluator.available_effects[name]
+            members = members_of(effect)
+            indices = iter(evaluator.get_coefficient_indices(name))
+            # A family with one coefficient for all places changes no number of the file.
+            if sum(len(member.coefficients) for member in members) == len(
+                evaluator.get_coefficient_indices(name)
+            ):
+                for member in members:
+                    yield type(member), [next(indices) for _ in member.coefficients]
+
+    def select_coefficients(self, name: str) -> dict[str, FittedValue]:
+        """Return the estimates of an effect by the names of its coefficients.
+
+        Args:
+            name: Name of the effect.
+        """
+        evaluator = self.search.evaluator
+        coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
+        indices = evaluator.get_coefficient_indices(name)
+        return {c.name: self.values[i] for c, i in zip(coefficients, indices, strict=True)}
+
+    def build_cause(self, evidence: CauseEvidence) -> Cause:
+        """Build a cause of the verdict from an effect found by the search.
+
+        Its description names the soft form of dry friction (MuJoCo's `frictionloss`) with the
+        solver parameters if the friction has it.
+
+        Args:
+            evidence: the effect and its evidence.
+        """
+        evaluator = self.search.evaluator
+        effect = evaluator.available_effects[evidence.effect]
+        # A coefficient that cannot be observed is fixed at zero and is not a result.
+        coefficients = effect.on(evaluator.simulator.system)
+        fixed = {c.name for c in coefficients if c.least is not None and c.least == c.most}
+        fitted_values = {
+            name: number
+            for name, number in self.select_coefficients(evidence.effect).items()
+            if name not in fixed
+        }
+        friction_form = get_friction_form(evaluator, evidence.effect)
+        description = effect.says
+        if friction_form is not None:
+            description = add_solver_parameters(evaluator, evidence.effect, description)
+        if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, fitted_values):
+            description = GRAVITY_COMPENSATED
+        return Cause(
+            evidence.effect,
+            evidence.alternatives,
+            description,
+            fitted_values,
+            evidence.p_value,
+            friction_form,
+        )
+
+    def are_results(self, effects: Iterable[str]) -> bool:
+        """Return whether the coefficients of effects are results, and no parameter is at a bound.
+
+        A cause may compensate for a value of a base parameter beyond a bound of its range.
+
+        Args:
+            effects: names of the effects.
+        """
+        evaluator = self.search.evaluator
+        base = [self.values[i] for i in evaluator.base_indices.tolist()]
+        indices = [i for name in effects for i in evaluator.get_coefficient_indices(name)]
+        is_at_bound = any(n.at_bound is not None and not n.is_result for n in base)
+        return all(self.values[i].is_result for i in indices) and not is_at_bound
