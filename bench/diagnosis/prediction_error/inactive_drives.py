@@ -13,11 +13,13 @@ doi:10.1109/TIT.1967.1054010). A sample costs min(|e| / s, `MAX_SAMPLE_COST`), w
 the smallest of (1), and each change costs `CHANGE_COST`. An interval that is off or held is
 accepted only if
 
-* the force error of the model's drive there is at least `MIN_MISSED_RATIO` times that elsewhere: a
-  wrong gain, friction or dead zone is wrong everywhere;
+* the force error of the model's drive there is at least `MIN_MISSED_RATIO` times that elsewhere,
+  and `MIN_WINDOW_RATIO` times that in any window of the same length elsewhere: a wrong gain,
+  friction, damping or dead zone is wrong everywhere, or wherever the joint is fast;
 * its hypothesis leaves at most `MAX_RESIDUAL_SHARE` of that force, and of the force of the drive
   elsewhere: a drive at its force limit exerts more than elsewhere;
-* a run has at most `MAX_STRETCHES` such intervals.
+* a run has at most `MAX_STRETCHES` such intervals, and all runs together have at most the share
+  `MAX_INACTIVE_SHARE` of their samples in them: a joint that hardly moves may be strongly damped.
 
 Magnitudes are the quantile `MAGNITUDE_QUANTILE` over all such intervals of a joint. Among 500
 random effects of the library on an arm with motors or servos, four were mistaken for an inactive
@@ -68,6 +70,8 @@ MAGNITUDE_QUANTILE = 0.8
 """Quantile by which magnitudes are compared."""
 MIN_MISSED_RATIO = 2.0
 """Minimum ratio of the force error of the model within the intervals to that elsewhere."""
+MIN_WINDOW_RATIO = 1.5
+"""Minimum ratio of this error to the largest one in a window of the same length elsewhere."""
 MAX_RESIDUAL_SHARE = 0.4
 """Maximum residual of a hypothesis over all intervals, as a share of the force."""
 MAX_STRETCH_SHARE = 0.6
@@ -76,6 +80,8 @@ MAX_REST_SPEED = 0.1
 """Maximum velocity of a joint that is held, as a share of its usual velocity."""
 MAX_STRETCHES = 3
 """Maximum number of inactive intervals in a run."""
+MAX_INACTIVE_SHARE = 0.7
+"""Maximum share of inactive samples in the recording."""
 MIN_SAMPLES = 20
 """Minimum number of samples in an interval, and in the part in which a drive works."""
 EDGE_SAMPLES = 5
@@ -350,7 +356,8 @@ class _Intervals:
         empty_masks = [np.zeros_like(mask) for mask in masks]
         active_masks = [~_widen_mask(mask) for mask in masks]
         interior_masks = [_remove_edges(mask) for mask in masks]
-        if (
+        inactive_share = np.concatenate(masks).mean()
+        if inactive_share > MAX_INACTIVE_SHARE or (
             min(sum(int(m.sum()) for m in of_runs) for of_runs in (active_masks, interior_masks))
             < MIN_SAMPLES // 2
         ):
@@ -359,9 +366,14 @@ class _Intervals:
         hypothesis_error_outside = self._compute_residual_magnitudes(self.state, active_masks)
         drive_error_inside = self._compute_residual_magnitudes(ON, interior_masks)
         hypothesis_error_inside = self._compute_residual_magnitudes(self.state, interior_masks)
+        # A wrong damping has large errors wherever the joint is fast, not in one interval alone.
+        length = int(np.median([end - first for mask in masks for first, end in spans(mask)]))
+        drive_error_in_windows = self._compute_largest_errors(active_masks, length)
         is_worse = any(
-            d >= MIN_MISSED_RATIO * m
-            for d, m in zip(drive_error_inside, drive_error_outside, strict=True)
+            inside >= MIN_MISSED_RATIO * outside and inside >= MIN_WINDOW_RATIO * in_windows
+            for inside, outside, in_windows in zip(
+                drive_error_inside, drive_error_outside, drive_error_in_windows, strict=True
+            )
         )
         is_small = all(
             e <= MAX_RESIDUAL_SHARE * u
@@ -412,6 +424,23 @@ class _Intervals:
             )
             for of_runs in self._residuals
         ]
+
+    def _compute_largest_errors(self, masks: Sequence[Mask], length: int) -> list[float]:
+        """Return the largest force error of the model's drive in a window, by joint.
+
+        Args:
+            masks: (T,) samples of each run in which the drive is active.
+            length: length of the windows in samples; they overlap by half.
+        """
+        largest = [0.0] * len(self._joints)
+        for run, mask in enumerate(masks):
+            for first in range(0, mask.size - length + 1, max(length // 2, 1)):
+                if not mask[first : first + length].all():
+                    continue
+                for place, of_runs in enumerate(self._residuals):
+                    error = _compute_magnitude(of_runs[run][ON, first : first + length])
+                    largest[place] = max(largest[place], error)
+        return largest
 
     def _is_at_rest(
         self, run: int, mask: Mask, ends: tuple[int, int], typical_speeds: Sequence[float]

@@ -32,11 +32,6 @@ from bench.diagnosis.search.verdict_rules import (
 
 MAX_COMPETITOR_DISTANCE = 30.0
 """Maximum difference in twice the log-likelihood (merit) of competing models that are refitted."""
-MAX_RANGE_EXCESS = 10.0
-"""Maximum coefficient of an alternative to a plausible effect, in half plausible ranges.
-
-An inertia that is a hundred times that of the model file is no alternative to an armature.
-"""
 MAX_COMPETITOR_EXCESS_RATIO = 1.5
 """Maximum excess of refitted competing models, as a multiple of the excess of the model."""
 
@@ -282,14 +277,8 @@ class AlternativeFinder:
         competing_effects = self._list_competing_effects(model, effect)
         # Effects with implausible coefficients come last in their set, the least plausible at the
         # end.
-        excesses = {name: self._compute_range_excess(name) for _, name in competing_effects}
-        competing_effects.sort(key=lambda pair: (excesses[pair[1]], pair))
-        is_one_plausible = min(excesses.values()) <= 1.0
-        ordered_effects = [
-            name
-            for _, name in competing_effects
-            if name == effect or not (is_one_plausible and excesses[name] > MAX_RANGE_EXCESS)
-        ]
+        competing_effects.sort(key=lambda pair: (self._compute_range_excess(pair[1]), pair))
+        ordered_effects = [name for _, name in competing_effects]
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.prediction_error.inactive_drives import (
+    OFF,
+    _Intervals,
     find_inactive_drives,
     remove_inactive_drives,
 )
@@ -206,3 +208,40 @@ def test_what_is_wrong_at_all_times_is_not_taken_for_a_drive_that_does_nothing(t
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
     assert find_inactive_drives(recording, kind) == []
     assert remove_inactive_drives(recording, kind) is recording
+
+
+class _SyntheticForces:
+    """Force residuals of one joint in one run.
+
+    Args:
+        drive_errors: (T,) residual of an active drive; that of an inactive one is small where it is
+            one.
+    """
+
+    def __init__(self, drive_errors):
+        rng = np.random.default_rng(5)
+        noise = 0.02 * rng.normal(size=(2, drive_errors.size))
+        off = np.where(drive_errors == 1.0, 0.0, 1.0)
+        self.needed = self.velocity = np.ones((drive_errors.size, 1))
+        self._residuals = np.stack([drive_errors + noise[0], off + noise[1], off + 1.0])
+
+    def residuals(self, _):
+        return self._residuals
+
+
+def _is_off_accepted(drive_errors):
+    return _Intervals([_SyntheticForces(drive_errors)], [0], OFF).any()
+
+
+@pytest.mark.parametrize(("share", "is_accepted"), [(0.3, True), (0.65, True), (0.9, False)])
+def test_a_drive_that_hardly_ever_works_is_not_called_inactive(share, is_accepted):
+    drive_errors = np.where(np.arange(1000) < 1000 * share, 1.0, 0.0)
+    assert _is_off_accepted(drive_errors) is is_accepted
+
+
+@pytest.mark.parametrize(("error", "is_accepted"), [(0.5, True), (0.8, False)])
+def test_an_equal_error_elsewhere_speaks_against_an_inactive_drive(error, is_accepted):
+    drive_errors = np.zeros(1000)
+    drive_errors[:100] = 1.0
+    drive_errors[600:750] = error
+    assert _is_off_accepted(drive_errors) is is_accepted

@@ -88,17 +88,6 @@ def test_of_two_implausible_effects_that_nearer_to_its_range_is_preferred(monkey
     assert found.preferred == "b", "c is distinguishable"
 
 
-@pytest.mark.parametrize(("excess", "alternatives"), [(9.0, ("b",)), (11.0, ())])
-def test_an_effect_far_outside_its_range_is_no_alternative_to_a_plausible_one(
-    monkeypatch, excess, alternatives
-):
-    found = evidence(monkeypatch, excess_of_ranges={"b": excess})
-    assert (found.preferred, found.alternatives) == ("a", alternatives)
-    # It is one if no effect is plausible.
-    found = evidence(monkeypatch, excess_of_ranges={"a": 2.0, "b": excess})
-    assert found.alternatives == ("b",)
-
-
 def test_held_out_runs_have_a_voice(monkeypatch):
     left = {("a",): 1.0, ("b",): 1.2, ("c",): 0.8}
     found = evidence(monkeypatch, HeldOutValidation(*held_out(left)))
