@@ -160,7 +160,8 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
         InputError: The conventions of the recording contradict the model file, or no fit of the
             base model can simulate the recording.
     """
-    error_check, steps, options = RecordingErrorCheck(), TimeStepChoice(), SolverOptionChoice()
+    error_check = RecordingErrorCheck()
+    step_choice, option_choice = TimeStepChoice(), SolverOptionChoice()
     refuse_broken_conventions(runs)
 
     def fit_base(runs: SimulatedRuns) -> BaseModel:
@@ -171,9 +172,9 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             return model
         if not runs.kind.has_model:
             return model.widen_ranges()
-        model = options.choose(model)
-        if options.finding is None and model.shows_step_errors():
-            model = steps.choose(model)
+        model = option_choice.choose(model)
+        if option_choice.finding is None and model.shows_step_errors():
+            model = step_choice.choose(model)
         return model.finish()
 
     runs.context.search_control.begin_stage(STAGES["base_fit"])
@@ -189,13 +190,13 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             f"{runs.recording.path}: the simulation loses the orientation"
         )
     cause_search = CauseSearch(error_check)
-    result = steps.reconsider(cause_search.search(base), cause_search)
-    if steps.finding is None:
-        result = options.reconsider(result, cause_search)
+    result = step_choice.reconsider(cause_search.search(base), cause_search)
+    if step_choice.finding is None:
+        result = option_choice.reconsider(result, cause_search)
     runs.context.search_control.begin_stage("measuring the gain")
-    numerics_causes = [] if steps.finding is None else list_step_causes(steps.finding)
-    if options.finding is not None:
-        numerics_causes += list_option_causes(options.finding)
+    numerics_causes = [] if step_choice.finding is None else list_step_causes(step_choice.finding)
+    if option_choice.finding is not None:
+        numerics_causes += list_option_causes(option_choice.finding)
     return _Diagnosis(_build_explanation(result, numerics_causes), result)
 
 

@@ -73,9 +73,9 @@ def restrict_verdict(result: SearchResult) -> DiagnosisResult:
 def _is_refuted(result: SearchResult) -> bool:
     """Return whether fitted models refute a missing effect that only the linear score suggests.
 
-    This is so if no fitted model with effects has a higher penalised log-likelihood than the
-    base model, or none predicts the held-out runs better. In closed loops and at rest,
-    derivatives may predict a gain that no fit achieves.
+    This is so if no fitted model with effects has a higher penalised log-likelihood than the base
+    model, or none predicts the held-out runs better. In closed loops and at rest, derivatives may
+    predict a gain that no fit achieves.
     """
     search, finding = result.search, result.finding
     if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
@@ -102,8 +102,12 @@ def _is_refuted(result: SearchResult) -> bool:
 def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candidate, ...]:
     """List all effects of the library with their scores about the base model, best first.
 
-    A score is reduced by the price of each coefficient beyond the first, so that an effect
-    precedes more general effects that contain it.
+    A score is reduced by the price of each coefficient beyond the first, so that an effect precedes
+    more general effects that contain it.
+
+    Args:
+        search: the search, with the scores about the base model.
+        gains: gains of the prediction of held-out runs by single effects.
     """
     scores = search.base_scores
     if scores is None:
