@@ -67,13 +67,16 @@ class DiagnosisContext:
             self.notes.append(note)
 
     def adopt(self, evaluator: RunEvaluator) -> None:
-        """Prepare a new run evaluator with what is known, and close it at the end."""
+        """Prepare a new run evaluator with what is known."""
         evaluator.search_control = self.search_control
         evaluator.worker_pool = self.worker_pool
         self.worker_pool.register(evaluator)
         use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
         evaluator.identified = self.identified
-        self._simulators.callback(evaluator.close)
+
+    def close_at_end(self, simulated: RunEvaluator | Validation) -> None:
+        """Close the simulators of a run evaluator or a validation when the context is closed."""
+        self._simulators.callback(simulated.close)
 
     def close(self) -> None:
         """Close all simulators; proposals of experiments need them until then."""
@@ -135,6 +138,9 @@ class SimulatedRuns:
             validation = HeldOutRuns(build_evaluator(held_out), noise)
         elif len(recording.folds()) > 1:
             validation = CrossValidation(fitting, noise)
+        context.close_at_end(fitting)
+        if validation is not None:
+            context.close_at_end(validation)
         return cls(context, kind, recording, fitting, floor, noise, validation)
 
     def with_kind(self, kind: type[SystemSimulator]) -> SimulatedRuns:

@@ -7,6 +7,7 @@ import pytest
 
 import simgap
 from bench.benchmark.problem.recording_observations import load_recorded_runs
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
@@ -55,6 +56,25 @@ def test_two_runs_are_both_fitted_and_each_is_predicted_by_the_other(tmp_path):
     text = " ".join(format_summary(found.story))
     assert "the error on runs left out in turn" in text
     assert "held-out" not in text
+
+
+def test_the_simulators_of_all_folds_are_closed(tmp_path, monkeypatch):
+    made, closed = [], []
+    make, close = CrossValidation._make_evaluator, RunEvaluator.close
+
+    def make_fold(validation, rows):
+        made.append(make(validation, rows))
+        return made[-1]
+
+    def close_evaluator(fold):
+        closed.append(fold)
+        close(fold)
+
+    monkeypatch.setattr(CrossValidation, "_make_evaluator", make_fold)
+    monkeypatch.setattr(RunEvaluator, "close", close_evaluator)
+    explain(swung(tmp_path, [3.3e-3, 3.3e-3], friction=2e-3))
+    assert len(made) == 4
+    assert all(any(fold is one for one in closed) for fold in made)
 
 
 def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
