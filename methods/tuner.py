@@ -323,6 +323,9 @@ def from_callback(
         """Run the optimiser in its thread.
 
         Its result is stored in `outcome`, and an error in `failure`.
+
+        `minimise` is the optimiser, and `objective` the function that hands its points to the
+        harness.
         """
         try:
             value_ready.acquire()

@@ -409,7 +409,14 @@ def _make_subclass(
         observe: Sequence[str] | None = None,
         **settings: Any,
     ) -> None:
-        """Create the simulator with the fitted constants and effects of the file."""
+        """Create the simulator with the fitted constants and effects of the file.
+
+        Args:
+            constants: Constants that differ from those of the file.
+            observe: Names of the observed channels; those of the fitted recording if None.
+            settings: Settings of the engine, which take precedence over those of the file.
+            self: Instance of the subclass.
+        """
         # Engine, sensors and constants may be changed; the effects are fixed.
         stated_constants = {**extended.constants, **(constants or {})}
         engine_settings = {**_engine(extended), **settings}

@@ -105,6 +105,8 @@ class _Flight:
         `_normal` is the x and z part of the unit vector normal to the ground, and `_touches` tells
         whether the ball is in contact.
 
+        Drag is -1/2 rho Cd A |v| v (1) and lift 1/2 rho A r omega x v (2).
+
         Args:
             ball: properties of the ball.
             ground: inclined plane.

@@ -180,6 +180,8 @@ def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) ->
     def evaluate(points: Array) -> tuple[Array, Array]:
         """Simulate points and compute their losses, as the harness of a comparison does.
 
+        `fails` decides by its running number whether a simulation fails.
+
         Args:
             points: (n, dim) points of the unit cube.
 
@@ -188,10 +190,10 @@ def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) ->
         """
         nonlocal simulated
         observations = simulate_toy_problem(points)
-        for lane in observations:
+        for observation in observations:
             simulated += 1
             if fails(simulated):
-                lane[:] = np.nan
+                observation[:] = np.nan
         losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
         losses[np.isnan(losses)] = np.inf  # as the harness does for a failed simulation
         return observations, losses

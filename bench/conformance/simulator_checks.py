@@ -371,6 +371,8 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
 
         Shapes: T samples, C channels.
 
+        The first call's result is `batch_result`; `kind` is the simulator class under test.
+
         Args:
             observations: (n, T, C) observations of the same points and scenario.
             after: what was different in this call, for the message.

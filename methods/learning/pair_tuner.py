@@ -297,6 +297,8 @@ class PairTuner(Tuner):
         def fitted(stage: str, noisy_data: TrainingData, noise: Array | None) -> TrainedPairNetwork:
             """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
 
+            `rng`, `callback` and `held_out` belong to the training that `train_on` runs.
+
             Args:
                 stage: name of this training, for the callback.
                 noisy_data: simulations to train on, with noise.

@@ -81,6 +81,8 @@ class ForceRipple(Force):
 
         Shapes: D coordinates, K coefficients.
 
+        F = a sin(2 pi x / period) + b cos(2 pi x / period) (2), with the primary coordinate x.
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -165,6 +167,8 @@ class CubicSpring(Force):
         """Return the force (L, D), towards zero for c > 0.
 
         Shapes: D coordinates, K coefficients.
+
+        F = -c x^3 (2), with the primary coordinate x.
 
         Args:
             c: (K, L, 1) coefficients.

@@ -166,6 +166,9 @@ class DirectionalLoadFriction(Friction):
 
         Shapes: K coefficients.
 
+        The limit is |motor drive - external load|, each load with its own coefficient by direction
+        (4).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -188,6 +191,9 @@ class QuadraticLoadFriction(Friction):
 
         Shapes: K coefficients.
 
+        The limit is c |drive - load| + quadratic through^2, where `through` is the smaller of drive
+        and load if they pull against each other (5).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -209,6 +215,9 @@ class PositionFriction(Friction):
         """Return the limit (L, 1), periodic in the primary coordinate.
 
         Shapes: K coefficients.
+
+        The limit is least + a + sine sin(2 pi x / period) + cosine cos(2 pi x / period), with the
+        amplitude a = (sine^2 + cosine^2)^(1/2) (6).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -236,6 +245,9 @@ class WarmingFriction(Friction):
 
         Shapes: K coefficients.
 
+        The limit is (dry + viscous |v|) exp(-t / time), with the time t since the start of the run
+        (7).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -262,6 +274,8 @@ class DirectionalViscousFriction(Force):
         """Return the force (L, D), proportional to speed, with a coefficient per direction.
 
         Shapes: D coordinates, K coefficients.
+
+        F = -viscous+ v where v > 0, -viscous- v where v < 0 (8).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -320,6 +334,9 @@ class FrictionHysteresis(HiddenStateEffect):
         """Return the force (L, D), and the rate (L, 1) of the hidden state.
 
         Shapes: D coordinates, K coefficients.
+
+        The friction is -F w with the limit F; w' = r - |r| w with r = v / d and the deflection d
+        (1).
 
         Args:
             c: (K, L, 1) coefficients.

@@ -182,6 +182,8 @@ class InputLag(Input):
 
         Shapes: L batch elements, S steps, K coefficients.
 
+        The applied input w follows the command u by c dw/dt = u - w (4).
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -203,6 +205,8 @@ class InputDeadBand(Input):
         """Return the excess (L, S) over the half width.
 
         Shapes: L batch elements, S steps, K coefficients.
+
+        w = u - clip(u, -c, c) (5).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -227,6 +231,8 @@ class InputSaturation(Input):
         """Return the limited input (L, S).
 
         Shapes: L batch elements, S steps, K coefficients.
+
+        w = clip(u, -c, c) (6).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -278,6 +284,8 @@ class InputPower(Input):
 
         Shapes: L batch elements, S steps, K coefficients.
 
+        w = (1 + gain) sign(u) |u|^(1 + power) (8).
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -315,6 +323,8 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     """Return means (L, S) of the lagged input (4) over each step.
 
     Shapes: L batch elements, S steps.
+
+    The lag is c dw/dt = u - w (4), for a command u that is constant over each step.
 
     Args:
         signal: input before the effect: values (L, S) and times of the steps.

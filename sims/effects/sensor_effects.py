@@ -138,6 +138,8 @@ class SensorLag(Sensor):
 
         Shapes: L batch elements, S steps, K coefficients.
 
+        The reading r follows the true value y by c dr/dt = y - r (4).
+
         Args:
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
@@ -179,6 +181,8 @@ class EncoderEccentricity(Sensor):
         """Return the reading (L, S) with an error periodic in the angle.
 
         Shapes: L batch elements, S steps, K coefficients.
+
+        r = y + a sin y + b cos y, with the angle y in rad (7).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -233,6 +237,9 @@ def _smooth_step(instant: Array, times: Array) -> Array:
     """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between.
 
     Shapes: L batch elements, S steps.
+
+    Over an interval h before a sample at t, it is linear from s = t - h / 2, where the slip has
+    happened, to s = t + h / 2, where it has not (8).
 
     Args:
         instant: (L, 1) time of the slip, s.

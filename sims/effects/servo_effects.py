@@ -73,6 +73,9 @@ class ServoDeadBand(Force):
 
         Shapes: D coordinates, K coefficients.
 
+        The force is K (dz(e) - e), dz(e) = e - clip(e, -c, c), with the stiffness K and the error e
+        = set point - position (1).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -95,6 +98,8 @@ class ServoDerivativeAction(Input):
         """Return the set point (L, S) plus its change in the last c seconds.
 
         Shapes: L batch elements, S steps, K coefficients.
+
+        The force is K (u(t) - u(t - c)), with the set point u (2).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -122,6 +127,9 @@ class ServoMotionProfile(Input):
         """Return the mean (L, S) of the limited set point over each step.
 
         Shapes: L batch elements, S steps, K coefficients.
+
+        The servo follows p instead of the set point u, with d2p/dt2 = c sign(u - p - |dp/dt| dp/dt
+        / (2 c)) until it arrives (3).
 
         Args:
             c: (K, L, 1) coefficients.
@@ -221,6 +229,8 @@ class SupplyBrakingLoss(Force):
         """Return the force (L, D), in the direction of motion.
 
         Shapes: D coordinates, K coefficients.
+
+        The drive exerts U where U v >= 0, and (1 - c) U where U v < 0 (3).
 
         Args:
             c: (K, L, 1) coefficients.

@@ -89,6 +89,9 @@ class EndStop(Force):
 
         Shapes: D coordinates, K coefficients.
 
+        F = -k d (d / D)^(1/2) (1 + a s v), with the stiffness k, its sign s, the penetration d =
+        max(s (x - p), 0) beyond the place p, the depth D of 1 cm or 0.01 rad, and the loss a (2).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
@@ -124,6 +127,9 @@ class SpeedDependentRestitution(Contact):
         """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
 
         Shapes: L batch elements, K coefficients.
+
+        e = e0 |vn|^c, with the simulator's restitution e0 and the normal speed vn in m/s before the
+        impact (1).
 
         Args:
             c: (K, L, 1) coefficients.

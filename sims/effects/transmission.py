@@ -155,6 +155,10 @@ class DrivenLoad(HiddenStateEffect):
 
         Shapes: D coordinates, K coefficients.
 
+        With the drive's position x, the load's y, the inertia M, the share s of the load, the other
+        forces U and the weight W: (1 - s) M x'' = U + (1 - s) W(x) - T (1), s M y'' = T + s W(y)
+        (2).
+
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.

@@ -263,6 +263,8 @@ def _average_command(
 def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a held signal over intervals; its value where an interval has no length.
 
+    The mean over (a, b) is (A(b) - A(a)) / (b - a) (1), with the integral A of the signal.
+
     Args:
         times: (T,) times from which the values hold, s.
         values: (T,) values.
@@ -292,6 +294,8 @@ def _average_linear_signal(times: Array, values: Array, starts: Array, end: Arra
     """Return the means of a linearly interpolated signal over intervals.
 
     The signal is constant before the first and after the last sample.
+
+    The mean over (a, b) is (A(b) - A(a)) / (b - a) (1), with the integral A of the signal.
 
     Args:
         times: (T,) sample times, s.
@@ -336,6 +340,8 @@ def _compute_held_integral(times: Array, values: Array, area: Array, t: Array) -
     """Return the integral A(t) (1) of a signal that is held between samples.
 
     The difference of A over a step, divided by its length, is the mean that the engine applies.
+
+    A(t) is the sum of u_i (t_{i+1} - t_i) up to t (1).
 
     Args:
         times: (T,) sample times, s.

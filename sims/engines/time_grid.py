@@ -187,6 +187,8 @@ def _find_change_times(
 
     Shapes: L batch elements.
 
+    With a shift to the time s(t), the change commanded at t is applied at t + (t - s(t)) (1).
+
     Args:
         runs: scenarios of the batch elements.
         commands: values of each input, by name, of each distinct scenario.

@@ -98,6 +98,9 @@ def name_unnamed_elements(spec: Any, robot: RobotModel) -> dict[int, Any]:
 def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> RobotModel:
     """Make a robot with tendons in place of joint transmissions, without changing element names.
 
+    The tendon has the length l = q + c p, with the position q of the drive's joint and p of the
+    preceding one; its force acts on both, U and c U (1).
+
     Args:
         robot: robot as read from its model file.
         coefficients: c of eq. (1) by joint; the joints are among `list_coupling_places`.

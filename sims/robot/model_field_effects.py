@@ -156,6 +156,8 @@ def _make_servo_gain_finder(term: int) -> Find:
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
         """Return the bias field with the servo's gain, and the gain field if it is the same.
 
+        `term` is the index of the bias parameter: 1 for position, 2 for velocity.
+
         Args:
             robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
             place: name of the actuator.
@@ -193,7 +195,10 @@ def _view_element(fields: Fields, element: ModelField) -> Any:
 
 
 def _add(find: Find) -> FieldWriter:
-    """Make a function that adds each coefficient to its number by eq. (1)."""
+    """Make a function that adds each coefficient to its number by eq. (1).
+
+    The new value is value + c, at least zero (1).
+    """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
@@ -204,7 +209,10 @@ def _add(find: Find) -> FieldWriter:
 
 
 def _scale(find: Find) -> FieldWriter:
-    """Make a function that scales all fields of a number by 1 + c, eq. (2)."""
+    """Make a function that scales all fields of a number by 1 + c, eq. (2).
+
+    The factor is at least `MIN_FACTOR`, so that masses stay positive.
+    """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         for element in find(robot, place)[0]:
@@ -231,6 +239,8 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     with `friction_form` soft, the file's solver parameters remain.
 
     Shapes: L batch elements.
+
+    The new value is value + c, at least zero (1).
 
     Args:
         fields: model fields of the batch elements, changed in place.
@@ -310,6 +320,8 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
     Shapes: L batch elements.
 
+    The axis a becomes exp([r]) a with the rotation vector r in rad, in the frame of the body (6).
+
     Args:
         fields: model fields of the batch elements, changed in place.
         robot: robot as read from its model file.
@@ -361,6 +373,10 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
 
     Shapes: L batch elements.
+
+    A point mass m at p on a body of mass m_0, centre of mass p_0 and tensor I_0 gives the mass m_0
+    + m, the centre p_1 = (m_0 p_0 + m p) / (m_0 + m) and the tensor I_0 + m_0 J(p_0 - p_1) + m J(p
+    - p_1), with J(d) = |d|^2 1 - d d' (7).
 
     Args:
         fields: model fields of the batch elements, changed in place.
@@ -415,6 +431,8 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Add c to the sliding friction coefficients of a pair of geoms by (1).
 
+    The new value is value + c, at least zero (1).
+
     Args:
         fields: fields of L batch elements, changed in place.
         robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
@@ -427,6 +445,9 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
 
 def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Scale the radius of a geom by (8), without changing mass and inertia of its body.
+
+    Radii and half axes change by the factor 1 + c, and the volumes that bound the geom by the
+    change d of its largest size (8).
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -449,7 +470,11 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _scale_solref(index: int) -> FieldWriter:
-    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (9)."""
+    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (9).
+
+    `solref` (t, z) becomes (t (1 + c), z) or (t, z (1 + c)); in the direct form (-k, -b), k is
+    proportional to 1 / (t z)^2 and b to 1 / t (9).
+    """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])

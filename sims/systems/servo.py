@@ -208,6 +208,9 @@ class ServoSystem(PendulumSystem):
         """Return the motor's torque (L, 1), including its back electromotive force.
 
         Shapes: L batch elements.
+
+        With K = kt / R, the torque is clip(K voltage kp error_gain (goal - q), -K voltage, K
+        voltage).
         """
         k = moment.constants
         kt = moment.theta[:, _TORQUE_CONSTANT]

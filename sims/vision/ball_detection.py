@@ -116,6 +116,9 @@ class BallDetection(NamedTuple):
         """Return the detection with its centre refitted for a radius known from other pictures.
 
         If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
+
+        With a known radius, only the centre (u, v) is changed by Gauss-Newton steps of the circle
+        fit.
         """
         if len(self.edges) < _MIN_REFIT_RAY_SHARE * _RAY_COUNT:
             return self

@@ -55,6 +55,10 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
     n . (du, dv) + dR with the direction n from the centre to the point (2). The normal equations
     are solved explicitly, because the call of numpy's solver would take most of the time.
 
+    With the distance d of a point from the centre, the residual is d - R (1). Each iteration solves
+    residual = n . (du, dv) + dR by weighted least squares (2), with Tukey's weights (1 - (residual
+    / width)^2)^2, zero beyond the width (3).
+
     Args:
         points: Points (n, 2), pixels.
         start: Initial centre and radius; without radius, the median distance from the centre is
@@ -104,6 +108,9 @@ def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None
     """Solve the Gauss-Newton equations (2) for (du, dv, dR); None if they are singular.
 
     `normal` (4, 4) holds the weighted sums of products of the rows (n_u, n_v, 1, rest).
+
+    The equations are residual = n . (du, dv) + dR, weighted (2), with the unit vector n from the
+    centre to each point.
     """
     (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = normal.tolist()
     if total <= 0:
@@ -152,6 +159,9 @@ def fit_arc(points: Array) -> Circle | None:
     A shadow or another ball disturbs one side of an edge. Circles are fitted to arcs of half of the
     points that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25,
     8, 1976, doi:10.1109/TIM.1976.6312298).
+
+    Kasa's linear fit solves x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2) (4) for 2 u, 2 v and the
+    constant.
 
     Args:
         points: Points (n, 2), in their order along the edge, pixels.

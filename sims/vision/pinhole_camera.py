@@ -162,6 +162,9 @@ class PinholeCamera:
         """Project world points (..., 3) to pixels (..., 2).
 
         Pixels may be outside the picture; they are NaN for points behind the camera.
+
+        With the point (X, Y, Z) in the camera's frame, u = u0 + f X / Z and v = v0 + f Y / Z (2),
+        with the focal length f and the principal point (u0, v0) in pixels.
         """
         camera_points = self.to_camera_frame(points)
         depth = camera_points[..., 2:]
@@ -175,6 +178,11 @@ class PinholeCamera:
 
         The longer axis points to the middle of the picture, and the centre is slightly further from
         it than the projection of the sphere's own centre.
+
+        A sphere of radius r at distance d, at the angle t from the optical axis, fills a cone of
+        half angle p with sin p = r / d (4). Its picture is an ellipse with the centre a = (tan(t -
+        p) + tan(t + p)) / 2 and the half length (tan(t + p) - tan(t - p)) / 2 (5); its half width b
+        follows from (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1) (6).
 
         Args:
             points: Centres of the sphere (..., 3), m.

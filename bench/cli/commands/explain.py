@@ -193,6 +193,9 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     def print_finished_recording(row: LogResult) -> None:
         """Print the result of one log (recording) as soon as it is explained.
 
+        The live progress line is erased meanwhile, and shows the new share of finished recordings
+        afterwards.
+
         Args:
             row: Result of one recording: its verdict or error, its causes and the time taken.
         """

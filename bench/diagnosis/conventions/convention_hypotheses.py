@@ -130,6 +130,8 @@ class ConventionHypothesis:
         def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
             """Return signals by name; a signal that differs is computed from `source`.
 
+            `self.changes` has the changed signals of the hypothesis by name.
+
             Args:
                 values: signals to convert, (T,) by name.
                 source: all signals of the run, from which a changed one may be computed.

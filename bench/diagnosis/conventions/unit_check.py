@@ -643,21 +643,23 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
         hypotheses: all hypotheses.
     """
 
-    def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+    def best(hypotheses: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
         """Sort hypotheses by their misfit in the first `share` of each run, smallest first.
 
         The recording is simulated with the starting values of the base fit; nothing is fitted here.
 
+        `subject` is the recording with its simulator.
+
         Args:
-            those: the hypotheses.
+            hypotheses: changes of units or signs of signals.
             share: simulated share of each run, from 0 to 1.
         """
         scores = []
-        for one in those:
-            evaluator, noise = _build_rescaled_evaluator(subject, one.factors())
+        for hypothesis in hypotheses:
+            evaluator, noise = _build_rescaled_evaluator(subject, hypothesis.factors())
             scores.append(compute_lowest_start_cost(evaluator, noise, share))
             evaluator.close()
-        return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
+        return [hypotheses[i] for i in np.argsort(scores, kind="stable").tolist()]
 
     screened = best(hypotheses, SCREENING_SHARE)[:SCREENED_HYPOTHESES]
     return list(

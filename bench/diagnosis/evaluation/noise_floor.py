@@ -173,6 +173,8 @@ def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
     def noise(name: str, values: Array) -> Array:
         """Draw white noise for a channel from a random stream of its own.
 
+        `sizes` has the standard deviation by channel, and `run` is the run that gets the noise.
+
         Args:
             name: name of the channel.
             values: (T,) recorded values, of which only the shape counts.

@@ -214,6 +214,8 @@ def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Ar
 
     Shapes: R runs, T samples.
 
+    The process is e_t = sum_k a_k e_{t-k} + u_t (1).
+
     Args:
         filled: (R, T) residual of one channel, zero where it is not recorded.
         observed_mask: (R, T) whether a sample is recorded.

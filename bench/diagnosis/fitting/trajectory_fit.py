@@ -577,6 +577,9 @@ class TrajectoryFitter:
         Their squares are a term of the cost, eq. (1) of `levenberg_marquardt_step`.
 
         Shapes: R runs, s states of a run.
+
+        For run i it is d_i = (z_i - g_i) / pi, with the initial state z_i and the mean g_i and
+        standard deviation pi of its prior.
         """
         deviation: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
             self.evaluator
@@ -599,6 +602,9 @@ class TrajectoryFitter:
         abandoned.
 
         Shapes: R runs, T samples, C channels, s states of a run.
+
+        The cost is sum_i |r_i|^2 + sum_i |d_i|^2, with the whitened residual r_i of run i and the
+        deviation d_i of its initial state from the prior.
 
         Args:
             simulated: (R, T, C) simulated runs.

@@ -356,6 +356,8 @@ def _compute_probe_sizes(probes: Sequence[CandidateDirection]) -> Array:
     """Return the divisor c of eq. (1) for each probe (K,), which is its scaling coefficient.
 
     It is one for a fixed probe, whose direction is the whole change.
+
+    The direction is d = (y(c) - y(0)) / c (1), with the runs y(c).
     """
     sizes = []
     for probe in probes:

@@ -488,6 +488,8 @@ def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[A
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
+    The projection subtracts (L'J'a)'(L'J'b) from a'b (2).
+
     Args:
         reduced_design: the whitened design.
         shared: (R, q + s, S) products of the Jacobian with residuals.
@@ -505,6 +507,8 @@ def _project_directions(roots: Array, products: Array) -> Array:
     """Multiply the products J'a of each run by the root L', as in eq. (2).
 
     Shapes: R runs, s states of a run.
+
+    The projection subtracts (L'J'a)'(L'J'b) from a'b (2).
 
     Args:
         roots: (R, s, s) L of each run.

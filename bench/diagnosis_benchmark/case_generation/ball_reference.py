@@ -242,6 +242,9 @@ def _integrate_flight(
     def rate(t: float, y: Array) -> tuple[float, ...]:
         """Return the time derivatives of position and velocity; a resting ball does not sink.
 
+        `air` has the laws of the hidden causes, `middle` a time that tells which of them act, and
+        `resting` whether the ball lies on the ground.
+
         Args:
             t: time, s.
             y: position (m) and velocity (m/s).

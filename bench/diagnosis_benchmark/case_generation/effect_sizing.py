@@ -261,6 +261,9 @@ def make_gap_function(
 
         The recording with the cause is refitted by the model without it. The fit starts at the
         values of the last strength, scaled to this strength, which saves iterations.
+
+        `observed` gives the recording with the cause at a strength, and `fit` refits the model
+        without it.
         """
         theta, starts = fit.theta, fit.starts
         # Fitted parameters and states change about in proportion to the strength.

@@ -197,6 +197,9 @@ class RegressionEvidence:
         Accelerations show forces at the moment at which they act, while trajectories integrate
         them.
 
+        The operator L r = r'' - A r - B r' (2) is applied to both sides of r = J delta + D c +
+        noise (1).
+
         Args:
             seconds: window of the local polynomials.
         """
@@ -374,6 +377,8 @@ class RegressionEvidence:
         They are the derivatives of the base model's acceleration by the D coordinates and by their
         rates, along the fitted motion. They are zero if the system's own force is uniform, and for
         systems of several coordinates.
+
+        They are A and B of L r = r'' - A r - B r' (2).
 
         Args:
             run: index of the run.

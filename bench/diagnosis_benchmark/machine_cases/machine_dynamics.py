@@ -350,6 +350,9 @@ class ArmDynamics(MachineDynamics):
 
         Shapes: L batch elements.
 
+        M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1 (2), M12 = I2 + m2 (c2^2 + l
+        c2 cos q2), M22 = I2 + m2 c2^2 + A2 (3), with the inertias A1, A2 of the rotors.
+
         Args:
             q: positions, (L, 2).
         """
@@ -371,6 +374,8 @@ class ArmDynamics(MachineDynamics):
         """Compute the forces of inputs, gravity, Coriolis effects and damping, as in (4).
 
         Shapes: L batch elements.
+
+        It is u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2) (4).
 
         Args:
             q: positions, (L, 2).

@@ -308,6 +308,9 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     All coordinates share the stamps, so a coordinate that moves as expected clears them; another
     one may belong to a link without inertia in the model file.
 
+    At rest in the recorded positions, the system's own forces would move it equally far within T' =
+    (var x / mean a^2)^(1/4) (2), with its acceleration a.
+
     Args:
         recording: recorded runs, with their channels, inputs and constants.
         run: recorded run: times, channels and inputs.

@@ -385,6 +385,9 @@ class BallRollout:
         """Return the seconds until the ball meets the ground with its present acceleration.
 
         It is 0 on the ground and inf if the ball never meets it.
+
+        From height H with upward speed u and upward acceleration l, it is (u + r) / -l = 2 H / (r -
+        u), r = sqrt(u^2 - 2 l H) (5); the form without cancellation is used.
         """
         gap = max(self.x[2] - self._floor, 0.0)
         rate = self.v[2]
@@ -470,6 +473,9 @@ class NativeContactBall(BallBody, Protocol):
 
 def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Trajectory:
     """Integrate one batch element, a ball, with the engine's own contact model.
+
+    The smooth acceleration is g + f - k v (1 + |v|), with the effects' force f per unit mass and
+    the engine's air damping k (6).
 
     Args:
         ball: ball in an engine.

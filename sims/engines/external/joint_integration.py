@@ -201,6 +201,8 @@ class LinearisedForces:
 
         A force that increases with the velocity is taken without its slope.
 
+        It solves v' = w + h/2 (G(x') + f(t', x', v', u)) / M (3) by one Newton step.
+
         Args:
             w: the engine's velocity.
             step: step size in seconds.

@@ -241,6 +241,10 @@ class MeasuredLinear(RunLinearisation):
         interval is the product of these. The maps give the deviation at the next sample from that
         at a sample, which a Kalman smoother needs. The defect of each step is composed in the same
         way.
+
+        For a deviation delta at sample i: delta[i+1] = A_i delta[i] - d_i + G_i f_i + sum_k c_k
+        b_ik (3), y[i] = h + H_i delta[i] + sum_k c_k psi_ik (4), with the missing force f and the
+        effects' coefficients c.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]

@@ -154,6 +154,9 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
 
     Shapes: L batch elements, S steps, T samples.
 
+    With values a, b and slopes a', b' at the ends of a step h: y = (1 + 2s)(1 - s)^2 a + s(1 - s)^2
+    h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b' (1), at the fraction s.
+
     Args:
         values: (L, S + 1) values at the ends of steps.
         slopes: (L, S + 1) derivatives per second; None if they are unknown.

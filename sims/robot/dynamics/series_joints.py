@@ -233,6 +233,9 @@ def write_series_element(
     An element is a spring with a damper (3), a gap with rigid flanks (4), or a gap with
     compliant flanks (5). The drive's armature is its share of the joint's inertia.
 
+    With the deflection d between drive and links: a spring exerts -k d - c d' (3), rigid flanks
+    limit |d| to gap / 2 (4), compliant flanks exert -k e - c d' with e beyond the gap (5).
+
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
@@ -369,6 +372,8 @@ def compute_rest_positions(
     fields: Mapping[str, Any], robot: RobotModel, loads: Sequence[Array]
 ) -> list[Array]:
     """Compute the rest positions (n,) of joints in series while their drives are held.
+
+    A limit of MuJoCo exerts -(K e + C d') / (A + R), R = (1 - s) A0 / s (6).
 
     Args:
         fields: model fields of the batch elements.

@@ -339,6 +339,9 @@ class TangentModel:
 
         Shapes: S steps.
 
+        dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t (2), with the derivatives A, B, C of
+        a step by state, forces and controls, and the inertia matrix M.
+
         Args:
             changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
@@ -560,6 +563,9 @@ def compute_runge_kutta_step(
     """Compute the derivatives of a Runge-Kutta step from those of the acceleration, by (3).
 
     Shapes: D joints.
+
+    With K = [[0, I], [da/dq, da/dv]], L = [[0], [da/df]] and the step h: A = I + P K, B = P L, P =
+    h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
 
     Args:
         by_state: (N, D, 2 D) derivatives of accelerations by positions and velocities.

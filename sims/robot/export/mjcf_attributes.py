@@ -496,6 +496,9 @@ def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
     `input_factor` is the factor 1 + a of an input gain that is in the fields already.
 
+    With the command u, the input (1 + a) u + b gives the force g (1 + a) u + g b + bias (1), so
+    that b is part of the actuator's bias.
+
     Args:
         fields: fields of the compiled model, changed in place.
         robot: robot as read from its model file.
@@ -516,6 +519,9 @@ def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     """Write a saturation of the input at ±s as a narrower control range, eq. (2).
 
     A saturation s of zero or less has no effect, as in the simulation.
+
+    With the input w = clip((1 + a) u + b, -s, s), the command is limited to (-s - b) / (1 + a) and
+    (s - b) / (1 + a), within its control range (2).
 
     Args:
         fields: fields of the compiled model, changed in place.

@@ -71,6 +71,9 @@ def _make_solref_reader(index: int) -> Read:
     def read(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
         """Return the number of the contact in a list of one.
 
+        MuJoCo's `solref` has a time constant and a damping ratio, or stiffness and damping if they
+        are negative; `index` selects one. For the latter form, the number is infinite.
+
         Args:
             f: fields of the model with the effects.
             robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.

@@ -169,6 +169,9 @@ class UrdfWriter:
         """Move the centre of mass of each link in the body by the same vector in metres, eq. (2).
 
         The result is None, or the reason why the URDF cannot state the cause.
+
+        The centre of mass of each fused link is moved by R' c, with the link's axes R in the frame
+        of the body (2).
         """
         inertials = self._find_inertials(cause)
         if inertials is None:
@@ -184,6 +187,9 @@ class UrdfWriter:
         """Move the zero of a joint by c (rad or m): turn or move its origin, by eq. (3).
 
         The result is None, or the reason why the URDF cannot state the cause.
+
+        The zero moves by c if the origin of the joint is turned by -c about its axis, or moved by
+        -c along it (3).
         """
         joint = self.joints.get(cause.place)
         if joint is None:
@@ -218,6 +224,9 @@ class UrdfWriter:
         `carrier` is the parent body in the compiled model, and `axes` are the axes of the
         parent link in it. The result is None, or the reason why the URDF cannot state the
         cause.
+
+        The origin of the body's joint moves by R' c p, with the position p of the body in the frame
+        of its parent, and the axes R of the joint's parent link (4).
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
         joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]

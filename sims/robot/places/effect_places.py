@@ -253,6 +253,9 @@ def _make_taking_method(
     def taking(_: Effect, c: Array, simpler: str, armature: Array) -> Array:
         """Convert the inertia of an armature effect to the rotor's share of the joint inertia.
 
+        `drive` is the name of the armature effect, `number` the index of the rotor's share among
+        the coefficients, `inertia` that of the joint, and `bounds` the range of the share.
+
         Args:
             _: the armature effect; unused.
             c: coefficients of the richer effect.
