@@ -64,6 +64,9 @@ _PRINTED_CHECKPOINTS = (3, 10)
 def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and the report page of a comparison, and print a summary.
 
+    The summary has the best tuners, their median errors, limitations of the comparison, failures
+    and running times.
+
     Args:
         folder: result folder of the comparison.
         problem: tuning problem of the comparison.

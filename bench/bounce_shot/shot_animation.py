@@ -96,6 +96,9 @@ def write_animation(
 ) -> Path:
     """Write figures/shot.gif: a drop at normal speed, if it was filmed, and shots at half speed.
 
+    Panels of all methods stand side by side, after the film and its track. The drop of the film is
+    shown first, then the shots of all methods together.
+
     Args:
         folder: result folder.
         settings: settings of the bounce shot, from the table [shot] of the experiment.

@@ -116,6 +116,9 @@ class ReportableShotStudy(Protocol):
 def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and HTML report from the shots that exist.
 
+    It writes the tables (table, shots, status), the figures, the HTML page and an animation of one
+    example, and prints the result table and the failures.
+
     Args:
         study: the study to report.
         print_line: prints a line.

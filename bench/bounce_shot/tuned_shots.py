@@ -151,6 +151,9 @@ def _tune_model(
 ) -> TunedModel:
     """Run a tuner on the recorded drop, in the simulator with given effects.
 
+    The tuner starts at the nominal parameters and sees only the drop, as pixel rows of the film or
+    as heights.
+
     Args:
         experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
         settings: settings of the bounce shot, from the table [shot] of the experiment.

@@ -91,6 +91,9 @@ def write_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> Path
 def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str:
     """Render the page as HTML.
 
+    The page has the verdicts and causes of all logs, each number of the causes over the logs, and
+    the held-out errors.
+
     Args:
         rows: Result of each log, in the order given.
         batch: Input of the page in addition to the rows.

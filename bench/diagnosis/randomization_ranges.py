@@ -120,6 +120,9 @@ class _Entry(NamedTuple):
 def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> RandomizationRanges:
     """Return the ranges of the fitted numbers of diagnosed causes and of free numbers.
 
+    Numbers of the solver, ambiguous causes and numbers without an interval are left out, with the
+    reason.
+
     Args:
         answer: Verdict. A cause with alternatives is ambiguous, and is left out.
         extended: Extended simulator with the fitted numbers.

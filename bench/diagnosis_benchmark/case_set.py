@@ -210,6 +210,9 @@ class BenchmarkConfig:
 def read_config(experiment: Experiment) -> BenchmarkConfig:
     """Read and validate the ``[diagnosis]`` table of an experiment.
 
+    Args:
+        experiment: Experiment with the table.
+
     Raises:
         InputError: a key or value is not allowed.
     """
@@ -241,6 +244,7 @@ def read_config(experiment: Experiment) -> BenchmarkConfig:
                 f"above 0, up to {MAX_EFFECT_SIZE:g}",
                 request.sizes,
             )
+        # Sampling rates in Hz for which cases can be drawn.
         if not all(10 <= rate <= 1000 for rate in request.rates):
             raise make_error(subject, "diagnosis.questions.rates", "10 to 1000 Hz", request.rates)
         if not all(2 <= runs <= 6 for runs in request.runs):

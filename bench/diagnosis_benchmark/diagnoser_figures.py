@@ -78,6 +78,9 @@ def draw_chart_figures(data: DiagnoserReportData) -> dict[str, Figure]:
 def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     """Draw the outcomes of all recordings with one hidden effect, as stacked bars.
 
+    Each diagnoser has a bar whose parts are the outcomes, such as right, ambiguous, wrong or
+    missed, in per cent of the recordings.
+
     Args:
         rows: one row per answer on a single effect.
         order: names of the diagnosers.
@@ -143,6 +146,9 @@ _MIN_LABELLED_PERCENT = 10.0
 
 def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     """Draw one confusion matrix of cause families for each diagnoser.
+
+    Rows are the families of the hidden causes, columns those of the answers, in per cent of a row.
+    Cases with two hidden causes are left out.
 
     Args:
         rows: one row per answer.

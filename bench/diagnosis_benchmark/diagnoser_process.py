@@ -124,6 +124,9 @@ def diagnose_case(
 ) -> dict[str, Any]:
     """Diagnose one case.
 
+    The recording is written to files and read again, as a user would have it, and the diagnoser is
+    called with counted simulations.
+
     Args:
         question: request with ``wanted`` (name, module, file), ``table`` and ``description`` of the
             recording, ``budget``, ``seconds``, ``seed``, and ``beside``, texts of further files in

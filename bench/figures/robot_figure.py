@@ -255,6 +255,9 @@ def draw_robot_figure(
 ) -> Figure:
     """Draw the robot at a pose, with places marked.
 
+    The robot is rendered if it has shapes, otherwise drawn as a skeleton. Labels of joints and
+    marked places are in two columns at its sides, with a scale bar below.
+
     Args:
         robot: Robot to draw.
         positions: Positions by joint, rad or m; other joints keep the position of the model file.

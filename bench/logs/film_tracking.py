@@ -82,6 +82,9 @@ def track_film(
 ) -> TrackingResult:
     """Track `video`; write `out`, its description, and a figure of the track in the same folder.
 
+    The ball is tracked in pixels, its path is converted to heights in metres, frames before the
+    release are left out, and the noise is estimated. Recording and figure are written together.
+
     Args:
         video: Path of the film.
         out: Path NAME.csv of a new file.

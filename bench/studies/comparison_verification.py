@@ -337,6 +337,8 @@ def _verify_tables(
 ) -> list[VerificationFailure]:
     """Verify that table.csv follows from the rows, and return the failures.
 
+    The table is computed again and compared column by column; numbers may differ by rounding.
+
     Args:
         folder: folder of the comparison.
         stored: comparison read from its result folder: configuration, runs and statuses.

@@ -196,6 +196,9 @@ def _score_extended_model(
 ) -> None:
     """Repeat the held-out error of the extended simulator, if the folder has the recording.
 
+    Nothing can be repeated without a stated error or without the recording; the recording must have
+    the hash that the explanation states. A difference beyond `_ERROR_TOLERANCE` is a failure.
+
     Args:
         folder: folder of the explanation.
         verdict: its verdict, with the stated error.

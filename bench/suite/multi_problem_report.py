@@ -403,6 +403,9 @@ def render_multi_problem_page(
 ) -> str:
     """Render the page as HTML.
 
+    The page has the mean ranks with Friedman's and Nemenyi's tests, the runtime distribution over
+    all problems, and error curves by problem.
+
     Args:
         collection: comparisons.
         tables: tables by name, as written next to the page.

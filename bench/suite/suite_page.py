@@ -237,6 +237,9 @@ td.failed { outline: 2px solid #c00000; outline-offset: -2px; }
 def render_suite_page(tables: SuiteTables) -> str:
     """Render the page as HTML.
 
+    The page has the ranking of the tuners, significance tests, the guide by property of the
+    problem, losses of this project's tuners, and all tables.
+
     Args:
         tables: tables of the suite.
     """
@@ -371,6 +374,8 @@ def _build_cells(
     tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]
 ) -> list[dict[str, Any]]:
     """Build name, description and error curves of each cell, a problem with one target range.
+
+    The curve of a tuner is the median over targets with its quartiles.
 
     Args:
         tables: tables of the suite.

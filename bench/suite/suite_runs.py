@@ -141,6 +141,9 @@ def collect_suite_runs(folder: Path) -> SuiteRuns:
 def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     """Collect the runs of one comparison of a suite, with its cells and the cost of trainings.
 
+    A cell is a problem with one range of targets. A run that ended early with a smaller budget has
+    NaN for more simulations.
+
     Args:
         folder: folder of the comparison.
         condition: ``before`` or ``after`` the extension of a misspecified simulator, else empty.

@@ -452,6 +452,9 @@ class InputFeatures:
     ) -> tuple[InputFeatures, dict[str, Array]]:
         """Restore the map from the arrays of `to_arrays`.
 
+        Arrays named `inputs.*` describe the features of observations, arrays named `told.*` those
+        of scenarios.
+
         Args:
             state: arrays by name.
             reading: configuration of the inputs.

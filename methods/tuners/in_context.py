@@ -193,6 +193,9 @@ class InContextTransformer(Tuner):
     def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
 
+        For each noise level of the training data a transformer is trained on histories of simulated
+        tuning runs; the level is chosen later by the noise of the target.
+
         Args:
             simulator: training simulator.
             rng: random generator.

@@ -95,6 +95,9 @@ def read_sources(
 ) -> RecordingSources:
     """Read the locations of all columns from a description.
 
+    A source says in which file and column a signal is, and in which unit; runs may be in folders or
+    files of their own.
+
     Args:
         path: Path of the description, for messages.
         meta: Content of the description.

@@ -337,6 +337,8 @@ class RecordingTable:
     def split_into_runs(self, names: list[str], columns: dict[str, Array]) -> list[CsvRun]:
         """Split the rows into runs, each a block of rows with the same name, and check them.
 
+        The checks concern the name of each run, its number of rows, its samples, and its times.
+
         Args:
             names: Name of the run of each row.
             columns: Times ``t`` and all other columns by name, each (T,); NaN where a cell is

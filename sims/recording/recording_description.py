@@ -282,6 +282,9 @@ def check_description(
 ) -> RecordingDescription:
     """Check a description against the system's channels, inputs, constants and states.
 
+    Tables are checked in this order: channels, inputs, constants, runs, extra columns, and columns
+    that switch drives.
+
     Args:
         path: Path of the description, for messages.
         meta: Content of the description, as in `NAME.toml`.

@@ -58,6 +58,8 @@ def write_recording(
 def _format_table(runs: Sequence[Run], digits: int) -> str:
     """Return the text of the CSV table with all runs.
 
+    The columns are the run, the time, inputs, channels and extra signals.
+
     Args:
         runs: Runs with the same signals; those of the first determine the columns.
         digits: Number of significant digits.

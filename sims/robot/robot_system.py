@@ -146,6 +146,12 @@ class RobotSystem(System):
     def effect(cls, name: str) -> type[Effect] | None:
         """Find the effect with a name such as ``friction.coulomb@elbow``.
 
+        The place may be left out for effects without places, be `ALL_PLACES` for the family, or be
+        the name of a link that was fused into a body.
+
+        Args:
+            name: Name of the effect, with its place after ``@``.
+
         Raises:
             InputError: there is no such effect, or it has no such place; the message lists the
                 existing ones.
@@ -165,11 +171,11 @@ class RobotSystem(System):
             return effects_by_name[name]
         if registered.at == "contact" and PAIR_SEPARATOR in place:
             # The contacts of a recording are candidates, but any contact may be named.
-            spot = make_contact_place(cls.robot, place, (place,))
-            return effect_places.make_placed_effect(registered, spot)
+            effect_place = make_contact_place(cls.robot, place, (place,))
+            return effect_places.make_placed_effect(registered, effect_place)
         if registered.at == "geom" and place not in ("", ALL_PLACES):
-            spot = make_geom_place(cls.robot, place)
-            return effect_places.make_placed_effect(registered, spot)
+            effect_place = make_geom_place(cls.robot, place)
+            return effect_places.make_placed_effect(registered, effect_place)
         if not effects_by_name:
             raise InputError(f"robot {cls.name} cannot have effect {effect_name}")
         if not place:

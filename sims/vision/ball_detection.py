@@ -361,6 +361,10 @@ class BallDetector:
     ) -> BallDetection | None:
         """Fit a circle to the edge points along rays, in turn with finding the edge again.
 
+        Edge points are located along rays from the present centre, a robust circle is fitted to
+        them, and this is repeated until the circle moves by less than `_CONVERGED_PIXELS`. If too
+        few rays agree, a circle through an arc is tried.
+
         Args:
             windows: (2, height, width) differences from the background around the region: of
                 brightness, and of the worst colour.

@@ -148,6 +148,9 @@ def estimate_comparison_need(
 ) -> ResourceNeed:
     """Estimate the needs of all runs of an experiment; see `check_comparison_size`.
 
+    Memory, disk space, files and seconds are sums over runs, simulations and trainings with
+    constants that were measured once; the counts explain the estimate to the user.
+
     Args:
         experiment: configuration without a sweep.
         jobs: number of worker processes; 0 for none.

@@ -573,6 +573,9 @@ def read_weights(path: Path) -> dict[str, Array]:
 def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
     """Read and check the arrays of a weights file.
 
+    The file has the weights, the cost of the training (two numbers) and its key, which must be
+    `name`. Nothing is unpickled.
+
     Args:
         path: file of the weights.
         name: key of the training.

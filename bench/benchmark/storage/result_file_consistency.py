@@ -162,6 +162,8 @@ def check_files(
 ) -> CheckedFiles:
     """Check runs.parquet, status.csv, training.csv, identifiability.csv and their consistency.
 
+    The tables are checked alone first, then against each other and against the plan of runs.
+
     Args:
         folder: Folder of the comparison.
         experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
@@ -272,6 +274,9 @@ def check_statuses(
 ) -> None:
     """Check that statuses are unique, belong to the experiment, and are within its budget.
 
+    Checked are: unique IDs that begin with tuner, target and seed; known tuners, simulator and
+    targets; and numbers of simulations that fit to budget and status.
+
     Args:
         statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`, cells checked.
         experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
@@ -341,6 +346,9 @@ def check_rows_match_statuses(
     source: str,
 ) -> None:
     """Check that rows and statuses describe the same runs consistently.
+
+    Every row belongs to an executed run, every executed run has rows, and the number of
+    simulations, tuner, simulator, target and seed agree.
 
     Args:
         runs: One line per run, as read from `file`.

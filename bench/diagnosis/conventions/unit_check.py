@@ -331,6 +331,10 @@ def find_wrong_units(
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
 
+    Each promising hypothesis rescales signals, and the base model is fitted again. A hypothesis is
+    accepted if it removes most of the misfit and other factors do not. Of several, the one with the
+    fewest signals is preferred; the others are stated as alternatives.
+
     Args:
         subject: Recording and simulator to check.
         evaluator: Run evaluator of the runs for fitting.

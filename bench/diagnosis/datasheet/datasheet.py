@@ -159,6 +159,10 @@ def build_datasheet(
 ) -> DataSheet:
     """Build the data sheet of a joint or actuator.
 
+    The recording is prepared as for a diagnosis. Detection limits are computed for all absent
+    effects that the recorded channels could show; effects that need a drive are only listed for
+    driven joints.
+
     Args:
         recording: Logs that were explained.
         extended: Extended simulator that was identified from them; its class is known.

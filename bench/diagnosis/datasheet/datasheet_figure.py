@@ -87,6 +87,10 @@ def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
 def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
 
+    The region above the forward boundary is forward motion, below the backward boundary back
+    motion; in between the joint holds. Marks show the break-away force and the load that moves the
+    joint back.
+
     Args:
         axes: Axes to draw on.
         diagram: Diagram to draw.

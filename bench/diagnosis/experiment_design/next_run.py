@@ -99,6 +99,10 @@ def design_next_run(
 ) -> NextRunDesign | None:
     """Design the best run that could be recorded next.
 
+    Basic plans are ranked by their linearised value, the best ones are evaluated exactly, and
+    variants of the best plans are tried for up to `MAX_VARIATION_ROUNDS` rounds. If none decides,
+    the best plans are tried with the maximum duration.
+
     Args:
         models: Collection that contains all of the models.
         model: Model of the present diagnosis.
@@ -199,6 +203,9 @@ def _describe_best_run(
     models: ModelSet, models_compared: Sequence[FittedModel], rig: RigModel, run_value: RunValue
 ) -> NextRunDesign:
     """Describe the best run, and what it is expected to tell, for the report.
+
+    With competing models, the design states the effects that it distinguishes and the expected
+    discrimination (T-optimal); otherwise the gain of information about parameters (D-optimal).
 
     Args:
         models: Fitted models of the recording.

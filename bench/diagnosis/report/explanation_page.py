@@ -301,6 +301,9 @@ def render_report(
 ) -> str:
     """Render the report as HTML.
 
+    The template gets the report data, finished texts, tables, charts and printed figures; tables
+    and charts are drawn by the script of the page.
+
     Args:
         report: Report data.
         rendered_figures: Figures by name; missing ones are left out.

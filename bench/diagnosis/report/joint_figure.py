@@ -222,6 +222,8 @@ def _draw_motion(
 ) -> None:
     """Draw the measured and simulated motion of a joint, with its name at the left.
 
+    Long signals are thinned to their extremes, so that no peak disappears.
+
     Args:
         panel: axes to draw on.
         report: content of the report.
@@ -287,14 +289,18 @@ def _format_row_name(row: JointRow, is_named: bool) -> str:
     return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
 
 
-def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
+def _draw_residual(
+    panel: Axes, report: DiagnosisReportData, view: RunView, channel_index: int
+) -> None:
     """Draw the residuals of a channel in units of its noise, with the RMS above.
+
+    A band marks two standard deviations of the noise.
 
     Args:
         panel: axes to draw on.
         report: content of the report.
         view: run to show: its part of the data, its index there, and the selected channels.
-        c: index of the channel.
+        channel_index: index of the channel.
     """
     times = view.data_split.times[view.row]
     panel.axhspan(
@@ -303,7 +309,7 @@ def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: i
     panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
     models = ("before", "after") if has_extended_model(report) else ("before",)
     for model in models:
-        residual = _compute_scaled_residual(report, view, c, model)
+        residual = _compute_scaled_residual(report, view, channel_index, model)
         rows = thin_signal(residual, MAX_SAMPLES)
         line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
         if model == "after":
@@ -311,7 +317,8 @@ def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: i
         line_style["rasterized"] = rows.size > MAX_OUTLINED_DOTS
         panel.plot(times[rows], residual[rows], **line_style)
     rms_texts = [
-        format_number(_compute_residual_rms(report, view, c, model), 2) for model in models
+        format_number(_compute_residual_rms(report, view, channel_index, model), 2)
+        for model in models
     ]
     panel.text(
         1.0,

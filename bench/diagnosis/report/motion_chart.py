@@ -292,18 +292,26 @@ def _list_hidden(
 
 
 def _make_panels(
-    report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], is_wide: bool
+    report: DiagnosisReportData,
+    run: ShownRun,
+    channel_index: int,
+    facets: dict[str, str],
+    is_wide: bool,
 ) -> tuple[Panel, Panel]:
     """Make two panels of one channel of a run: its motion, and its residual in noise units.
+
+    Both panels read their columns from the motion table of the page, by run and channel. The
+    residual panel has a band of two standard deviations of the noise; for robots its scale is
+    common to all joints.
 
     Args:
         report: content of the report.
         run: run of the page: its label, and its place in the data.
-        c: number of the channel.
+        channel_index: number of the channel.
         facets: values of the switches that show these panels.
         is_wide: place the panels side by side.
     """
-    channel = report.channels[c]
+    channel = report.channels[channel_index]
     selection = {
         "run": sanitise(run.data_split.names[run.row], 80),
         "channel": sanitise(channel.name, 80),

@@ -585,6 +585,10 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
 def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     """Fit the effects that may replace the only effect of a model.
 
+    The change by the present effect is added to the residual, and the other effects are scored
+    against it: those that explain it with a small remainder may replace the effect, and are fitted
+    from their best starting values.
+
     Args:
         search: the search, with scores about the model.
         model: fitted model: its effects, parameters, initial states and likelihood.

@@ -211,6 +211,10 @@ def list_hat_effects(kind: type[SystemSimulator]) -> list[type[Effect]]:
 def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     """Test a fitted model for lack of fit.
 
+    The size of the residual is tested first. Then a linear test for an unmodelled force of any
+    shape follows, which decides if it finds none; otherwise hat-shaped forces over time, position
+    and speed are simulated and scored, calibrated by surrogate residuals.
+
     Args:
         models: the models of the recording.
         model: the fitted model.

@@ -143,6 +143,9 @@ class NeuralClassifier(Diagnoser):
 def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
     """Simulate one recording with an effect, as input of the network.
 
+    Parameters, noise, inputs, channels, number and length of the runs are drawn, so that the
+    network learns under varied conditions.
+
     Args:
         training_task: the training task.
         name: name of the effect; empty for none.
@@ -231,6 +234,10 @@ def _compute_network_input(
 ) -> tuple[Array, float]:
     """Compute the network's input from a recording.
 
+    Each run is resampled to `GRID_POINT_COUNT` points. The rows are, for each channel, the residual
+    of the fitted base model (arcsinh, clipped), the normalised motion and a mask; then the inputs,
+    and the logarithm of the duration.
+
     Args:
         kind: simulator class.
         recording: recorded runs, with their channels, inputs and constants.
@@ -248,8 +255,8 @@ def _compute_network_input(
         fit = fit_base_model(evaluator, noise).fit
         residual = (evaluator.observed - fit.simulated) / noise.sigma
         rms = float(np.sqrt(np.nanmean(np.square(residual))))
-        names = [c.name for c in kind.channels]
-        inputs = [c.name for c in kind.inputs]
+        names = [recorded_index.name for recorded_index in kind.channels]
+        inputs = [recorded_index.name for recorded_index in kind.inputs]
         image = np.zeros(
             (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
         )
@@ -257,25 +264,27 @@ def _compute_network_input(
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
             relative_times = np.linspace(0.0, 1.0, size)
-            for c, name in enumerate(evaluator.channels):
+            for recorded_index, name in enumerate(evaluator.channels):
                 channel_index = names.index(name)
-                is_recorded = np.isfinite(residual[run_index, :size, c])
+                is_recorded = np.isfinite(residual[run_index, :size, recorded_index])
                 clipped_residual = np.clip(
-                    np.nan_to_num(residual[run_index, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP
+                    np.nan_to_num(residual[run_index, :size, recorded_index]),
+                    -_RESIDUAL_CLIP,
+                    _RESIDUAL_CLIP,
                 )
                 image[run_index, channel_index] = np.arcsinh(
                     np.interp(grid, relative_times[is_recorded], clipped_residual[is_recorded])
                 )
-                motion = fit.simulated[run_index, :size, c]
+                motion = fit.simulated[run_index, :size, recorded_index]
                 spread = float(motion.std()) or 1.0
                 image[run_index, len(names) + channel_index] = np.interp(
                     grid, relative_times, (motion - motion.mean()) / spread
                 )
                 image[run_index, 2 * len(names) + channel_index] = 1.0
-            for i, name in enumerate(inputs):
+            for input_index, name in enumerate(inputs):
                 signal = np.asarray(run_data.scenario.inputs.get(name, np.zeros(size)))[:size]
                 spread = float(np.abs(signal).max()) or 1.0
-                image[run_index, 3 * len(names) + i] = np.interp(
+                image[run_index, 3 * len(names) + input_index] = np.interp(
                     grid, relative_times, signal / spread
                 )
             image[run_index, -1] = np.log(run_data.duration)
@@ -284,6 +293,9 @@ def _compute_network_input(
 
 def _make_network(features: int, classes: int) -> Any:
     """Make the network: convolutions over a run, mean over runs, and dense layers.
+
+    A run has F rows of resampled signals; the mean over the runs makes the answer independent of
+    their order.
 
     Args:
         features: number of channels of the input, F.

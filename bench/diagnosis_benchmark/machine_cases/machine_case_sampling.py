@@ -59,6 +59,9 @@ def draw_case(
 ) -> BenchmarkCase | None:
     """Draw a case; see `bench.diagnosis_benchmark.case_generation.case_sampling.draw_case`.
 
+    The recording conditions are drawn first, then the cause is scaled to the requested size in
+    units of the noise.
+
     Args:
         kind: clean, single, double or foreign.
         system: servo or arm2.
@@ -95,6 +98,7 @@ def draw_case(
     )
     if kind == "clean":
         return case
+    # Sizes are log-uniform up to 10 noises; several or foreign causes must be clearly visible.
     low = 3.0 if kind in ("double", "foreign") else 1.0
     target_size = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
     hidden = {

@@ -149,6 +149,9 @@ def _find_saturated_commands(
 def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find coordinates that move in few samples or never.
 
+    A coordinate moves in a window if its range there clearly exceeds the noise and the quantisation
+    step.
+
     Args:
         recording: Recording to check.
         kind: Simulator class of its system.

@@ -222,6 +222,10 @@ def has_no_pending_event(block: Block, i: int) -> bool:
 def detect_event(block: Block, i: int) -> bool:
     """Return whether an event is within the step just tried; schedule the event.
 
+    Events are: an impact, when the height above the ground becomes negative; a standstill, when the
+    speed along the motion changes sign; and a break-away, when the pulling force of a sticking
+    element exceeds its friction limit.
+
     Args:
         block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.

@@ -241,6 +241,9 @@ def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: in
 def run_rare_instruction(op: int, r: FloatArray, o: int, a: int, b: int, w: int) -> None:
     """Run an instruction that is not in the common ones of `run_instructions`.
 
+    True is 1 and false is 0. The loop over slots is outside, because these instructions are too
+    rare to need vector code.
+
     Args:
         op: operation code.
         r: registers.

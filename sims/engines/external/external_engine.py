@@ -134,6 +134,9 @@ def integrate_batch(
 ) -> Trajectories:
     """Integrate the batch elements one after the other.
 
+    Elements whose numbers are not finite are not integrated. With several rollouts, the elements
+    are divided among threads.
+
     Args:
         batch: batch to integrate.
         rollouts: functions that integrate one element, each with its own world; with several of

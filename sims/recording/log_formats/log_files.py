@@ -145,6 +145,9 @@ class LogFile:
 def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
     """Read the columns of a log.
 
+    The path may name a file, a topic of a ROS bag, an episode of a LeRobot dataset, or a group in
+    an HDF5 file. Logs are cached by path, size and modification time.
+
     Args:
         path: Path of the log.
         columns_to_read: Columns that will be used; all if empty. Of a bag, which may be larger than

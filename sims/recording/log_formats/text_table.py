@@ -76,6 +76,12 @@ class Layout:
 def find_layout(path: Path) -> Layout:
     """Find the layout of a table from its first lines.
 
+    The separator is detected first, then the first row of numbers. The header is the last row above
+    it that can be names; a row of units may lie in between. Without a header, columns are numbered.
+
+    Args:
+        path: Text file of a table.
+
     Raises:
         InputError: The table has no rows, or its header has another number of cells than its rows.
     """
@@ -408,6 +414,9 @@ def _make_unique_names(layout: Layout) -> list[str]:
 def _read_cells(path: Path, layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
+    The file is read in the detected encoding, or as Windows-1252. Columns that are empty throughout
+    at the end are dropped.
+
     Args:
         path: path of the file.
         layout: layout of the table.
@@ -608,6 +617,9 @@ class _CellKind:
 
     def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
         """Convert the cells to numbers.
+
+        The first cell decides the kind: Boolean values, lists, dates or numbers. If more than half
+        of the cells are no numbers, the column counts as text.
 
         Args:
             path: Path of the table, for messages.

@@ -301,6 +301,9 @@ class LinearisationPoints:
     ) -> Iterator[tuple[int, IndexArray | None]]:
         """Place the points in the elements of the batch, as many at a time as it has elements.
 
+        Each batch element gets the state, controls and forces of another step of the motion, with
+        the displacements added, and the forces of effects at this state.
+
         Args:
             moved: displacements for a difference quotient, index and size by quantity: q position,
                 v velocity, a activation, w hidden state, p and r displacement and velocity of
@@ -362,6 +365,9 @@ class LinearisationPoints:
         self, steps: IndexArray, n: int, state_changes: Mapping[int, float]
     ) -> None:
         """Add state-dependent effect forces at the states of the batch elements.
+
+        They are the forces of effects that no model field represents; dry friction is written into
+        the model's friction limits.
 
         Args:
             steps: steps of the points.

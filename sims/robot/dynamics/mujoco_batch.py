@@ -460,6 +460,10 @@ class MujocoBatch:
     ) -> dict[str, Array]:
         """Step n batch elements S times with effects that are evaluated in every step.
 
+        In each step the effects are evaluated at the predicted middle of the step, their forces and
+        friction limits are written into MuJoCo's fields, and MuJoCo makes the step. Where actuators
+        are switched, their force ranges are changed before.
+
         Args:
             controls: (n, S, nu) controls.
             forces: (n, S, nv) generalised forces.

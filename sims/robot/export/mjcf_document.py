@@ -390,6 +390,12 @@ class MjcfDocument:
     def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
         """Map element numbers of the compiled model to the elements of the text.
 
+        Bodies, joints and actuators have the order of the text; geoms and contact pairs are found
+        by their names.
+
+        Args:
+            model: Compiled model of MuJoCo.
+
         Raises:
             NotEditableError: the compiled model has other elements than the text.
         """

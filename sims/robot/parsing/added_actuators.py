@@ -82,6 +82,9 @@ def _check_actuator_table(
 ) -> None:
     """Check the table of an added actuator: its joint, kind, name and gains.
 
+    `kp`, `ki` and `kv` are gains on position, integral and velocity; `kd` acts on the rate of the
+    error.
+
     Args:
         spec: a mujoco.MjSpec with the joints and actuators of the file.
         source: beginning of error messages.

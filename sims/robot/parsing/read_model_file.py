@@ -99,6 +99,11 @@ def _make_robot(
 ) -> RobotModel:
     """Repair, complete and compile a parsed model file, and make the robot from it.
 
+    The steps are: repair of the XML, parsing by MuJoCo, actuators and engine settings of the
+    recording, names of unnamed elements, replacement of recorded floating joints, compilation with
+    repairs, and removal of contacts that overlap in the reference pose (URDF only). Every repair
+    adds a note.
+
     Args:
         files: reader of the model file.
         root: root element; it is changed in place.
