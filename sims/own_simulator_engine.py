@@ -117,6 +117,13 @@ class OwnSimulatorEngine:
     def _run(self, batch: IntegrationBatch, element: int) -> Array | None:
         """Simulate one batch element, given by its number, with the user's simulator.
 
+        Before each step the forces of effects are applied, and after it levels are cut at their
+        rims.
+
+        Args:
+            batch: Batch of parameter vectors with inputs, steps and effects.
+            element: Index of the element.
+
         Returns:
             (N, C) readings of all channels, at the start and after each `steps_per_sample` steps.
             None if a parameter, constant or initial state is not finite.

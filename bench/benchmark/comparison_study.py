@@ -201,6 +201,9 @@ class Comparison(Study):
     ) -> StudyOutcome:
         """Run what is missing, and write the results; see `Study.run`.
 
+        Missing runs are executed and stored one by one, so that an interruption loses nothing; at
+        the end the tables are written and the salt is revealed.
+
         Args:
             jobs: number of worker processes; 0 for none.
             progress: called for every step.

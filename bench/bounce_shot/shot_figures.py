@@ -152,6 +152,8 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
 def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     """Draw where shots met the hoop's plane (left) and the prediction error (right) as box plots.
 
+    Each method has one row; its colour shows the kind of the method.
+
     Args:
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         rows: rows of shots.csv.

@@ -302,6 +302,9 @@ def _parse_command_line(words: Sequence[str]) -> argparse.Namespace:
 def build_parser(only: str | None = "") -> _Parser:
     """Build the parser of the command line.
 
+    Each command is a module of `bench.cli.commands`, which is imported only if its options are
+    needed.
+
     Args:
         only: Name of the only command that gets its options, so that the modules of the others are
             not imported; empty for all commands, None for no command.

@@ -442,6 +442,9 @@ def freeze_unidentified_parameters(
 ) -> BaseFit:
     """Freeze at the nominal value all free numbers that the data cannot identify.
 
+    The worse half of the unidentified parameters is frozen and the rest refitted, because the
+    others may become identifiable then; in the last of `MAX_REFITS` rounds all of them are frozen.
+
     Args:
         evaluator: Run evaluator of the runs.
         noise: Noise of each channel.

@@ -35,6 +35,9 @@ def score_model(
 ) -> dict[str, Any]:
     """Compute the RMS error of a model on a recording, by channel and over all channels.
 
+    Only the initial states are fitted to the recording; parameters and coefficients are those of
+    the model.
+
     Args:
         model: An extended.toml, or a robot's model file, such as extended.xml.
         recording: Recording, or the path of its table.

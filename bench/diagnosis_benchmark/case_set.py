@@ -210,6 +210,9 @@ class BenchmarkConfig:
 def read_config(experiment: Experiment) -> BenchmarkConfig:
     """Read and validate the ``[diagnosis]`` table of an experiment.
 
+    It states the diagnosers, the tables of cases (``questions``), the random seed and the size of a
+    sample.
+
     Args:
         experiment: Experiment with the table.
 

@@ -101,6 +101,9 @@ class MisspecificationStudy(Study):
     ) -> StudyOutcome:
         """Run what is missing; see `Study.run`.
 
+        The extension of the simulator is diagnosed first, then the comparisons in the plain and in
+        the extended simulator are run.
+
         Args:
             jobs: number of worker processes.
             progress: makes progress callbacks; None for no progress output.

@@ -93,6 +93,8 @@ def verify_comparison(
 ) -> VerificationResult:
     """Verify a finished comparison, and print the result.
 
+    Checked are the hashes, the salt, a sample of the simulations, and the tables.
+
     Args:
         folder: folder of the comparison.
         print_line: prints a line.

@@ -353,6 +353,8 @@ def _make_runtime_panel(
 def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], pd.DataFrame]:
     """Make the panels of error against simulations, one per problem, with their table.
 
+    Medians over targets are drawn with their intervals.
+
     Args:
         collection: Comparisons on several problems with their common tuners.
 

@@ -32,6 +32,9 @@ def read_csv_fast(
 ) -> tuple[list[str], dict[str, Array]] | None:
     """Read the run names and the numeric columns of a CSV table with pyarrow.
 
+    It gives up where cells are quoted, or a number is missing or not finite, so that the slow
+    reader can locate the error.
+
     Args:
         path: Table whose first line is its header.
         header: Checked names of its columns, including ``run``.
@@ -233,6 +236,8 @@ class RecordingTable:
 
     def _check_header(self, cells: list[str]) -> list[str]:
         """Check the names of the columns against the declared ones, and return them.
+
+        Every declared column must exist, and no other column may.
 
         Args:
             cells: Cells of the first row.

@@ -368,6 +368,8 @@ _HELD_OUT_STRIDE = 3
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description.
 
+    Units are converted, quaternions become angles, and wrapped angles are unwrapped.
+
     Args:
         table: CSV file of the run, for error messages.
         part: columns of the run in the units of the file.

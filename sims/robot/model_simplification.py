@@ -208,6 +208,9 @@ def _write_inertials(spec: Any, model: Any) -> None:
 def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int]]:
     """Make geoms that cannot collide visual, and reduce the meshes of the others to convex hulls.
 
+    A hull with few faces replaces a mesh only in the tested version of MuJoCo, because contacts
+    depend on the order of its vertices.
+
     Args:
         spec: the model as an `MjSpec`, changed in place.
         model: the model, compiled from it.

@@ -382,6 +382,9 @@ class BallScene:
     ) -> tuple[ColourArray, ColourArray]:
         """Render a body in a window of the picture.
 
+        PyBullet's software renderer draws the window with several fine pixels per pixel, which are
+        averaged, so that edges are smooth.
+
         Args:
             window: Window (left, top, right, bottom).
             oversampling: Factor of oversampling.

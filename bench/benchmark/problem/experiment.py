@@ -478,6 +478,8 @@ def find_experiment_file(name_or_path: str) -> Path:
 def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
     """Check the tables of an experiment file and convert them to an experiment.
 
+    Relative paths are made absolute, and names of tuners and swept values are checked.
+
     Args:
         name: name of the experiment.
         document: tables of the file.

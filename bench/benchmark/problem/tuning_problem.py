@@ -61,6 +61,10 @@ class TuningProblem:
     def __init__(self, experiment: Experiment, salt: str | None = None) -> None:
         """Build the simulators, and read the recording if the experiment has one.
 
+        `simulator` is tuned, `world` is the true system that makes the targets (the same unless the
+        experiment names another), `cube` maps parameters to the unit cube, and `noise` and `scale`
+        are those of the channels.
+
         Args:
             experiment: experiment that neither sweeps over values nor names other experiments.
             salt: salt from which targets are drawn; None for that of the experiment.

@@ -138,6 +138,9 @@ def execute_run(
 ) -> RunOutcome:
     """Execute one run; failures of the tuner or the simulator are a status of its trace.
 
+    The tuner runs in this process if it is trusted, otherwise in an isolated one. Afterwards the
+    errors of its proposals and recommendations on the fitting and the held-out runs are computed.
+
     Args:
         experiment: configuration of the experiment.
         request: request of the run.

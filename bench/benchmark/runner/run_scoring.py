@@ -67,6 +67,9 @@ def build_rows(
 ) -> dict[str, Any]:
     """Build the columns of runs.parquet for one run, with a row for each k = 0..simulations.
 
+    The columns are the description of the run, the loss, errors of the parameters, RMS errors of
+    the channels on fitting and held-out runs, and the seconds in tuner and simulator.
+
     Args:
         problem: tuning problem.
         order: request of the run.
@@ -79,17 +82,17 @@ def build_rows(
         Values by column name.
     """
     trace = outcome.trace
-    k = len(trace.losses)
+    simulations = len(trace.losses)
     columns: dict[str, Any] = {
-        "run": [order.run] * (k + 1),
-        "experiment": [problem.experiment.name] * (k + 1),
-        "tuner": [order.entry.label] * (k + 1),
-        "simulator": [problem.experiment.simulator] * (k + 1),
-        "target": [target.blinded.name] * (k + 1),
-        "seed": [order.seed] * (k + 1),
-        "range": [target.blinded.range] * (k + 1),
-        "trusted": [problem.experiment.trusted] * (k + 1),
-        "k": np.arange(k + 1),
+        "run": [order.run] * (simulations + 1),
+        "experiment": [problem.experiment.name] * (simulations + 1),
+        "tuner": [order.entry.label] * (simulations + 1),
+        "simulator": [problem.experiment.simulator] * (simulations + 1),
+        "target": [target.blinded.name] * (simulations + 1),
+        "seed": [order.seed] * (simulations + 1),
+        "range": [target.blinded.range] * (simulations + 1),
+        "trusted": [problem.experiment.trusted] * (simulations + 1),
+        "k": np.arange(simulations + 1),
         "loss": _prepend_nan(trace.losses),
     }
     columns |= _build_parameter_columns(problem, target, outcome)
@@ -102,7 +105,7 @@ def build_rows(
         )
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     # All runs of a comparison have the same columns, so that their rows form one table.
-    unknown_errors = np.full((k + 1, len(problem.channels)), np.nan)
+    unknown_errors = np.full((simulations + 1, len(problem.channels)), np.nan)
     heldout = unknown_errors if outcome.heldout_rmse is None else outcome.heldout_rmse
     columns["heldout_error"] = heldout[:, problem.error_channel]
     for channel_index, channel in enumerate(problem.channels):

@@ -184,6 +184,9 @@ def start_isolated_tuner(
 ) -> Iterator[IsolatedTuner]:
     """Start an isolated tuner for one run or one training, or reuse an idle one.
 
+    A process that failed, or that serves one run only, is ended afterwards; others wait for the
+    next run of the same tuner, seed, memory limit and weights.
+
     Args:
         tuned: specification of the tuner.
         seed: seed of the run.

@@ -253,6 +253,9 @@ def build_error_table(
 ) -> pd.DataFrame:
     """Build the table of a comparison in long form.
 
+    There is one row per tuner, range, number of simulations and error measure: median, mean and
+    interval over targets, counts of runs and failures, and training and tuning costs.
+
     Args:
         runs: rows of runs.parquet.
         statuses: rows of status.csv.
@@ -284,9 +287,12 @@ def build_error_table(
             values = _summarise_over_targets(
                 curve, tuner_rows, points, (str(tuner), str(kind), metric)
             )
-            for i, k in enumerate(points):
-                errors, times = values[:, i], (seconds[0][i], seconds[1][i])
-                key = (experiment, tuner, kind, k, metric)
+            for point_index, simulations in enumerate(points):
+                errors, times = (
+                    values[:, point_index],
+                    (seconds[0][point_index], seconds[1][point_index]),
+                )
+                key = (experiment, tuner, kind, simulations, metric)
                 lines.append((*key, *errors, *counts, *fit, *times))
     # A tuner that could not be used has a row too, so that the table names every tuner.
     skipped = statuses[statuses["status"] == "skipped"]

@@ -69,6 +69,8 @@ def select_declared_columns(
 def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
     """Convert a column of a Parquet file to text, int64, float64 or bool.
 
+    Integers are accepted where floats are declared, and empty cells of a float column become NaN.
+
     Args:
         column: Declaration of the column: type, range, allowed words, and empty cells.
         values: Its values.

@@ -48,6 +48,9 @@ def render_page(
 ) -> str:
     """Render the page as HTML.
 
+    The page has the numbers with their evidence, detection limits of absent effects, the drive
+    diagram and the MJCF class.
+
     Args:
         sheet: Content of the data sheet.
         diagram_files: Diagram as SVG, and as PDF if requested; None without a drive.

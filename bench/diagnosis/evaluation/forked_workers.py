@@ -376,6 +376,9 @@ def _run_worker(
 ) -> None:
     """Process the requests of the parent until the pipe ends; main loop of a worker.
 
+    A request has the index of a run evaluator, a task (a function) and its arguments. The answer
+    has the result or the error, and the number of simulations.
+
     Args:
         evaluators: objects that the worker inherits; a request names one by its index.
         pipe: connection to the parent.

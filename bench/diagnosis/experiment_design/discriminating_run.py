@@ -87,6 +87,10 @@ def propose_discriminating_run(
 ) -> DiscriminatingRun:
     """Propose a run or measurement that distinguishes a model from a competing model.
 
+    Present runs are changed in a few ways that an experimenter can make. Of these, the run within
+    the limits of the robot on which both models differ most is proposed, if they differ by at least
+    `MIN_DISCRIMINATION_SIGMAS`.
+
     Args:
         models: Collection that contains both models.
         model: Model of the present diagnosis.

@@ -143,6 +143,10 @@ class TrajectoryFitter:
     ) -> list[TrajectoryFit]:
         """Fit each model from its start.
 
+        All fits advance together in racing rounds of several Levenberg-Marquardt steps. Between
+        rounds, fits that have fallen far behind are ended, if racing. Groups of fits run in
+        parallel workers.
+
         Args:
             starts: starts of the fits; one or more.
             iterations: maximum number of steps of each fit.

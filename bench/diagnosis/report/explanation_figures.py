@@ -567,21 +567,31 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
 
 
 def _draw_signal(
-    signal_axis: Axes, residual_axis: Axes, report: DiagnosisReportData, view: RunView, c: int
+    signal_axis: Axes,
+    residual_axis: Axes,
+    report: DiagnosisReportData,
+    view: RunView,
+    channel_index: int,
 ) -> None:
     """Draw the measured and simulated signal of a channel, and the residual below it.
+
+    Long signals are thinned to their extremes. The residual has a band of two standard deviations
+    of the noise.
 
     Args:
         signal_axis: axes of the signal.
         residual_axis: axes of the residual, below it.
         report: content of the report.
         view: run to show: its part of the data, its index there, and the selected channels.
-        c: index of the channel.
+        channel_index: index of the channel.
     """
-    channel, split = report.channels[c], view.data_split
+    channel, split = report.channels[channel_index], view.data_split
     times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.
-    signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
+    signals = [
+        a[view.row, : len(times), channel_index]
+        for a in (split.observed, split.before, split.after)
+    ]
     shown_samples = thin_signal(signals[0], MAX_SAMPLES)
     shown_times = times[shown_samples]
     measured, before, after = (signal[shown_samples] for signal in signals)

@@ -273,6 +273,8 @@ def draw_profile_panel(
 ) -> None:
     """Draw the mean residual of a channel against a variable.
 
+    Bars are two standard errors of the mean to either side.
+
     Args:
         axis: Axes to draw on.
         profile: Residual in bins.

@@ -407,6 +407,8 @@ def _add_title_and_legend(
 ) -> None:
     """Add title, legend and margins to the figure of joints.
 
+    The legend has the curves of the motion and the band of the noise.
+
     Args:
         figure: figure of Matplotlib.
         axes: array of its axes: motion, then residuals of each quantity.

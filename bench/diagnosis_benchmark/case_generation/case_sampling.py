@@ -100,6 +100,9 @@ def draw_case(
 ) -> BenchmarkCase | None:
     """Draw a case.
 
+    The cause is drawn first, then recording conditions in which it can be observed, and finally its
+    size in units of the noise: log-uniform from 1 to 10, or from 3 for double and foreign causes.
+
     Args:
         kind: clean, single, double or foreign.
         system: ball, pendulum or slider.

@@ -388,6 +388,9 @@ def _prefer_model(
 ) -> dict[str, str]:
     """Exchange unnamed columns if the model then explains the motion far better.
 
+    The forces that the motion needs are compared with those that the actuators exert under the
+    recorded commands, for the possible orders of the columns.
+
     Args:
         logs: logs of all runs, with their time stamps and columns.
         signals: signals and their columns, exchanged in place.

@@ -296,6 +296,12 @@ class RunLogs:
     def _choose_clock(self, logs: Mapping[str, LogFile]) -> None:
         """Find the time stamps of all files, which have a common name and unit.
 
+        The name and unit that the files with the most recognised columns have are used for all
+        files; times count from the earliest first stamp.
+
+        Args:
+            logs: Logs of the first run by file.
+
         Raises:
             InputError: A file that the user named has other stamps or none, or no file has stamps.
         """

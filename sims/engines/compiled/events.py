@@ -166,6 +166,10 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
 def is_too_nonlinear(block: Block, i: int) -> bool:
     """Return whether forces are too nonlinear in the step just tried; set the next step size.
 
+    The measure is |k1 - k2 - k3 + k4| of the four Runge-Kutta accelerations, relative to the
+    largest acceleration, and likewise for friction. A rejected step is repeated with a shorter
+    length.
+
     Args:
         block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
@@ -371,6 +375,11 @@ def clip_to_non_positive(rate: float) -> float:
 def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
     """Compute the velocity after an impact, from restitution and friction with effects.
 
+    With restitution e, friction coefficient mu and normal speed v, the rebound speed is e v, and
+    the tangential speed decreases by mu (1 + e) v, but not below the share that the ground leaves.
+    A ball whose bounces are over comes to rest, and loses the tangential speed of all remaining
+    impacts at once.
+
     Args:
         block: force program, batch elements, and buffers of the slots.
         i: index of the slot, the column of the batch element.
@@ -390,16 +399,16 @@ def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
         r[rows[IN_MU], s] = block.ground[GROUND_FRICTION, element]
         r[rows[IN_SPEED], s] = speed
     run_instructions(block.code, block.ends[IMPACTS], block.ends[IMPACTS + 1], r, width)
-    e = r[rows[OUT_E], i]
-    mu = r[rows[OUT_MU], i]
-    rebound_speed = e * speed
-    lost_speed = mu * (1.0 + e) * speed
+    restitution = r[rows[OUT_E], i]
+    friction = r[rows[OUT_MU], i]
+    rebound_speed = restitution * speed
+    lost_speed = friction * (1.0 + restitution) * speed
     if is_bouncing_over(block, i, rebound_speed, -pull):
-        if e < 1.0:
-            lost_speed += mu * (1.0 + e) * rebound_speed / (1.0 - e)
+        if restitution < 1.0:
+            lost_speed += friction * (1.0 + restitution) * rebound_speed / (1.0 - restitution)
         rebound_speed = 0.0
         block.n[IS_RESTING, i] = 1
-    if mu > 0.0:
+    if friction > 0.0:
         square = 0.0
         for j in range(d - 1):
             square += a[V + j, i] * a[V + j, i]

@@ -346,6 +346,10 @@ def emit_instructions(
 ) -> InstructionList:
     """Return instructions that compute outputs from groups of inputs.
 
+    Registers are allocated in this order: inputs by group, constants, results. Instructions are
+    grouped by how often they must be repeated: once per element, per evaluation of forces, or per
+    impact.
+
     Args:
         groups: groups of input nodes; the registers of a group are consecutive.
         outputs: output nodes.

@@ -91,6 +91,9 @@ def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
     """Check that a written URDF loads as the model with all causes that a URDF can express.
 
+    Fields, inertia tensors and a test motion are compared; contacts and friction stiffness, which a
+    URDF cannot state, are left out.
+
     Args:
         robot: the robot as read from its URDF.
         causes: coefficients of all causes.
