@@ -325,7 +325,7 @@ _DIGITS = 7
 
 
 def render_page(results: ComparisonReportData) -> str:
-    """Render the page as HTML.
+    """Render the HTML page of a comparison of tuners.
 
     Tables and chart data are written into the page, from which its script draws the charts.
 

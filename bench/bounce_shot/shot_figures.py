@@ -61,7 +61,7 @@ def draw_figures(
     rows: pd.DataFrame,
     lines: pd.DataFrame,
 ) -> dict[str, FigureFiles]:
-    """Draw all figures.
+    """Draw the figures of the bounce-shot study.
 
     Args:
         experiment: experiment: simulator, tuners, targets and budget, from its TOML file.

@@ -198,7 +198,7 @@ class SuiteResult(NamedTuple):
         return all(_classify_line(line)[0] != "failed" for line in self.lines.values())
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document.
+        """Convert the results of the conformance checks to a JSON document.
 
         Each check has its title, its outcome (passed, failed, not tested, not applicable) and the
         line that was printed.

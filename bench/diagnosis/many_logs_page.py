@@ -89,7 +89,7 @@ def write_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> Path
 
 
 def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str:
-    """Render the page as HTML.
+    """Render the HTML summary page of explanations of many logs.
 
     The page has the verdicts and causes of all logs, each number of the causes over the logs, and
     the held-out errors.

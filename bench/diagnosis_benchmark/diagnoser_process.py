@@ -122,7 +122,7 @@ def diagnose_case(
     learned: Mapping[str, Array],
     diagnoser: Diagnoser | None = None,
 ) -> dict[str, Any]:
-    """Diagnose one case.
+    """Run a diagnoser on one benchmark case and read its verdict.
 
     The recording is written to files and read again, as a user would have it, and the diagnoser is
     called with counted simulations.

@@ -68,7 +68,7 @@ class Grade:
 
 
 def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
-    """Grade one answer.
+    """Grade the verdict of a diagnoser on one benchmark case.
 
     Args:
         case: the case with its true causes.

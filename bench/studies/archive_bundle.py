@@ -370,7 +370,7 @@ class BundleResult(NamedTuple):
     left_out: tuple[str, ...]
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert the result of writing an archive to a JSON document."""
         size = self.archive.stat().st_size
         return {**self._asdict(), "bytes": size, "sha256": compute_sha256(self.archive)}
 
@@ -553,7 +553,7 @@ class ArchiveVerification(NamedTuple):
         return has_no_doubts and not (self.explanation and self.explanation.doubts)
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert the result of verifying an archive to a JSON document."""
         comparisons = [comparison.to_document() for comparison in self.comparisons]
         explanation = self.explanation.to_document() if self.explanation else None
         archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}

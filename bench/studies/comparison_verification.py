@@ -73,7 +73,7 @@ class VerificationResult(NamedTuple):
         return not self.doubts
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert the result of verifying a comparison to a JSON document."""
         doubts = [doubt._asdict() for doubt in self.doubts]
         return {
             "folder": self.folder,

@@ -335,7 +335,7 @@ class ComparisonDiff:
         return notes
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document.
+        """Convert the differences between two comparisons to a JSON document.
 
         The document follows the schema ``diff``; `a` and `b` are the two comparisons.
         """

@@ -300,7 +300,7 @@ class ExplanationDiff:
         return notes
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document.
+        """Convert the differences between two explanations to a JSON document.
 
         The document follows the schema ``diff``; `a` and `b` are the two explanations.
         """

@@ -50,7 +50,7 @@ class ExplanationVerification(NamedTuple):
     doubts: list[VerificationFailure]
 
     def to_document(self) -> dict[str, Any]:
-        """Convert to a JSON document."""
+        """Convert the result of verifying an explanation to a JSON document."""
         doubts = [doubt._asdict() for doubt in self.doubts]
         return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
 

@@ -403,7 +403,7 @@ def render_multi_problem_page(
     pictures: Mapping[str, FigureFiles],
     command: Sequence[str],
 ) -> str:
-    """Render the page as HTML.
+    """Render the HTML page of a comparison on several problems.
 
     The page has the mean ranks with Friedman's and Nemenyi's tests, the runtime distribution over
     all problems, and error curves by problem.

@@ -235,7 +235,7 @@ td.failed { outline: 2px solid #c00000; outline-offset: -2px; }
 
 
 def render_suite_page(tables: SuiteTables) -> str:
-    """Render the page as HTML.
+    """Render the HTML page of a suite, which compares tuners on many problems.
 
     The page has the ranking of the tuners, significance tests, the guide by property of the
     problem, losses of this project's tuners, and all tables.

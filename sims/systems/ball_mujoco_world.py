@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """Return the world as MJCF.
+    """Return the MuJoCo model (MJCF) of the ball and the ground.
 
     The joints are x, y, z, with zero at the origin; the contact uses the parameters of the ball.
     """

@@ -23,7 +23,7 @@ _BODY_INERTIA = 1e-14
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """Return the world as MJCF."""
+    """Return the MuJoCo model (MJCF) of the pendulum."""
     mass = constants["mass"] * LENGTH_REDUCTION_FACTOR
     arm = constants["length"] / LENGTH_REDUCTION_FACTOR
     inertia = f"{_BODY_INERTIA} {_BODY_INERTIA} {_BODY_INERTIA}"

@@ -17,7 +17,7 @@ OPEN_LOOP = True
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001
-    """Return the world as MJCF.
+    """Return the MuJoCo model (MJCF) of the slider.
 
     The body hangs below the guide, because MuJoCo does not update the mass of a body at its joint's
     origin.

@@ -184,7 +184,7 @@ class MessageChannel:
                 raise PeerClosedError from None
 
     def receive(self, limit: int = MAX_TEXT_BYTES, deadline: float = float("inf")) -> Message:
-        """Receive the next message.
+        """Receive the next message from the process at the other end.
 
         Args:
             limit: maximum size of the body in bytes.

@@ -182,7 +182,7 @@ def _find_import_problem(package: str, load: Callable[[], Any]) -> str | None:
 
 
 def _format_info(information: JsonDocument) -> Iterator[str]:
-    """Format the information as text."""
+    """Format the information on versions and settings as lines of text."""
     revision = f" ({information['revision']})" if information["revision"] else ""
     python = f"{information['implementation']} {information['python']}"
     yield f"simgap {information['simgap']}{revision}, {python}"

@@ -46,7 +46,7 @@ _NAMED_RUNS = 8
 def render_page(
     sheet: SheetContent, diagram_files: tuple[bytes, bytes | None] | None, mjcf: MjcfFiles
 ) -> str:
-    """Render the page as HTML.
+    """Render the HTML datasheet of an explained simulator.
 
     The page has the numbers with their evidence, detection limits of absent effects, the drive
     diagram and the MJCF class.

@@ -396,7 +396,7 @@ class RunEvaluator:
         states: Array,
         share: float = 1.0,
     ) -> Array:
-        """Simulate a batch of runs.
+        """Simulate recorded runs with a batch of parameters.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 

@@ -353,7 +353,7 @@ class ScoreTest:
         return self._design.project_out(residuals)
 
     def compute_scores(self, residual: Array, surrogate: Array | None = None) -> CandidateScores:
-        """Score a residual.
+        """Score each candidate effect by how well its sensitivities explain a residual.
 
         Shapes: R runs, T samples, C channels.
 

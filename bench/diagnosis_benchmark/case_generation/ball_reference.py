@@ -56,7 +56,7 @@ class FlightDynamics:
         self.breaks = list(self.gust[2:]) if self.gust else []
 
     def compute_acceleration(self, t: float, y: Any, middle: float) -> Acceleration:
-        """Compute the acceleration.
+        """Compute the acceleration of a ball with a hidden cause.
 
         Args:
             t: time.

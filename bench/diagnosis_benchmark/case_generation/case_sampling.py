@@ -98,7 +98,7 @@ def draw_case(
     size: float | None = None,
     requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
-    """Draw a case.
+    """Draw the hidden cause, its size and the nuisances of a benchmark case.
 
     The cause is drawn first, then recording conditions in which it can be observed, and finally its
     size in units of the noise: log-uniform from 1 to 10, or from 3 for double and foreign causes.

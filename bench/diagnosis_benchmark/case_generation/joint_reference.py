@@ -472,7 +472,7 @@ def compute_region_indicator(x: float, centre: float, half: float) -> float:
 def simulate_joint(
     true_system: TrueSystem, scenario: Scenario, number: int, instants: Array
 ) -> Array:
-    """Simulate a run.
+    """Simulate one run of a joint with a hidden cause.
 
     Args:
         true_system: true system of a case: constants, parameters and hidden effects.

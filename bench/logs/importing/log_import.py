@@ -30,7 +30,7 @@ def describe_logs(
     folder: Path,
     options: ImportOptions | None = None,
 ) -> ImportResult:
-    """Describe logs of a robot.
+    """Find what the columns of a robot's logs contain, and describe the recording.
 
     Args:
         logs: Files of one run, folders with the files of one run each, or datasets of LeRobot.

@@ -91,7 +91,7 @@ class MujocoWorldModule(Protocol):
     """Module ``<system>_mujoco_world`` of a system."""
 
     def model(self, constants: Constants, /) -> str:
-        """Return the world as MJCF."""
+        """Return the MuJoCo model (MJCF) of the system."""
         ...
 
 

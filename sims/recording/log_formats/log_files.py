@@ -143,7 +143,7 @@ class LogFile:
 
 
 def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
-    """Read the columns of a log.
+    """Read the columns of a log file in any supported format.
 
     The path may name a file, a topic of a ROS bag, an episode of a LeRobot dataset, or a group in
     an HDF5 file. Logs are cached by path, size and modification time.

@@ -616,7 +616,7 @@ class _CellKind:
             self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
 
     def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
-        """Convert the cells to numbers.
+        """Convert the cells of one column of a text log to numbers.
 
         The first cell decides the kind: Boolean values, lists, dates or numbers. If more than half
         of the cells are no numbers, the column counts as text.
