@@ -250,7 +250,7 @@ class FollowedRuns:
         neighbours = (similar or self).linear
         motions: Sequence[Trajectory | None] = [None] * len(neighbours)
         first_states: Sequence[Array | None] = [None] * len(neighbours)
-        if self._is_on_ground:
+        if self.is_on_ground:
             first_states = list(self.get_first_states())
         else:
             motions = self.trajectories
@@ -268,7 +268,8 @@ class FollowedRuns:
         return self._filter_linear(self.evaluator, theta, *filter_arguments)
 
     @property
-    def _is_on_ground(self) -> bool:
+    def is_on_ground(self) -> bool:
+        """True if the pose of a robot that stands or drives is recorded."""
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
         return simulator.robot.is_on_ground
@@ -344,7 +345,7 @@ class FollowedRuns:
         # With another step size, the motion at the ends of the steps is not known.
         has_same_step = known is not None and known.step == evaluator.simulator.time_step
         motion = None
-        if known is not None and has_same_step and not known._is_on_ground:
+        if known is not None and has_same_step and not known.is_on_ground:
             motion = known.trajectories
         followed = evaluator.filtered_runs = cls.follow(evaluator, theta, noise, motion)
         return followed
@@ -617,7 +618,7 @@ class FollowedRuns:
         joints = len(self.linear[0].trajectory.x[0])
         if len(self.evaluator.state_names) != 2 * joints:
             return None
-        if self._is_on_ground:
+        if self.is_on_ground:
             return self._get_prior_of_measured_states()
         prior = self.runs.prior
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
@@ -638,7 +639,7 @@ class FollowedRuns:
         the first velocity from a linear model; for other joints they are smoothed states, and for
         robots on the ground these with settled contacts.
         """
-        if self._is_on_ground:
+        if self.is_on_ground:
             return self._settled_first_states
         first_states = []
         for run, trajectory in enumerate(self.trajectories):
@@ -665,19 +666,24 @@ class FollowedRuns:
         A contact that begins or ends makes the motion nonlinear. So each run begins at the share of
         the smoothed change whose simulation is closest to the readings.
         """
-        evaluator, simulator = self.evaluator, self.evaluator.simulator
-        assert isinstance(simulator, RobotSimulator)
-        deviations = _get_noise_of_states(evaluator, self.noise)
-        first_states = np.zeros((len(SMOOTHED_SHARES), *evaluator.initial_state_guesses.shape))
-        for run, linear in enumerate(self.linear):
-            first_step, change = int(linear.knots[0]), self.smoothed.states[run, 0]
-            x, v = linear.trajectory.x[first_step], linear.trajectory.v[first_step]
-            velocity_change = change[linear.positions : linear.positions + v.size]
-            scenario = evaluator.prepared_runs[run].scenario
-            for i, share in enumerate(SMOOTHED_SHARES):
-                start = x + share * change[: x.size], v + share * velocity_change
-                settled = settle_contacts(simulator, self.theta, scenario, start, deviations)
-                first_states[i, run] = np.concatenate(settled)
+        evaluator = self.evaluator
+        changes = []
+        for linear, change in zip(self.linear, self.smoothed.states[:, 0], strict=True):
+            joints = linear.trajectory.x.shape[1]
+            velocities = slice(linear.positions, linear.positions + joints)
+            changes.append(np.concatenate([change[:joints], change[velocities]]))
+        simulated_starts = np.array(
+            [
+                np.concatenate([linear.trajectory.x[0], linear.trajectory.v[0]])
+                for linear in self.linear
+            ]
+        )
+        first_states = np.array(
+            [
+                self.settle(self.theta, simulated_starts + share * np.array(changes))
+                for share in SMOOTHED_SHARES
+            ]
+        )
         count, runs, size = first_states.shape
         simulated = evaluator.simulate(
             np.tile(self.theta, (count * runs, 1)),
@@ -690,6 +696,23 @@ class FollowedRuns:
         squares[~np.isfinite(simulated).any(axis=(2, 3))] = np.inf
         best: Array = first_states[np.argmin(squares, axis=0), np.arange(runs)]
         return best
+
+    def settle(self, theta: Array, states: Array) -> Array:
+        """Return first states (R, 2 D) near given ones at which the contacts are in equilibrium.
+
+        Args:
+            theta: (P,) parameters of the model.
+            states: (R, 2 D) positions and velocities.
+        """
+        simulator = self.evaluator.simulator
+        assert isinstance(simulator, RobotSimulator)
+        deviations = _get_noise_of_states(self.evaluator, self.noise)
+        settled = []
+        for run_data, state in zip(self.evaluator.prepared_runs, states, strict=True):
+            x, v = np.split(state, 2)
+            start = settle_contacts(simulator, theta, run_data.scenario, (x, v), deviations)
+            settled.append(np.concatenate(start))
+        return np.array(settled)
 
     def _propagate_through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None

@@ -46,6 +46,8 @@ EffectWithCoefficients = tuple[Effect, Array]
 """An effect with its coefficients (k,)."""
 FORCE_EVALUATED_EFFECTS = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb"})
 """Model-field effects whose force the effect library computes as well, so that it is used here."""
+GEOMETRY_DIFFERENCE_SHARE = 1e-4
+"""Share of a change of a geom's size that is used as a finite difference."""
 SPRING_EFFECTS = frozenset({"spring.linear", "spring.cubic"})
 """Model-field effects whose force the library computes if the joint's spring rests at zero."""
 
@@ -351,11 +353,14 @@ class RunLinearisation:
             return self._tangent.perturb_by_force(owner, effect, c)
         key = effect.name, c.tobytes()
         if key not in self._perturbation_cache:
-            acting = (*self._work.acting, (effect, c))
+            # A larger geom would be pressed into another one, or a smaller one lose its contact.
+            is_geometry = "geom_size" in MODEL_FIELD_EFFECTS[name].fields
+            share = GEOMETRY_DIFFERENCE_SHARE if is_geometry else 1.0
+            acting = (*self._work.acting, (effect, share * c))
             with capture_mujoco_warnings():
                 mujoco_batch = self._simulator.make_linearisation_batch(acting)
                 self._perturbation_cache[key] = self._tangent.perturb_model_numbers(
-                    0, acting, 1.0, mujoco_batch
+                    0, acting, share, mujoco_batch
                 )
         return [self._perturbation_cache[key]._replace(owner=owner)]
 

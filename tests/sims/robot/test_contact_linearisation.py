@@ -53,3 +53,19 @@ def test_the_reaction_of_the_floor_is_part_of_a_response(
     wanted = changed - without
     assert np.abs(wanted).max() > 1e-9
     np.testing.assert_allclose(responses[0], wanted, atol=0.05 * np.abs(wanted).max())
+
+
+def test_the_response_to_a_radius_does_not_depend_on_its_size(tmp_path: Path) -> None:
+    """A wheel that is larger by 2 % would be pressed 2 mm into the floor.
+
+    The response of 2 % is 2,000 times that of a simulated radius that is larger by 0.001 %.
+    """
+    (tmp_path / "roller.xml").write_text(ROLLER)
+    kind = make_robot_simulator(read_robot(tmp_path / "roller.xml")).with_contacts(("floor/rim",))
+    simulator = kind(observe=["q.x", "q.z", "q.spin"], effects=["geom.radius@rim"])
+    scenario = Scenario(TIMES, {"q.z": START[0][1]}, {"u.drive": 3.0 * np.sin(8.0 * TIMES)})
+    linear = RunLinearisation(simulator, np.zeros(1), scenario, *START)
+    responses, _ = linear.compute_effect_responses([(simulator.effects[0], np.array([0.02]))])
+    without, changed = simulator.simulate(np.array([[0.0], [1e-5]]), scenario)
+    wanted = 2000.0 * (changed - without)
+    np.testing.assert_allclose(responses[0], wanted, atol=0.05 * np.abs(wanted).max())
