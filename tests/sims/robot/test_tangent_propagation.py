@@ -7,7 +7,11 @@ from sims import effects as library
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.applied_inputs import compute_step_inputs
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
-from sims.robot.dynamics.tangent_propagation import compute_runge_kutta_step
+from sims.robot.dynamics.tangent_propagation import (
+    DifferenceQuotients,
+    compute_runge_kutta_step,
+    replace_diverging_points,
+)
 from sims.robot.integrator_settings import IntegratorSettings
 from tests.sims.robot.test_robot_motion import kind_of
 
@@ -213,3 +217,19 @@ def test_a_runge_kutta_step_of_a_linear_joint_has_these_derivatives():
     np.testing.assert_allclose(states[0, :, 1], step(0.0, 1.0, 0.0), rtol=1e-13)
     np.testing.assert_allclose(forces[0, :, 0], step(0.0, 0.0, 1.0), rtol=1e-13)
     assert controls.shape == (1, 2, 0)
+
+
+def test_points_whose_difference_straddles_a_jump_get_the_quotients_of_the_nearest_other_point():
+    step = np.array([[1.0, 0.002], [-0.5, 0.98]])
+    states = np.array([step + 0.01 * point for point in range(6)])
+    # A stiff contact has large derivatives too, but a step does not multiply deviations.
+    states[4] = [[1.0, 0.002], [-400.0, 0.1]]
+    states[2] = [[1.0, 0.002], [5890.0, 588.0]]
+    states[5, 0, 0] = np.nan
+    others = [np.arange(6.0).reshape(6, 1, 1) for _ in range(5)]
+    replaced = replace_diverging_points(DifferenceQuotients(states, *others))
+    np.testing.assert_array_equal(replaced.states, states[[0, 1, 1, 3, 4, 4]])
+    for values in replaced[1:]:
+        np.testing.assert_array_equal(values.ravel(), [0, 1, 1, 3, 4, 4])
+    kept = DifferenceQuotients(states[[0, 1, 3]], *(values[:3] for values in others))
+    assert replace_diverging_points(kept) is kept
