@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
+from bench.diagnosis.explain import explain
 from sims.core.toml_validation import tomllib
 from tests.exams.exam import UndrawableError
 from tests.exams.planted.model_cases import MIN_GAP, ModelExperiment, ModelQuestion, questions
@@ -106,3 +107,12 @@ def test_a_large_armature_and_the_inertia_of_its_body_are_equals(tmp_path):
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
     (cause,) = verdict["causes"]
     assert {cause["effect"], *cause["alternatives"]} == {case.change.effect, "inertia.scale@RR_hip"}
+
+
+@pytest.mark.slow(seconds=14)
+def test_wheels_that_roll_as_the_file_says_raise_no_alarm(tmp_path):
+    """The noise of the recorded pose is larger than the depth of the contacts, 0.15 mm."""
+    case = drawn("differential-drive", -1)
+    answer = explain(case.write(tmp_path)).answer
+    assert answer.verdict == "adequate"
+    assert not answer.causes
