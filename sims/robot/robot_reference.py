@@ -20,7 +20,7 @@ from sims.core.toml_validation import (
     check_text,
     make_error,
 )
-from sims.robot.robot_model import FRICTION_FORMS, FrictionForm
+from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
 
 if TYPE_CHECKING:
     from sims.robot.robot_simulator import RobotSimulator

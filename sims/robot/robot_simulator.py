@@ -67,6 +67,7 @@ from sims.robot.dynamics.mujoco_batch import (
 from sims.robot.dynamics.sensor_sampling import DriveSensorModel, sample_readings
 from sims.robot.dynamics.series_joints import AddedElements, group_by_added_elements
 from sims.robot.floating_joints import FloatingJoints, FloatingState
+from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (
     INTEGRATOR_IDS,
     IntegratorSettings,
@@ -74,7 +75,7 @@ from sims.robot.integrator_settings import (
     read_integrator_settings,
 )
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.robot_model import FrictionForm, RobotModel
+from sims.robot.robot_model import RobotModel
 from sims.robot.robot_system import RobotSystem, make_robot_system
 from sims.system_simulator import SystemSimulator
 
