@@ -183,7 +183,7 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     hang_shorter = {**os.environ, "PYTHONPATH": os.getcwd()}
     code = (
         "import sys, bench.benchmark.runner.worker_pools, bench.cli.main; "
-        "bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS = -12.0\n"
+        "bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS = -8.0\n"
         "if __name__ == '__main__':\n    sys.exit(bench.cli.main.main(sys.argv[1:]))\n"
     )
     (tmp_path / "go.py").write_text(code)
