@@ -40,7 +40,6 @@ from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.friction_form_verdict import make_soft_kind
 from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
@@ -598,24 +597,6 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
     """
     sigma = compute_noise_floor(evaluator, recording).sigma
     return NoiseModel(sigma, np.zeros(len(sigma)))
-
-
-def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
-    """Return the model file's numbers as a fit, the starting point of candidate directions.
-
-    Args:
-        evaluator: Run evaluator of the recording; it has the nominal parameters.
-    """
-    empty = np.zeros(0)
-    return TrajectoryFit(
-        (),
-        evaluator.get_nominal_theta(),
-        evaluator.initial_state_guesses,
-        np.zeros(0, np.intp),
-        empty,
-        empty,
-        0.0,
-    )
 
 
 def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) -> FollowedRuns:
