@@ -1,10 +1,12 @@
-"""Tests of properties common to all search methods."""
+"""Tests of properties common to all search methods that no conformance check of a tuner covers.
+
+`tests/conformance/test_registered.py` applies these checks to every registered tuner.
+"""
 
 import numpy as np
 import pytest
 
-from bench.benchmark.runner.tuner_loop import drive_tuner
-from methods.tuner import Array, Evaluation, Proposal, Tuner
+from methods.tuner import Array, Tuner
 from methods.tuners.bayesian_optimisation import BayesianOptimisation
 from methods.tuners.cma_es import CMAES
 from methods.tuners.entropy_search import EntropySearch
@@ -36,54 +38,9 @@ def beyond(true_parameters: Array) -> Array:
 
 
 @each
-def test_budget_is_exact(tuner: Tuner) -> None:
-    for dim in (1, 3):
-        for budget in range(1, 8):
-            trace = run(
-                tuner,
-                *problem(
-                    decays,
-                    TRUE_PARAMETERS[:dim],
-                    START[:dim],
-                    budget,
-                    beyond(TRUE_PARAMETERS[:dim]),
-                ),
-            )
-            assert len(trace.losses) == budget
-
-
-@each
 def test_starts_at_the_start(tuner: Tuner) -> None:
     for dim in (1, 2, 5):
         assert (run(tuner, *smooth(dim, 1)).proposals[0] == START[:dim]).all()
-
-
-@each
-@pytest.mark.parametrize("dim", [1, 2, 10])
-def test_proposals_lie_in_the_cube_before_the_harness_moves_them(tuner: Tuner, dim: int) -> None:
-    rng = np.random.default_rng(5)
-    truth, start = rng.uniform(size=dim), rng.integers(2, size=dim).astype(float)
-    task, evaluate = problem(decays, truth, start, 24, beyond(truth))
-    steps = tuner.tune(task, np.random.default_rng(0))
-    asked, used = next(steps), 0
-    while used < 24:
-        points = np.atleast_2d(asked.points if isinstance(asked, Proposal) else asked)
-        assert points.shape[1] == dim
-        assert points.min() >= 0.0
-        assert points.max() <= 1.0
-        used += len(points)
-        asked = steps.send(Evaluation(points, *evaluate(points)))
-    steps.close()
-
-
-@each
-def test_same_seed_same_run_whatever_ran_before(tuner: Tuner) -> None:
-    task, evaluate = smooth(2, 14)
-    first = run(tuner, task, evaluate, seed=3)
-    run(tuner, task, evaluate, seed=4)
-    again = run(tuner, task, evaluate, seed=3)
-    assert (first.proposals == again.proposals).all()
-    assert (first.recommendations == again.recommendations).all()
 
 
 @each
@@ -97,26 +54,6 @@ def test_another_seed_is_another_run_where_the_tuner_says_so(tuner: Tuner) -> No
 
 
 @each
-def test_global_random_state_is_neither_changed_nor_used(tuner: Tuner) -> None:
-    task, evaluate = smooth(2, 14)
-    np.random.seed(1)  # noqa: NPY002 - the global state is what is tested
-    before = np.random.get_state()  # noqa: NPY002
-    first = run(tuner, task, evaluate)
-    after = np.random.get_state()  # noqa: NPY002
-    assert (before[1] == after[1]).all()
-    assert before[2:] == after[2:]
-    np.random.seed(2)  # noqa: NPY002
-    assert (run(tuner, task, evaluate).proposals == first.proposals).all()
-
-
-@each
-def test_options_are_all_that_a_tuner_keeps(tuner: Tuner) -> None:
-    before = dict(vars(tuner))
-    run(tuner, *smooth(2, 12))
-    assert vars(tuner) == before
-
-
-@each
 def test_failed_simulations_are_survived(tuner: Tuner) -> None:
     def fails_above(theta: Array) -> Array:
         return decays(theta) if theta[0] < 0.5 else np.full((30, len(theta)), np.nan)
@@ -125,20 +62,6 @@ def test_failed_simulations_are_survived(tuner: Tuner) -> None:
     trace = run(tuner, task, evaluate)
     assert np.isnan(trace.losses).any()
     assert np.nanmin(trace.losses) < 0.1 * np.sqrt((task.observed**2).mean())
-
-
-@each
-def test_nothing_but_failed_simulations_is_survived(tuner: Tuner) -> None:
-    task, evaluate = problem(
-        lambda theta: np.full((30, 2), np.nan),
-        TRUE_PARAMETERS[:2],
-        START[:2],
-        30,
-        decays(TRUE_PARAMETERS[:2]),
-    )
-    trace = drive_tuner(tuner, task, evaluate, np.random.default_rng(0))
-    assert trace.status == "diverged", trace.reason
-    assert (trace.recommendations == START[:2]).all()
 
 
 @each

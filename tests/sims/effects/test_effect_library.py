@@ -21,7 +21,6 @@ from sims.core.effect import (
     Input,
     Level,
     Sensor,
-    Signal,
 )
 from sims.core.simulator import InputError
 from sims.core.system import SYSTEM_KINDS
@@ -178,46 +177,6 @@ def test_what_fits_what():
 def test_what_does_not_fit_says_why(name, system, reason):
     with pytest.raises(InputError, match=f"{system} cannot have effect {name}: .*{reason}"):
         SIMULATORS[system](engine="batch", effects=[name])
-
-
-@pytest.mark.parametrize("count", [1, 5])
-@pytest.mark.parametrize(("name", "system"), PAIRS)
-def test_zero_gives_nothing_and_shapes_are_those_of_the_elements(name, system, count):
-    effect = effects.get_effect(name)()
-    rng = np.random.default_rng(7)
-    size = len(SYSTEMS[system].coordinates)
-    now = moment(
-        system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3
-    )
-    off = batch_coefficients(*[0.0] * len(effect.coefficients), count=count)
-    on = batch_coefficients(*[0.1] * len(effect.coefficients), count=count)
-    signal = Signal(
-        rng.normal(size=(count, 6)),
-        np.full((count, 6), 0.01),
-        np.zeros((count, 1)),
-        np.ones((count, 6)),
-    )
-    if isinstance(effect, Force):
-        assert not effect.force(off, now).any()
-        assert effect.force(on, now).shape == (count, size)
-    elif isinstance(effect, Friction):
-        assert not effect.limit(off, now).any()
-        assert effect.limit(on, now).shape == (count, 1)
-    elif isinstance(effect, Contact):
-        assert not effect.friction(off).any()
-        e, speed = np.full((count, 1), 0.7), np.full((count, 1), 3.0)
-        assert np.array_equal(effect.restitution(off, e, speed), e)
-        assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
-    elif isinstance(effect, HiddenStateEffect):  # engines do not evaluate it where it is off
-        state = effect.begin(on, now)
-        force, rate = effect.act(on, now, state)
-        assert force.shape == (count, size)
-        assert {a.shape for a in (rate, state.x, state.v, effect.behind(on))} == {(count, 1)}
-    else:
-        change = effect.feel if isinstance(effect, Input) else effect.read
-        assert np.array_equal(change(off, signal), signal.values)
-        assert np.array_equal(effect.times(off, signal.times), signal.times)
-        assert change(on, signal).shape == effect.times(on, signal.times).shape == (count, 6)
 
 
 @pytest.mark.parametrize(("name", "system"), PAIRS)
