@@ -8,6 +8,8 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from bench.benchmark.runner.worker_pools import limit_to_one_thread
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.search_control import STAGES
@@ -20,7 +22,7 @@ from bench.diagnosis.numerics_cause import (
     list_option_causes,
     list_step_causes,
 )
-from bench.diagnosis.pipeline.base_model import BaseModel, filter_and_fit
+from bench.diagnosis.pipeline.base_model import SEGMENT_DURATIONS, BaseModel, filter_and_fit
 from bench.diagnosis.pipeline.cause_search import CauseSearch
 from bench.diagnosis.pipeline.extended_model import build_extended_simulator
 from bench.diagnosis.pipeline.left_out_segments import leave_out_jumps
@@ -38,12 +40,17 @@ from bench.diagnosis.pipeline.verdict_builder import build_verdict
 from bench.diagnosis.verdict import Cause
 from sims.core.simulator import InputError
 
-RETRIED_SEGMENTS = (1.0, 0.5, 0.25)
-"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
-
 
 class DivergingSimulationError(InputError):
-    """Error if no simulation follows the runs, at any starting point of the base fit."""
+    """Error if no simulation follows the runs, at any starting point of the base fit.
+
+    Attributes:
+        longest_segment: maximum duration in seconds of segments that a simulation may follow.
+    """
+
+    def __init__(self, message: str, longest_segment: float = np.inf) -> None:
+        super().__init__(message)
+        self.longest_segment = longest_segment
 
 
 class ExplanationAndDesign(NamedTuple):
@@ -112,7 +119,8 @@ def _diagnose(
 
     The motion of a robot that balances or flies is unstable without its controller. A simulation
     with the recorded commands and a wrong model leaves it within a second, but not within a short
-    segment whose initial state is estimated. The simulators are open within the `with` block.
+    segment whose initial state is estimated. Neither does a chaotic motion. The simulators are open
+    within the `with` block.
 
     Args:
         recording: See `explain`.
@@ -122,7 +130,7 @@ def _diagnose(
         DivergingSimulationError: The simulation fails in the shortest segments, too.
     """
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
-    started, attempt, retried = time.perf_counter(), options, list(RETRIED_SEGMENTS)
+    started, attempt, retried = time.perf_counter(), options, list(SEGMENT_DURATIONS)
     while True:
         with (
             closing(ForkedWorkerPool(options.jobs or 1)) as worker_pool,
@@ -132,9 +140,10 @@ def _diagnose(
             may_divide = runs.contacts.is_divisible and options.pieces is None and bool(retried)
             try:
                 diagnosis = _diagnose_runs(runs, may_divide)
-            except DivergingSimulationError:
+            except DivergingSimulationError as error:
                 if not may_divide:
                     raise
+                retried = [s for s in retried if s <= error.longest_segment] or retried[-1:]
             else:
                 yield diagnosis
                 return
@@ -172,6 +181,12 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             return model
         if not runs.kind.has_model:
             return model.widen_ranges()
+        segment_duration = model.find_segment_duration() if may_divide else None
+        if segment_duration is not None:
+            raise DivergingSimulationError(
+                f"{runs.recording.path}: the simulation amplifies errors of the first state",
+                segment_duration,
+            )
         model = option_choice.choose(model)
         if option_choice.finding is None and model.shows_step_errors():
             model = step_choice.choose(model)

@@ -551,6 +551,28 @@ class FollowedRuns:
         result[..., : joint_states.size] = self._propagate_without_gain(initial_changes)
         return result
 
+    def compute_amplification(self, seconds: float = np.inf) -> float:
+        """Return the factor by which simulated runs amplify an error of their first positions.
+
+        It is the largest change of a reading in any segment, in units of its noise, if the segment
+        begins with an error of one position by the noise of its readings. A stable motion has about
+        1; a chaotic or unstable one grows exponentially with the duration (Lyapunov exponent).
+
+        Args:
+            seconds: duration of the segments; whole runs by default.
+        """
+        samples = self.runs.residuals.shape[1]
+        interval = self.evaluator.runs[0].times[1] - self.evaluator.runs[0].times[0]
+        length = int(min(max(seconds / interval, 1.0) + 1, samples))
+        segments = self if length == samples else replace(self, runs=self.runs.segments(length))
+        joints = len(self.linear[0].trajectory.x[0])
+        errors = np.zeros((len(segments.runs.residuals), self.runs.prior.size, joints))
+        errors[:, np.arange(joints), np.arange(joints)] = _get_noise_of_states(
+            self.evaluator, self.noise
+        )[0]
+        changes = segments._propagate_without_gain(errors) / self.noise.sigma[:, None]
+        return float(np.abs(changes).max())
+
     def sensitivities(self, columns: Columns) -> Array:
         """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
 

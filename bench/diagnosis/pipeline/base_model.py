@@ -28,6 +28,14 @@ MAX_ROTATION_ERROR = 0.5
 
 Beyond it, the effects of small changes are not linear.
 """
+SEGMENT_DURATIONS = (1.0, 0.5, 0.25)
+"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
+MAX_RUN_AMPLIFICATION = 1000.0
+"""Maximum factor by which whole runs may amplify an error of their first positions."""
+MAX_SEGMENT_AMPLIFICATION = 100.0
+"""Maximum factor by which segments may amplify an error of their first positions."""
+MIN_UNFOLLOWED_RESIDUAL = 3.0
+"""Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +142,25 @@ class BaseModel:
         The step is chosen before, because the correction hides the discretisation error.
         """
         return self.widen_ranges().freeze_unidentified().correct_step_errors()
+
+    def find_segment_duration(self) -> float | None:
+        """Return the duration in seconds of segments that a simulation can follow.
+
+        An unstable or chaotic motion amplifies the error of an estimated first state, until no
+        simulation follows it. It is None if the base model follows whole runs, or if they amplify
+        errors little.
+        """
+        followed = self.runs.fitting.filtered_runs
+        if followed is None or not self.is_usable:
+            return None
+        if self.rate()[1] < MIN_UNFOLLOWED_RESIDUAL:
+            return None
+        if not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
+            return None
+        for seconds in SEGMENT_DURATIONS:
+            if followed.compute_amplification(seconds) <= MAX_SEGMENT_AMPLIFICATION:
+                return seconds
+        return SEGMENT_DURATIONS[-1]
 
     def loses_orientation(self) -> bool:
         """Return whether the simulated orientation of a recorded floating body is far from it."""

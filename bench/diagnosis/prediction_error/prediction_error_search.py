@@ -73,8 +73,10 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
     fit_quick_selection,
     fit_selection,
+    is_at_noise,
     is_explained,
     is_nearly_explained,
+    refit_first_states,
     remove_idle_effects,
     select_lowest_of_each,
     select_more_likely,
@@ -264,6 +266,12 @@ class PredictionErrorSearch(EffectSearch):
         if self._should_continue(best):
             best = select_more_likely(best, select_in_model(context))
         return best
+
+    def refit_first_states(self, model: FittedModel) -> FittedModel:
+        """Refit the first states of a model that leaves more than noise; see `simulated_fits`."""
+        if not np.isfinite(model.fit.cost) or is_at_noise(self._search_context, model):
+            return model
+        return refit_first_states(self._search_context, model)
 
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""

@@ -87,7 +87,7 @@ class Confirmation(Inquiry):
             self._model = search.fit_competing_models(self._model)
             self._evaluate_on_held_out_runs()
         search_control.begin_question("structure")
-        self._model = search.fit_to_convergence(self._model)
+        self._model = search.fit_to_convergence(search.refit_first_states(self._model))
         lack_of_fit = assess_lack_of_fit(search, self._model)
         search_control.begin_question("alternatives")
         found, trial = self._model, self._trial
