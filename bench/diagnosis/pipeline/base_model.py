@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.diagnosis.fitting.base_fit import (
+    FINAL_ITERATIONS,
     BaseFit,
     correct_discretisation,
     find_start_with_tuner,
     fit_base_model,
     fit_wider,
 )
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array
 from sims.recording.recorded_poses import ANGLES
 
@@ -34,6 +37,8 @@ MAX_RUN_AMPLIFICATION = 1000.0
 """Maximum factor by which whole runs may amplify an error of their first positions."""
 MAX_SEGMENT_AMPLIFICATION = 100.0
 """Maximum factor by which segments may amplify an error of their first positions."""
+MIN_REFITTED_RESIDUAL = 1.1
+"""Minimum RMS residual, in units of the noise, at which first states are fitted again."""
 MIN_UNFOLLOWED_RESIDUAL = 3.0
 """Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""
 
@@ -143,6 +148,23 @@ class BaseModel:
         """
         return self.widen_ranges().freeze_unidentified().correct_step_errors()
 
+    def refit_first_states(self) -> BaseModel:
+        """Fit the first states again if the filter follows the runs and the simulation does not.
+
+        A fit to whole runs from the readings may end in a local minimum.
+        """
+        runs, followed = self.runs, self.runs.fitting.filtered_runs
+        if followed is None or followed.has_missing_force or not self.is_usable:
+            return self
+        if self.rate()[1] < MIN_REFITTED_RESIDUAL:
+            return self
+        start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
+        if start is None:
+            return self
+        fitter = TrajectoryFitter(runs.fitting, runs.noise, self.fit.fixed_parameters)
+        (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
+        return replace(self, fit=replace(self.fit, fit=fit))
+
     def find_segment_duration(self) -> float | None:
         """Return the duration in seconds of segments that a simulation can follow.
 
@@ -179,7 +201,8 @@ def filter_and_fit(runs: SimulatedRuns) -> BaseModel:
     """Fit the base model; the runs of a robot are filtered before."""
     if runs.kind.has_model:
         filter_runs(runs)
-    return BaseModel(runs, fit_base_model(runs.fitting, runs.noise, _get_starts(runs)))
+    model = BaseModel(runs, fit_base_model(runs.fitting, runs.noise, _get_starts(runs)))
+    return model.refit_first_states()
 
 
 def _get_starts(runs: SimulatedRuns) -> Array | None:

@@ -25,7 +25,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-from bench.diagnosis.validation.held_out_runs import HeldOutRuns
+from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
@@ -45,8 +45,6 @@ MAX_SURPLUS = 2
 """Maximum number of consecutive effects with too little gain before a selection is cut."""
 MAX_SLOW_EFFECTS = 2
 """Maximum number of effects in a set that is fitted by simulation although this is slow."""
-MIN_COST_DECREASE = 10.0
-"""Minimum decrease of the cost by which other first states of a fitted model count as better."""
 MIN_FURTHER_GAIN_SHARE = 0.01
 """Minimum gain of a further effect, as a share of the gain of the set.
 
@@ -100,17 +98,8 @@ def refit_first_states(context: SearchContext, model: FittedModel) -> FittedMode
     Returns:
         The refitted model, or `model` if it is as good.
     """
-    evaluator, search = context.evaluator, context.search
-    derivatives_before = evaluator.state_derivatives
-    runs = HeldOutRuns(evaluator, search.noise)
-    (prediction,) = runs.fit_initial_states([model.fit.theta])
-    squares = np.square((evaluator.observed - prediction.simulated) / search.noise.sigma)
-    cost = float(squares[search.observed_mask].sum())
-    if cost < model.fit.cost - MIN_COST_DECREASE:
-        start = replace(model.fit.make_start(), initial_states=prediction.states)
-        model = select_more_likely(model, search.fit_one(start))
-    evaluator.state_derivatives = derivatives_before
-    return model
+    start = find_first_states(context.evaluator, context.search.noise, model.fit)
+    return model if start is None else select_more_likely(model, context.search.fit_one(start))
 
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:

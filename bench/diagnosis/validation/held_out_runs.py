@@ -275,6 +275,29 @@ class HeldOutRuns:
         return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free_state_count)
 
 
+def find_first_states(
+    evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
+) -> FitStart | None:
+    """Return a start with better first states of fitted runs, None if there are none.
+
+    They are fitted to ever longer parts of the runs, as those of held-out runs, with the parameters
+    of the fit.
+
+    Args:
+        evaluator: the fitted runs.
+        noise: noise that weights the channels.
+        fit: fit of these runs.
+    """
+    derivatives_before = evaluator.state_derivatives
+    runs = HeldOutRuns(evaluator, noise)
+    (prediction,) = runs.fit_initial_states([fit.theta])
+    squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
+    evaluator.state_derivatives = derivatives_before
+    if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
+        return None
+    return replace(fit.make_start(), initial_states=prediction.states)
+
+
 def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:
     """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
 
