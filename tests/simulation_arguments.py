@@ -1,6 +1,6 @@
 """Build specifications of simulated recordings from command-line texts, and write them."""
 
-from bench.cli.key_value_args import build_simulation_spec_args
+from bench.cli.commands.simulate import build_simulation_spec_args
 from bench.logs import synthetic_recording
 
 

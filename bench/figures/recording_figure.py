@@ -19,7 +19,7 @@ from bench.figures.style import (
     make_panel_grid,
 )
 from bench.logs.ball_heights import BallHeights
-from bench.logs.signal_statistics import list_recorded_signals
+from bench.logs.recording_summary import list_recorded_signals
 from sims.core.plain_values import format_unit
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run

@@ -79,7 +79,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     """
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
-    from bench.logs import recording_summary, signal_statistics
+    from bench.logs import recording_summary
     from bench.logs.quality.clock_checks import find_anomalies, find_log_anomalies
     from bench.logs.quality.log_quality import check_log_quality
     from bench.logs.quality.pose_check import find_missing_base_poses
@@ -127,7 +127,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         print_line(str(path))
     numbers = _print_identifiability(options, print_line) if options.check else None
     document = {
-        **signal_statistics.to_document(recording, kind),
+        **recording_summary.to_document(recording, kind),
         "robot": robot_lines,
         "odd": warnings_to_print,
         "findings": [finding._asdict() for finding in findings],
