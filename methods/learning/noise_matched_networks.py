@@ -1,16 +1,17 @@
-"""Networks for several noise levels, chosen by the noise of the target."""
+"""Networks for several noise levels, chosen by the noise of the target, and their tuners."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from functools import partial
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig
-from methods.learning.training_data import TrainingData
-from methods.tuner import Array, Task
+from methods.learning.training_data import TrainingData, generate_training_data
+from methods.tuner import Array, Task, TrainingSimulator, Tuner
 
 _MAX_PARTS = 8
 """Maximum number of parts of a run for the noise estimate."""
@@ -228,3 +229,176 @@ def check_shapes(
                 f"found {arrays[name].shape}"
             )
     return {name: arrays[name] for name in expected}
+
+
+@dataclass(frozen=True)
+class TrainingMonitor:
+    """Monitor of the training of one network.
+
+    Attributes:
+        held_out: simulations that are used for evaluation only.
+        epoch: called after each epoch with its number from 1, the number of epochs, training loss
+            and held-out loss.
+    """
+
+    held_out: TrainingData
+    epoch: Callable[[int, int, float, float], None]
+
+
+_UNIT_RANGE = np.array([[0.0], [1.0]])
+"""Corners of the unit cube, a training range in any number of dimensions."""
+
+
+class NoiseMatchedTuner(Tuner, Generic[Learner]):
+    """Base class of tuners with a network for each noise level: training, state, configuration.
+
+    Subclasses define the training of a network, its arrays and the tuning loop. The attributes are
+    options of those subclasses that do not define `make_feature_config` themselves; see
+    `methods.tuners.tunenet.TuneNet`.
+    """
+
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    stochastic: ClassVar[bool] = False
+    learned: ClassVar[bool] = True
+
+    points: int
+    inputs: int
+    strictness: float
+    noise: float
+    told: bool
+    channels: tuple[int, int] | None
+    clean: bool
+
+    _fitted: NoiseMatchedNetworks[Learner] | None = None
+
+    def make_feature_config(self) -> FeatureConfig:
+        """Return the configuration of the inputs."""
+        return FeatureConfig(
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            use_scenario_features=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
+
+    def choose_training_layout(self, dim: int) -> tuple[int, int]:
+        """Return the maximum number of training scenarios, and of simulations in each."""
+        raise NotImplementedError
+
+    def draw_points(
+        self, simulator: TrainingSimulator, rng: np.random.Generator, count: int
+    ) -> Array:
+        """Draw the points (count, dim) of a training scenario, uniformly by default."""
+        return simulator.sample(rng, count)
+
+    def train_network(
+        self,
+        data: TrainingData,
+        rng: np.random.Generator,
+        training_range: Array,
+        monitor: TrainingMonitor | None,
+    ) -> Learner:
+        """Train the network for one noise level.
+
+        Args:
+            data: simulations to train on, with noise.
+            rng: random generator.
+            training_range: (2, dim) corners of the training range.
+            monitor: monitor of the training; None for none.
+        """
+        raise NotImplementedError
+
+    def restore_network(self, arrays: dict[str, Array]) -> Learner:
+        """Restore one network from its arrays.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        raise NotImplementedError
+
+    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
+        Raises:
+            ValueError: the budget is smaller than two scenarios.
+        """
+        scenarios, per_scenario = self.choose_training_layout(simulator.dim)
+        training_data = generate_training_data(
+            simulator, rng, budget, scenarios, per_scenario, self.draw_points
+        )
+        held_out = None
+        if self.watch is not None:
+            ground = self.watch.ground
+            # Separate simulations and a separate random stream do not affect the training.
+            stream = np.random.default_rng(0)
+            held_out = generate_training_data(
+                ground, stream, ground.budget, scenarios, max(per_scenario, 2), self.draw_points
+            )
+        self.train_on(training_data, rng, held_out, np.array(simulator.training, dtype=np.float64))
+
+    def train_on(
+        self,
+        data: TrainingData,
+        rng: np.random.Generator,
+        held_out: TrainingData | None = None,
+        training_range: Array = _UNIT_RANGE,
+    ) -> None:
+        """Train on simulations.
+
+        Args:
+            data: training data.
+            rng: random generator.
+            held_out: held-out data for the losses that `callback` gets; None for none.
+            training_range: (2, dim) corners of the training range.
+        """
+        callback = self.watch
+
+        def learn(stage: str, noisy_data: TrainingData, noise: Array | None) -> Learner:
+            """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
+
+            `rng`, `callback` and `held_out` belong to the training that `train_on` runs.
+
+            Args:
+                stage: name of this training, for the callback.
+                noisy_data: simulations to train on, with noise.
+                noise: noise that is also added to the held-out simulations; None for none.
+            """
+            monitor = None
+            if callback is not None and held_out is not None:
+                monitor = TrainingMonitor(
+                    add_noise_to_held_out(held_out, noise), partial(callback.epoch, stage)
+                )
+            return self.train_network(noisy_data, rng, training_range, monitor)
+
+        self._fitted = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learn)
+
+    def state(self) -> dict[str, Array]:
+        """Return weights and input features by name; empty before `fit`."""
+        return {} if self._fitted is None else self._fitted.to_arrays()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Restore the arrays that `state` returned.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        self._fitted = NoiseMatchedNetworks.from_arrays(
+            state, self.make_feature_config(), self.restore_network
+        )
+
+    def get_trained_network(self) -> NoiseMatchedNetworks[Learner]:
+        """Return the trained networks.
+
+        Raises:
+            RuntimeError: the tuner has not been trained.
+        """
+        if self._fitted is None:
+            raise RuntimeError(f"{self.name} has not been trained; call fit or restore first")
+        return self._fitted

@@ -1,18 +1,17 @@
-"""Base class of tuners on TuneNet's pair network: training, state and estimates."""
+"""Base class of tuners on TuneNet's pair network: training of the network, and its estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig, InputFeatures, fill_gaps
 from methods.learning.noise_matched_networks import (
-    NoiseMatchedNetworks,
-    add_noise_to_held_out,
+    NoiseMatchedTuner,
+    TrainingMonitor,
     check_shapes,
 )
 from methods.learning.pair_network import (
@@ -23,25 +22,11 @@ from methods.learning.pair_network import (
     get_weight_shapes,
     train_pair_network,
 )
-from methods.learning.training_data import TrainingData, generate_training_data
-from methods.tuner import Array, Task, TrainingSimulator, Tuner
+from methods.learning.training_data import TrainingData
+from methods.tuner import Array, Task
 
 _PROPOSED_SIDE_PREFIX = "own-"
 """Prefix of array names of the proposed side if both sides have different inputs."""
-
-
-@dataclass(frozen=True)
-class TrainingMonitor:
-    """Monitor of the training of one network.
-
-    Attributes:
-        held_out: simulations that are used for evaluation only.
-        epoch: called after each epoch with its number from 1, the number of epochs, training loss
-            and held-out loss.
-    """
-
-    held_out: TrainingData
-    epoch: Callable[[int, int, float, float], None]
 
 
 @dataclass(frozen=True)
@@ -230,117 +215,38 @@ def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork)
     return filled
 
 
-class PairTuner(Tuner):
+class PairTuner(NoiseMatchedTuner[TrainedPairNetwork]):
     """Base class of tuners on TuneNet's network.
 
     Subclasses define the design, the inputs and the tuning loop.
     """
 
-    requires: ClassVar[tuple[str, ...]] = ("torch",)
-    stochastic: ClassVar[bool] = False
-    learned: ClassVar[bool] = True
     is_single_input: ClassVar[bool] = False
     """True if the network has a single input, the target; see `pair_network.train`."""
-
-    _fitted: NoiseMatchedNetworks[TrainedPairNetwork] | None = None
 
     def make_network_design(self) -> PairNetworkDesign:
         """Return the design of the network."""
         raise NotImplementedError
 
-    def make_feature_config(self) -> FeatureConfig:
-        """Return the configuration of the inputs."""
-        raise NotImplementedError
-
-    def choose_training_layout(self, dim: int) -> tuple[int, int]:
-        """Return the maximum number of training scenarios, and of simulations in each."""
-        raise NotImplementedError
-
-    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
-        """Train on at most `budget` simulations of the training range.
-
-        Args:
-            simulator: training simulator.
-            rng: random generator.
-            budget: maximum number of simulations.
-
-        Raises:
-            ValueError: the budget is smaller than two scenarios.
-        """
-        scenarios, points_per_scenario = self.choose_training_layout(simulator.dim)
-        training_data = generate_training_data(
-            simulator, rng, budget, scenarios, points_per_scenario
-        )
-        callback = self.watch
-        held_out_data = None
-        if callback is not None:
-            ground = callback.ground
-            # Separate simulations and a separate random stream do not affect the training.
-            stream = np.random.default_rng(0)
-            held_out_data = generate_training_data(
-                ground, stream, ground.budget, scenarios, max(points_per_scenario, 2)
-            )
-        self.train_on(training_data, rng, held_out_data)
-
-    def train_on(
-        self, data: TrainingData, rng: np.random.Generator, held_out: TrainingData | None = None
-    ) -> None:
-        """Train on simulations.
-
-        Args:
-            data: training data.
-            rng: random generator.
-            held_out: held-out data for the losses that `callback` gets; None for none.
-        """
-        callback = self.watch
-
-        def fitted(stage: str, noisy_data: TrainingData, noise: Array | None) -> TrainedPairNetwork:
-            """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
-
-            `rng`, `callback` and `held_out` belong to the training that `train_on` runs.
-
-            Args:
-                stage: name of this training, for the callback.
-                noisy_data: simulations to train on, with noise.
-                noise: noise that is also added to the held-out simulations; None for none.
-            """
-            monitor = None
-            if callback is not None and held_out is not None:
-                monitor = TrainingMonitor(
-                    add_noise_to_held_out(held_out, noise), partial(callback.epoch, stage)
-                )
-            return TrainedPairNetwork.train(
-                self.make_network_design(),
-                noisy_data,
-                rng,
-                self.make_feature_config(),
-                self.is_single_input,
-                monitor,
-            )
-
-        self._fitted = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), fitted)
-
-    def state(self) -> dict[str, Array]:
-        """Return weights and input features by name; empty before `fit`."""
-        return {} if self._fitted is None else self._fitted.to_arrays()
-
-    def restore(self, state: dict[str, Array]) -> None:
-        """Restore the arrays that `state` returned.
-
-        Raises:
-            ValueError: arrays have other names or shapes.
-        """
-        design, reading = self.make_network_design(), self.make_feature_config()
-        self._fitted = NoiseMatchedNetworks.from_arrays(
-            state, reading, lambda part: TrainedPairNetwork.from_arrays(part, design, reading)
+    def train_network(
+        self,
+        data: TrainingData,
+        rng: np.random.Generator,
+        training_range: Array,  # noqa: ARG002 - the network learns differences of parameters
+        monitor: TrainingMonitor | None,
+    ) -> TrainedPairNetwork:
+        """Train the network for one noise level; see `NoiseMatchedTuner`."""
+        return TrainedPairNetwork.train(
+            self.make_network_design(),
+            data,
+            rng,
+            self.make_feature_config(),
+            self.is_single_input,
+            monitor,
         )
 
-    def get_trained_network(self) -> NoiseMatchedNetworks[TrainedPairNetwork]:
-        """Return the trained networks.
-
-        Raises:
-            RuntimeError: the tuner has not been trained.
-        """
-        if self._fitted is None:
-            raise RuntimeError(f"{self.name} has not been trained; call fit or restore first")
-        return self._fitted
+    def restore_network(self, arrays: dict[str, Array]) -> TrainedPairNetwork:
+        """Restore one network from its arrays; see `TrainedPairNetwork.from_arrays`."""
+        return TrainedPairNetwork.from_arrays(
+            arrays, self.make_network_design(), self.make_feature_config()
+        )

@@ -74,15 +74,7 @@ class DirectRegressor(PairTuner):
         """Return how an observation becomes inputs of the network; raw samples if published."""
         if self.published:
             return FeatureConfig(self.points, noise=0.0, raw=True)
-        return FeatureConfig(
-            self.points,
-            self.inputs,
-            self.strictness,
-            self.noise,
-            use_scenario_features=self.told,
-            channels=self.channels,
-            clean=self.clean,
-        )
+        return super().make_feature_config()
 
     def choose_training_layout(self, dim: int) -> tuple[int, int]:
         """Return the maximum number of training scenarios and the number of simulations in each."""

@@ -41,12 +41,12 @@ from methods.learning.history_transformer import (
 )
 from methods.learning.input_features import FeatureConfig, InputFeatures
 from methods.learning.noise_matched_networks import (
-    NoiseMatchedNetworks,
-    add_noise_to_held_out,
+    NoiseMatchedTuner,
+    TrainingMonitor,
     check_shapes,
 )
-from methods.learning.training_data import TrainingData, generate_training_data
-from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, TunerGenerator
+from methods.learning.training_data import TrainingData
+from methods.tuner import Array, Proposal, Task, TrainingSimulator, TunerGenerator
 from methods.tuners.tunenet import MIN_STEP
 
 _RANGE_ARRAY = "box"
@@ -120,7 +120,7 @@ class TrainedHistoryNetwork:
 
 
 @dataclass(eq=False)
-class InContextTransformer(Tuner):
+class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
     """Causal transformer that reads the tuning history and proposes the next point.
 
     It is trained on simulated tuning histories, and recommends its newest proposal.
@@ -147,9 +147,6 @@ class InContextTransformer(Tuner):
     """
 
     name: ClassVar[str] = "in_context"
-    requires: ClassVar[tuple[str, ...]] = ("torch",)
-    stochastic: ClassVar[bool] = False
-    learned: ClassVar[bool] = True
 
     published: bool = False
     window: int = 7
@@ -166,8 +163,6 @@ class InContextTransformer(Tuner):
     channels: tuple[int, int] | None = None
     clean: bool = True
 
-    _prepared: NoiseMatchedNetworks[TrainedHistoryNetwork] | None = None
-
     def make_network_design(self) -> HistoryTransformerDesign:
         """Return the design of the network."""
         return HistoryTransformerDesign(
@@ -178,74 +173,43 @@ class InContextTransformer(Tuner):
             weight_decay=self.weight_decay,
         )
 
-    def make_feature_config(self) -> FeatureConfig:
-        """Return the configuration of the inputs."""
-        return FeatureConfig(
-            self.points,
-            self.inputs,
-            self.strictness,
-            self.noise,
-            use_scenario_features=self.told,
-            channels=self.channels,
-            clean=self.clean,
-        )
+    def choose_training_layout(self, dim: int) -> tuple[int, int]:
+        """Return the maximum number of training scenarios and the number of simulations in each."""
+        return self.scenarios, max(self.each, 2 * (dim + 1))
 
-    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
-        """Train on at most `budget` simulations of the training range.
+    def draw_points(
+        self, simulator: TrainingSimulator, rng: np.random.Generator, count: int
+    ) -> Array:
+        """Draw a target and a random binary search for it."""
+        return draw_binary_search(simulator, rng, count)
 
-        For each noise level of the training data a transformer is trained on histories of simulated
-        tuning runs; the level is chosen later by the noise of the target.
+    def train_network(
+        self,
+        data: TrainingData,
+        rng: np.random.Generator,
+        training_range: Array,
+        monitor: TrainingMonitor | None,
+    ) -> TrainedHistoryNetwork:
+        """Train a transformer on histories of simulated tuning runs, for one noise level.
 
         Args:
-            simulator: training simulator.
+            data: simulations to train on, with noise.
             rng: random generator.
-            budget: maximum number of simulations.
-
-        Raises:
-            ValueError: the budget is smaller than two scenarios.
+            training_range: (2, dim) corners of the training range.
+            monitor: monitor of the training; None for none.
         """
-        per_scenario = max(self.each, 2 * (simulator.dim + 1))
-        training_data = generate_training_data(
-            simulator, rng, budget, self.scenarios, per_scenario, draw_binary_search
+        features = InputFeatures.fit(data, self.make_feature_config())
+        validation_monitor = None
+        if monitor is not None:
+            held_out = _build_training_histories(features, monitor.held_out, training_range)
+            validation_monitor = HistoryValidationMonitor(held_out, monitor.epoch)
+        design = self.make_network_design()
+        material = _build_training_histories(features, data, training_range)
+        per_scenario = data.parameters.shape[1]
+        weights = train_history_transformer(
+            material, partial(self._draw_histories, per_scenario), design, rng, validation_monitor
         )
-        callback = self.watch
-        held_out_data = None
-        if callback is not None:
-            ground = callback.ground
-            # Separate simulations and a separate random stream do not affect the training.
-            stream = np.random.default_rng(0)
-            held_out_data = generate_training_data(
-                ground, stream, ground.budget, self.scenarios, per_scenario, draw_binary_search
-            )
-        box = np.array(simulator.training, dtype=np.float64)
-
-        def learned(
-            stage: str, noisy_data: TrainingData, noise: Array | None
-        ) -> TrainedHistoryNetwork:
-            """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
-
-            Args:
-                stage: name of this training, for the callback.
-                noisy_data: simulations to train on, with noise.
-                noise: noise that is also added to the held-out simulations; None for none.
-            """
-            features = InputFeatures.fit(noisy_data, self.make_feature_config())
-            monitor = None
-            if callback is not None and held_out_data is not None:
-                material = _build_training_histories(
-                    features, add_noise_to_held_out(held_out_data, noise), box
-                )
-                monitor = HistoryValidationMonitor(material, partial(callback.epoch, stage))
-            design = self.make_network_design()
-            material = _build_training_histories(features, noisy_data, box)
-            weights = train_history_transformer(
-                material, partial(self._draw_histories, per_scenario), design, rng, monitor
-            )
-            return TrainedHistoryNetwork(design, features, weights, box)
-
-        self._prepared = NoiseMatchedNetworks.train(
-            training_data, rng, self.make_feature_config(), learned
-        )
+        return TrainedHistoryNetwork(design, features, weights, training_range)
 
     def _draw_histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
         """Draw the histories of a batch from `each` simulations per scenario.
@@ -265,19 +229,10 @@ class InContextTransformer(Tuner):
             else make_shuffled_histories(rng, each, window)
         )
 
-    def state(self) -> dict[str, Array]:
-        """Return weights and input features by name; empty before `fit`."""
-        return {} if self._prepared is None else self._prepared.to_arrays()
-
-    def restore(self, state: dict[str, Array]) -> None:
-        """Restore the arrays that `state` returned.
-
-        Raises:
-            ValueError: arrays have other names or shapes, or numbers that are not finite.
-        """
-        design, reading = self.make_network_design(), self.make_feature_config()
-        self._prepared = NoiseMatchedNetworks.from_arrays(
-            state, reading, lambda part: TrainedHistoryNetwork.from_arrays(part, design, reading)
+    def restore_network(self, arrays: dict[str, Array]) -> TrainedHistoryNetwork:
+        """Restore one network from its arrays; see `TrainedHistoryNetwork.from_arrays`."""
+        return TrainedHistoryNetwork.from_arrays(
+            arrays, self.make_network_design(), self.make_feature_config()
         )
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
@@ -290,9 +245,7 @@ class InContextTransformer(Tuner):
             task: task of the target.
             rng: not used.
         """
-        if self._prepared is None:
-            raise RuntimeError("in_context has not been trained; call fit or restore first")
-        network = self._prepared.select_for(task)
+        network = self.get_trained_network().select_for(task)
         missing = np.isnan(task.observed)
         row = network.input_features(task.observed[None], task.lengths, task.scene, missing)
         target = network.apply_weights(row)[0]

@@ -85,18 +85,6 @@ class TuneNet(PairTuner):
         """Return the design of the network."""
         return PairNetworkDesign(epochs=self.epochs, rate=self.rate, weight_decay=self.weight_decay)
 
-    def make_feature_config(self) -> FeatureConfig:
-        """Return the configuration of the inputs."""
-        return FeatureConfig(
-            self.points,
-            self.inputs,
-            self.strictness,
-            self.noise,
-            use_scenario_features=self.told,
-            channels=self.channels,
-            clean=self.clean,
-        )
-
     def choose_training_layout(self, dim: int) -> tuple[int, int]:
         """Return the maximum number of training scenarios and the number of simulations in each."""
         return self.scenarios, max(self.each, 2 * (dim + 1))

@@ -32,7 +32,7 @@ def test_a_first_guess_without_a_simulation_and_then_steps_that_fall(fitted):
 
 
 def test_what_was_tried_before_changes_what_is_proposed(fitted):
-    network = fitted._prepared.clean
+    network = fitted._fitted.clean
     rng = np.random.default_rng(1)
     target, *shown = rng.normal(size=(3, network.design.seen))
     points = [np.array([0.4]), np.array([0.6])]
@@ -48,7 +48,7 @@ def test_what_was_tried_before_changes_what_is_proposed(fitted):
 def test_a_simulation_that_shows_the_target_is_where_it_stays(fitted):
     toy = Toy()
     truth, scenario = np.array([0.55]), np.array([1.3])
-    network = fitted._prepared.clean
+    network = fitted._fitted.clean
     row = network.apply_weights(
         network.input_features(toy.observe(truth[None], scenario), toy.lengths, toy.scene)
     )[0]
