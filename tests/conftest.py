@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.data_dependence import find_data_dependent_names
+from tests.data_dependence import can_be_slow_or_data, find_data_dependent_names
 
 PLUGINS = Path(__file__).parent / "plugins"
 
@@ -107,6 +107,21 @@ def undrawn():
         yield
 
 
+SLOW_OR_DATA = "slow or data"
+"""Marker expression of `make test-rest`."""
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Do not import test files of which `make test-rest` would deselect every test.
+
+    Each worker would import them, which takes half of the time of the collection.
+    """
+    is_test_file = collection_path.match("test_*.py")
+    if is_test_file and config.getoption("markexpr") == SLOW_OR_DATA:
+        return True if not can_be_slow_or_data(collection_path.read_text()) else None
+    return None
+
+
 _SECONDS = {True: 15.0, False: 0.2}
 """Approximate duration of a test in seconds, by whether it is marked as slow.
 
@@ -121,12 +136,20 @@ def pytest_collection_modifyitems(items):
     A slow file that starts last would keep the other workers waiting.
     """
     seconds = Counter()
-    reads = {path: find_data_dependent_names(path.read_text()) for path in {i.path for i in items}}
+    sources = {path: path.read_text() for path in {item.path for item in items}}
+    reads = {path: find_data_dependent_names(source) for path, source in sources.items()}
     for item in items:
         name = item.originalname if item.cls is None else item.cls.__name__
         if name in reads[item.path] or "recordings" in item.fixturenames:
             item.add_marker(pytest.mark.data)
         slow = item.get_closest_marker("slow")
+        if (slow or item.get_closest_marker("data")) and not can_be_slow_or_data(
+            sources[item.path]
+        ):
+            raise pytest.UsageError(
+                f"{item.nodeid} is marked, but `make test-rest` would ignore its file: write "
+                "`pytest.mark.slow` or the parameter `recordings` there"
+            )
         seconds[item.path] += (
             slow.kwargs.get("seconds", _SECONDS[True]) if slow else _SECONDS[False]
         )

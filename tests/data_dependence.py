@@ -1,4 +1,4 @@
-"""Find the tests whose results may depend on the real recordings next to the clone."""
+"""Find tests that are slow, or whose results may depend on the recordings next to the clone."""
 
 import ast
 import re
@@ -8,6 +8,19 @@ READS_DATA = re.compile(
     "|list_experiment_names"
 )
 """Pattern of code whose results may depend on the real recordings."""
+
+
+MARKED = re.compile(r"\bmark\.(slow|data)\b|\brecordings\b")
+"""Pattern of files with tests that are marked as slow, or use the fixture `recordings`."""
+
+
+def can_be_slow_or_data(source):
+    """Return whether tests of a file can be marked as slow or data-dependent.
+
+    Args:
+        source: Source of a test file.
+    """
+    return bool(MARKED.search(source)) or bool(find_data_dependent_names(source))
 
 
 def find_data_dependent_names(source):

@@ -1,3 +1,8 @@
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import SLOW_OR_DATA, pytest_collection_modifyitems, pytest_ignore_collect
 from tests.data_dependence import find_data_dependent_names
 
 MODULE = """
@@ -39,3 +44,44 @@ def test_a_fixture_that_all_tests_use_makes_all_of_them_dependent():
     assert {"test_neither", "test_another_parameter"} <= find_data_dependent_names(always)
     assert find_data_dependent_names(MODULE.replace("SIMGAP_DATA", "HOME")
                                      .replace("simgap list", "simgap")) == set()  # fmt: skip
+
+
+class Config:
+    """Stand-in for pytest's configuration with a marker expression."""
+
+    def __init__(self, expression):
+        self.expression = expression
+
+    def getoption(self, name):
+        return {"markexpr": self.expression}[name]
+
+
+@pytest.mark.parametrize(
+    ("source", "is_ignored"),
+    [
+        ("def test_a(): ...\n", True),
+        ("def slow_test_marked(): ...\n", True),
+        ("@pytest.mark.slow(seconds=3)\ndef test_a(): ...\n", False),
+        ("def test_a(recordings): ...\n", False),
+        (MODULE, False),
+    ],
+)
+def test_only_files_without_slow_or_data_tests_are_ignored(tmp_path, source, is_ignored):
+    path = tmp_path / "test_it.py"
+    path.write_text(source)
+    assert bool(pytest_ignore_collect(path, Config(SLOW_OR_DATA))) is is_ignored
+    assert not pytest_ignore_collect(path, Config("not slow"))
+    assert not pytest_ignore_collect(path.rename(tmp_path / "conftest.py"), Config(SLOW_OR_DATA))
+
+
+def test_a_mark_that_the_source_does_not_show_stops_the_collection(request, monkeypatch):
+    monkeypatch.setattr("tests.conftest.can_be_slow_or_data", lambda source: False)
+    pytest_collection_modifyitems([request.node])
+    request.node.add_marker(pytest.mark.slow)
+    with pytest.raises(pytest.UsageError, match="would ignore its file"):
+        pytest_collection_modifyitems([request.node])
+
+
+def test_the_makefile_uses_the_expression_for_which_files_are_ignored():
+    makefile = Path(__file__).parents[1] / "Makefile"
+    assert f'test-rest: $(STAMP)\n\t$(PYTEST) -m "{SLOW_OR_DATA}"\n' in makefile.read_text()
