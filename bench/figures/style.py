@@ -185,11 +185,6 @@ def get_marker(place: int) -> str:
     return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
 
 
-def get_line_style(place: int) -> Any:
-    """Return the line style of the tuner or diagnoser at this index."""
-    return _LINES[place % len(_LINES)]
-
-
 MEDIAN_LINE_CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
     "Band or bar: 95 % bootstrap interval of the median. "

@@ -79,7 +79,6 @@ class MachineDynamics(ABC):
         self.added = np.zeros(count)
         self.patch: tuple[int, float, float, float] | None = None
         self.dull = 0.0
-        self.heavier = 1.0
         self.acts: list[ForceLaw] = []
         for name, coefficients in effects.items():
             effect, _, place = name.partition("@")
