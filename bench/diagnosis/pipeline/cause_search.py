@@ -93,7 +93,12 @@ class CauseSearch:
         try:
             return self._find_causes(base, stiff_search, rng)
         except SoftFrictionError as error:
-            return self._search_with_soft_friction(base, search, error.start)
+            start = error.start
+            # A repeated soft search could only begin with another model.
+            if start is None or frozenset(start.effects) in soft_result.search.models:
+                runs.context.say(SOFT_FRICTION)
+                return soft_result
+            return self._search_with_soft_friction(base, search, start)
 
     def _search_with_soft_friction(
         self, base: BaseModel, stiff_search: EffectSearch, likely: FitStart | None = None

@@ -5,6 +5,7 @@ Plain MuJoCo makes the motion, from a model file with `frictionloss` at the elbo
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -23,6 +24,7 @@ from bench.diagnosis.friction_form_verdict import (
     make_soft_kind,
 )
 from bench.diagnosis.pipeline import cause_search
+from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
@@ -187,3 +189,49 @@ def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
     assert read_extended(paths["extended.toml"]).robot.friction_form == "soft"
     assert "solreffriction=" not in paths["extended.xml"].read_text()
     assert score_model(paths["extended.xml"], path)["normalised_rmse"] < 1.1
+
+
+@pytest.mark.parametrize(
+    ("effects", "soft_searches"),
+    [
+        (("friction.coulomb@elbow",), 1),
+        (("friction.coulomb@shoulder",), 2),
+        (None, 1),
+    ],
+)
+def test_a_soft_search_is_repeated_only_for_a_model_that_it_did_not_fit(
+    monkeypatch, effects, soft_searches
+):
+    """Filters and then fits find the soft form; the soft search in between explains nothing."""
+    start = None if effects is None else FitStart(effects, np.zeros(1), np.zeros((1, 2)))
+    errors = [SoftFrictionError(start, is_preliminary=True), SoftFrictionError(start)]
+    fitted_models = {frozenset(["friction.coulomb@elbow"]): None}
+    results, said = [], []
+
+    def find_soft_form(*_):
+        raise errors.pop(0)
+
+    def search_with_soft_friction(*_):
+        said.append(cause_search.SOFT_FRICTION)
+        search = SimpleNamespace(models=fitted_models)
+        results.append(SimpleNamespace(search=search, is_explained=False))
+        return results[-1]
+
+    monkeypatch.setattr(cause_search.CauseSearch, "_find_causes", find_soft_form)
+    monkeypatch.setattr(
+        cause_search.CauseSearch, "_search_with_soft_friction", search_with_soft_friction
+    )
+    context = SimpleNamespace(
+        say=said.append, search_control=SimpleNamespace(is_over=lambda: False)
+    )
+    runs = SimpleNamespace(
+        context=context,
+        kind=SimpleNamespace(has_model=True),
+        make_rng=lambda: None,
+        create_search=lambda *_, **__: SimpleNamespace(),
+    )
+    base = SimpleNamespace(runs=runs, fit=None)
+    assert cause_search.CauseSearch(None).search(base) is results[-1]
+    assert (len(results), errors) == (soft_searches, [])
+    # The last message is that of the returned result.
+    assert said[-2:] == [cause_search.STIFF_FRICTION, cause_search.SOFT_FRICTION]
