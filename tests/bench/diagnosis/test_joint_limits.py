@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from bench.diagnosis.explain import explain
 
-MASS, NOISE, INTERVAL, SAMPLES = 1.2, 1e-3, 0.02, 150
+MASS, NOISE, INTERVAL, SAMPLES = 1.2, 1e-3, 0.02, 100
 
 
 def path(force, speed, stiffness, place, loss):

@@ -41,18 +41,18 @@ QUADROTOR = """<mujoco model="quadrotor">
 """
 MASS, INERTIA, ARM, TORQUE_RATIO = 0.6, np.array([0.004, 0.0045, 0.007]), 0.12, 0.02
 """Mass (kg), moments of inertia (kg m^2), distances of the rotors (m), torque by thrust (m)."""
-RATE, SECONDS = 100, 4.0
+RATE = 100
 POSITION_NOISE, QUATERNION_NOISE = 3e-4, 5e-4
 SIGNS = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])
 """Contribution of each rotor to thrust, and to the torques about x, y and z."""
 
 
-def fly(change, seed):
+def fly(change, seed, seconds):
     """Return times (T,), thrusts (T, 4) in N, and poses (T, 7) of a controlled flight."""
     model = mujoco.MjModel.from_xml_string(QUADROTOR)
     change(model)
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
-    times = np.arange(round(SECONDS * RATE) + 1) / RATE
+    times = np.arange(round(seconds * RATE) + 1) / RATE
     frequencies = 2 * np.pi * rng.uniform((0.2, 0.5, 1.0), (0.5, 1.0, 2.0), (4, 3))
     waves = np.sin(frequencies[..., None] * times) * np.array([0.6, 0.3, 0.15])[:, None]
     targets = np.array([0.5, 0.5, 0.3, 0.6])[:, None] * waves.sum(axis=1)
@@ -75,12 +75,12 @@ def fly(change, seed):
     return times, np.array(thrusts), np.array(poses)
 
 
-def write_flights(folder, change, seed=0):
+def write_flights(folder, change, seed=0, seconds=2.0):
     """Write three flights, of which the last is held out, and return the path of the table."""
     noise = np.array([POSITION_NOISE] * 3 + [QUATERNION_NOISE] * 4)
     rng, runs = np.random.default_rng(seed + 100), {}
     for number, name in enumerate(("1", "2", "3")):
-        times, thrusts, poses = fly(change, 10 * seed + number)
+        times, thrusts, poses = fly(change, 10 * seed + number, seconds)
         runs[name] = (name == "3", times, thrusts, poses + noise * rng.standard_normal(poses.shape))
     channels = {f"q.base.{axis}": ("m", POSITION_NOISE) for axis in "xyz"}
     channels |= {f"q.base.q{entry}": ("1", QUATERNION_NOISE) for entry in "wxyz"}
@@ -139,7 +139,8 @@ def test_a_load_is_named_rather_than_several_commands(tmp_path):
 @pytest.mark.slow
 def test_an_unstable_flight_is_explained_in_short_pieces(tmp_path):
     notes = []
-    answer = explain(write_flights(tmp_path, shift_centre_of_mass), jobs=1, say=notes.append).answer
+    log = write_flights(tmp_path, shift_centre_of_mass, seconds=2.5)
+    answer = explain(log, jobs=1, say=notes.append).answer
     assert any("cut into pieces" in note for note in notes)
     (cause,) = answer.causes
     assert cause.effect == "mass.offset@hull"
