@@ -239,12 +239,13 @@ def _make_unobserved_error(world: SteppableSimulator, observation: object, name:
     )
 
 
-def inertia_of(world: SteppableSimulator) -> float | Array:
-    """Return the current generalised inertia of a simulator.
+def get_checked_inertia(simulator: SteppableSimulator) -> float | Array:
+    """Return the current generalised inertia of a simulator, after checking its shape.
 
-    It is needed to find the dry friction that stops the motion in the next step.
+    A user wrote the simulator, so its method `inertia` may return anything. The inertia is needed
+    to find the dry friction that stops the motion in the next step.
 
-    Shapes: D coordinates.
+    Shapes: D generalised coordinates.
 
     Returns:
         A number, which applies to every coordinate, or a matrix (D, D).
@@ -252,23 +253,25 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
     Raises:
         InputError: `inertia` returned neither.
     """
-    inertia = world.inertia()
+    inertia = simulator.inertia()
     if isinstance(inertia, float):
         return float(inertia)
-    coordinate_count = len(world.coordinates)
+    coordinate_count = len(simulator.coordinates)
     try:
         matrix = np.asarray(inertia, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
+        raise InputError(
+            f"simulator {simulator.name}: inertia: expected numbers; {error}"
+        ) from None
     if not matrix.shape:
         return float(matrix)
     if matrix.shape == (coordinate_count, coordinate_count):
         return matrix
-    joints = ", ".join(world.coordinates)
+    coordinates = ", ".join(simulator.coordinates)
     raise InputError(
-        f"simulator {world.name}: inertia: expected shape "
-        f"{(coordinate_count, coordinate_count)} (joints × joints; here: "
-        f"{joints}) or a number, found {matrix.shape}"
+        f"simulator {simulator.name}: inertia: expected shape "
+        f"{(coordinate_count, coordinate_count)} (coordinates × coordinates; here: "
+        f"{coordinates}) or a number, found {matrix.shape}"
     )
 
 
@@ -367,7 +370,7 @@ class _Forces:
             force: (D,) sum of the other effects' forces.
             seconds: length of the step.
         """
-        inertia = inertia_of(self.world)
+        inertia = get_checked_inertia(self.world)
         v = moment.v[0]
         passive_force = np.zeros_like(force)
         if self._last is not None:

@@ -129,15 +129,21 @@ def score(
     """
     frame_description = FrameDescription(units=units, constants=constants, description=description)
     if isinstance(recording, Frame):
-        frame_description = _complete_from_model(Path(model), frame_description)
+        frame_description = _fill_in_from_model_file(Path(model), frame_description)
     (source,) = list_sources(recording, frame_description)
     return score_model(Path(model), source, held_out, force)
 
 
-def _complete_from_model(model: Path, frame_description: FrameDescription) -> FrameDescription:
-    """Complete the description of a data frame by the system or robot of a model.
+def _fill_in_from_model_file(model: Path, frame_description: FrameDescription) -> FrameDescription:
+    """Fill in the system or robot to which a data frame belongs, taken from a model file.
 
-    `model` is a robot's model file, or an extended simulator (TOML) that names a robot or a system.
+    Unlike a recording file, a data frame has no description file that names them. Entries that
+    `frame_description` already has take precedence.
+
+    Args:
+        model: A robot's model file (MJCF or URDF), or an extended simulator (TOML), which names a
+            robot or a system.
+        frame_description: Description of the data frame.
     """
     if model.suffix in MODEL_FILES:
         return replace(frame_description, model=model)

@@ -177,15 +177,19 @@ class _Flight:
     def _set_contact_damping(self, speed: float) -> None:
         """Set the contact damping that gives the ball's restitution, for an impact at this speed.
 
+        It also marks the begin of a contact (`_touches`), during which the damping stays constant.
+
         Args:
             speed: speed normal to the ground at the begin of the impact, m/s.
         """
         self._touches = True
-        # Rounded, so that almost equal impacts share the cached result.
+        # Rounded, so that almost equal impacts share one cached result of `compute_damping_ratio`.
         restitution = round(self._ball.compute_restitution(speed), 9)
         ratio = compute_damping_ratio(restitution, _MAX_DAMPING_RATIO)
         # The contact of a spring lasts half of its period.
         frequency = math.pi / CONTACT_SECONDS
+        # Two negative values of `solref` are -stiffness and -damping per unit mass. Geom 0 is the
+        # ground and geom 1 the ball, whose values apply to their contact (priority 1).
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
     def _apply_forces(self, velocity: list[float]) -> None:

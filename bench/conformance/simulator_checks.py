@@ -19,7 +19,7 @@ from sims.core.simulator import (
     UnitCube,
 )
 from sims.own_simulator import OwnSimulator
-from sims.own_simulator_engine import inertia_of, observed
+from sims.own_simulator_engine import get_checked_inertia, observed
 from sims.recording.unit_conversion import is_unit
 
 _FORCED_STEPS = 20
@@ -69,7 +69,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
             for name in dict.fromkeys([*names, *kind.coordinates, *kind.rates, *kind.levels]):
                 observed(simulator, observation, name)
             if heavy:
-                _check_inertia(kind, inertia_of(simulator))
+                _check_inertia(kind, get_checked_inertia(simulator))
             if forced:
                 simulator.apply_force(np.zeros(len(kind.coordinates)))
             _make_step(simulator)

@@ -255,12 +255,15 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
     # A wrapper around the tuner, because the harness's loop clips what it records.
     class Watched(Tuner):
         def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-            """Run the tuner unchanged, and copy its proposals and recommendations to `asked`.
+            """Run the tuner unchanged, and collect its proposals and recommendations.
+
+            They are appended to `proposals`, where the check reads them after the run.
 
             Args:
                 task: number of parameters and budget.
                 rng: random numbers of the tuner.
             """
+            # The tuner under test, trained for two parameters.
             steps = make_trained_tuner(kind, 2).tune(task, rng)
             try:
                 proposal = next(steps)
@@ -271,7 +274,9 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
                     proposals.extend(
                         np.atleast_2d(p) for p in (points, recommended) if p is not None
                     )
-                    proposal = steps.send((yield proposal))
+                    # Let the harness simulate the points, and pass the result on to the tuner.
+                    evaluation = yield proposal
+                    proposal = steps.send(evaluation)
             except StopIteration as stop:
                 return str(stop.value)
             finally:

@@ -227,19 +227,21 @@ class SummaryCharts(NamedTuple):
 
 
 def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCharts:
-    """Make the charts of the page.
+    """Make the charts of the summary page: numbers of the causes, and errors on held-out runs.
+
+    Both have the logs on the horizontal axis, by name if all names fit, else by number from 1.
 
     Args:
         logs: Table of `many_logs.build_log_table`.
         numbers: Table of `many_logs.build_number_table`.
     """
     across = _make_log_axis(logs)
-    # Named logs have the positions 0, 1, 2, ... on their axis.
-    first = 1 if across.names else 0
+    # Column "number" counts from 1. An axis of names counts from 0, an axis of numbers from 1.
+    offset = 1 if across.names else 0
     errors = logs[["number", "log", "before", "after"]]
     tables = {
-        "found": numbers.assign(place=numbers["number"] - first),
-        "held-out": errors.assign(place=errors["number"] - first),
+        "found": numbers.assign(place=numbers["number"] - offset),
+        "held-out": errors.assign(place=errors["number"] - offset),
     }
     number_panels = _make_number_panels(numbers, across)
     held_out_panels = _make_held_out_panels(logs, across)
@@ -277,7 +279,9 @@ def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
 
 
 def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
-    """Make the panel of the errors on held-out runs, in noise floors; none without errors.
+    """Make the panel that shows the errors on held-out runs, in units of the noise floor.
+
+    Return an empty list if no log has both errors.
 
     Args:
         logs: one row for each log, with the columns ``before`` and ``after``.
@@ -291,9 +295,11 @@ def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
         Series("before: tuned simulation", "before", _BEFORE, draw="points"),
         Series("after: with the causes found", "after", _AFTER, draw="points"),
     )
+    # `holds` keeps the noise floor, 1, within the range of the axis.
     error_axis = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
     title = "One log" if log_count == 1 else f"{log_count} logs"
     rules = (ReferenceLine(1.0, "noise floor"),)
+    # "held-out" is the key of the table in `SummaryCharts`, "place" its column for the x-axis.
     return [Panel(title, "held-out", "place", series, across, error_axis, rules=rules)]
 
 

@@ -572,7 +572,7 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
         if kind == "body":
             return np.array(data.xipos[robot.body(name).id])
         if kind == "actuator":
-            return _place_of_actuator(robot, data, name)
+            return _get_actuator_position(robot, data, name)
         if kind == "channel":
             return _place_of_channel(robot, data, name)
         return np.array(data.xanchor[robot.joint(name).id])
@@ -580,10 +580,11 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
         return None
 
 
-def _place_of_actuator(robot: RobotModel, data: Any, name: str) -> Array | None:
-    """Return the position (3,) in the world of the joint or the site on which an actuator acts.
+def _get_actuator_position(robot: RobotModel, data: Any, name: str) -> Array | None:
+    """Return the position (3,) in the world of the joint or the site that an actuator drives.
 
-    It is None for an actuator on a tendon or a body.
+    The figure marks an effect of the actuator there. An actuator on a tendon or a body has no
+    single point, so the result is None.
 
     Args:
         robot: model of the robot.
@@ -595,6 +596,7 @@ def _place_of_actuator(robot: RobotModel, data: Any, name: str) -> Array | None:
     actuator = robot.actuator(name)
     if actuator.joint is not None:
         return np.array(data.xanchor[robot.joint(actuator.joint).id])
+    # MuJoCo's `trntype` and `trnid` are the kind and the index of the element that is driven.
     if int(robot.compiled.actuator_trntype[actuator.id]) != int(mujoco.mjtTrn.mjTRN_SITE):
         return None
     return np.array(data.site_xpos[int(robot.compiled.actuator_trnid[actuator.id, 0])])

@@ -126,11 +126,14 @@ class StudyScores:
 
 
 def load_scores(folder: Path, experiment: Experiment) -> StudyScores:
-    """Load the scores of a study.
+    """Load the scores of a study: errors of parameters and of predictions, for each target.
+
+    A study has one comparison of tuners for each model (original and extended), in a subfolder
+    with the model's name. Only targets that are complete in both are kept.
 
     Args:
         folder: result folder of the study.
-        experiment: its experiment.
+        experiment: experiment of the study.
 
     Raises:
         InputError: a comparison of the study is missing, unfinished or damaged.
@@ -139,8 +142,10 @@ def load_scores(folder: Path, experiment: Experiment) -> StudyScores:
     parameters, widths = problem.cube.parameters, problem.cube.compute_training_widths()
     channel = problem.channels[problem.error_channel]
     problem.close()
-    parts = [_build_error_rows(folder / model, model, parameters, widths) for model in MODEL_LABELS]
-    errors = _select_complete_targets(pd.concat(parts, ignore_index=True))
+    errors_by_model = [
+        _build_error_rows(folder / model, model, parameters, widths) for model in MODEL_LABELS
+    ]
+    errors = _select_complete_targets(pd.concat(errors_by_model, ignore_index=True))
     return StudyScores(experiment, channel.unit, channel.name, parameters, errors)
 
 

@@ -244,25 +244,30 @@ class HtmlPage:
     def figure(
         self,
         name: str,
-        static: PrintedFigure | None,
+        drawn_figure: PrintedFigure | None,
         tables: Sequence[str] = (),
         markers: Sequence[tuple[str, float, float]] = (),
         *,
         caller: Callable[[], Markup],
     ) -> Markup:
-        """Return a figure that is identical on screen and on paper, with its files for download.
+        """Return the HTML of a drawn figure, with its caption and its files for download.
+
+        Page templates call it for each figure that they may show. It returns nothing if the figure
+        was not drawn, for example because its data do not exist.
 
         Args:
             name: Name in the page's address: letters, digits and hyphens.
-            static: The figure; None if it was not drawn.
+            drawn_figure: The figure; None if it was not drawn.
             tables: Names of the page's tables with its numbers.
             markers: Names to highlight with their positions, as fractions of width and height from
                 the top left.
-            caller: Caption, as the body of a template's call block.
+            caller: Returns the caption. Jinja requires this name: it passes the body of a
+                template's call block as this function.
         """
-        if static is None:
+        if drawn_figure is None:
             return Markup()
-        return Markup(self._parts.figure(name, static, Markup(caller().strip()), tables, markers))
+        caption = Markup(caller().strip())
+        return Markup(self._parts.figure(name, drawn_figure, caption, tables, markers))
 
     def grid(
         self, name: str, title: str, table: str, columns: Sequence[Any], **options: Any

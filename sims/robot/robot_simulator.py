@@ -766,7 +766,8 @@ def make_robot_simulator(
 
     Args:
         robot: robot as read from its model file.
-        free: numbers of the file to tune, such as ``damping@*`` or ``mass@forearm``.
+        free: values of the model file that become parameters, such as ``damping@*`` (of all
+            joints) or ``mass@forearm``.
         numerics: time step and integrator; those of the file if None.
 
     Raises:
@@ -776,6 +777,7 @@ def make_robot_simulator(
     # The class is created at run time, so its source text does not identify the robot; the digest
     # does.
     identity_text = repr((robot.digest, tuple(free), tuple(numerics)))
+    # "stiff" is the default. It adds nothing, so that digests from before this option stay valid.
     identity_text += "" if robot.friction_form == "stiff" else robot.friction_form
     identity_text += "".join(robot.contacts)
     system = make_robot_system(robot, free)
@@ -784,6 +786,8 @@ def make_robot_simulator(
         "robot": robot,
         "numerics": numerics,
         "free": tuple(free),
+        # Classes whose source code the digest of this class includes: the effects of the values
+        # in `free`.
         "made_of": tuple(
             library.get_effect(n) for n in dict.fromkeys(e.of for e in system.freed_effects)
         ),

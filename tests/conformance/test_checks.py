@@ -456,8 +456,8 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
         (
             SmallInertia,
             "check_hooks_have_the_declared_shapes",
-            r"inertia: expected shape \(2, 2\) \(joints × joints; here: x1, x2\) or a number; "
-            r"found \(1, 1\)",
+            r"inertia: expected shape \(2, 2\) \(coordinates × coordinates; here: x1, x2\) or a "
+            r"number; found \(1, 1\)",
         ),
         (NegativeInertia, "check_hooks_have_the_declared_shapes", "positive definite matrix"),
         (

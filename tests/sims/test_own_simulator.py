@@ -162,8 +162,11 @@ def test_dry_friction_of_coupled_joints_takes_the_inertia_matrix():
 
 def test_an_inertia_of_another_shape_is_refused_with_the_one_that_is_expected():
     wrong = type("Wrong", (Coupled,), {"name": "wrong", "given": np.eye(1)})
-    says = r"simulator wrong: inertia: expected shape \(2, 2\) \(joints × joints; here: q1, q2\)"
-    with pytest.raises(InputError, match=says + r" or a number, found \(1, 1\)"):
+    says = (
+        r"simulator wrong: inertia: expected shape \(2, 2\) \(coordinates × coordinates; "
+        r"here: q1, q2\) or a number, found \(1, 1\)"
+    )
+    with pytest.raises(InputError, match=says):
         wrong(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
     as_matrix = type("Matrix", (Block,), {"inertia": lambda self: np.array([[self.mass]])})
     kinds = (Block, as_matrix)

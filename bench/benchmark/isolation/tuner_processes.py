@@ -662,8 +662,9 @@ class IsolatedSteps:
     def _receive_answer(self) -> Array | Proposal:
         """Receive the tuner's answer: points to simulate (A), or the end of its run (S).
 
-        A message has n points (n, dim), after one recommended point (dim,) if its flags are 1.
-        Anything else ends the process, because code of a tuner may send any bytes.
+        The body of a message ``A`` is [recommended point (dim,), if flags is 1] and then n points
+        (n, dim), with n in the field `size`. Any other message ends the process, because code of a
+        tuner may send any bytes.
 
         Raises:
             StopIteration: the tuner has stopped; the value is its reason.
@@ -685,6 +686,7 @@ class IsolatedSteps:
             or coordinates.size != (point_count + recommends) * dim
         ):
             raise self._child.fail_with_protocol_error("it requested no points")
+        # The tuner now waits for the evaluation of these points.
         self._waits = True
         if recommends:
             return Proposal(coordinates[dim:].reshape(point_count, dim), coordinates[:dim])

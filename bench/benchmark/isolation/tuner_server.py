@@ -199,12 +199,13 @@ def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
 def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     """Run the tuner on the task of a message, and exchange its proposals for evaluations.
 
-    At the end it sends S with the tuner's reason for stopping, or K after the harness closed the
-    run.
+    Its last message says how the run ended: ``S`` ("stopped") with the tuner's reason, or ``K``
+    ("OK") after the harness closed the run.
 
     Args:
         channel: Channel to the harness.
-        message: Message T with the arrays of the task.
+        message: Message of kind ``T`` ("task"): start point, observed signals, scales of the
+            channels, training data, budget of simulations, and lengths of the runs in samples.
         tuner: Tuner to run.
     """
     arrays = unpack_arrays(message.body)
@@ -221,9 +222,11 @@ def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     steps = tuner.tune(task, make_generator(arrays))
     try:
         _exchange_evaluations(channel, steps, task)
+    # The generator's return value is the tuner's reason for stopping.
     except StopIteration as stop:
         reason = str(stop.value or "the tuner stopped")
         channel.send(b"S", reason.encode("utf-8", "replace")[: MAX_TEXT_BYTES // 2])
+    # The harness closed the run, for example because the budget is used up.
     except GeneratorExit:
         steps.close()
         channel.send(b"K")

@@ -59,7 +59,9 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
         Hashes by readable name.
     """
     return {
-        # The salt is secret until the end, but its commitment exists from the beginning.
+        # The salt is secret until the end, and then revealed in the configuration. It is blanked
+        # here, so that this does not change the hash. `salt_sha256`, the commitment to the salt,
+        # is part of the configuration from the beginning.
         "configuration": compute_digest(experiment.name, experiment.chosen(salt="").document())
         if experiment.salt_sha256
         else compute_digest(experiment.name, experiment.document()),

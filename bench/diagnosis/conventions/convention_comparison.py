@@ -185,50 +185,63 @@ class ConventionComparison:
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
-            suspects = self._list_suspect_joints(self._filter_runs(self._select_parts(corrected)))
+            suspects = self._list_suspect_joints(
+                self._filter_runs(self._select_segments(corrected))
+            )
             best = self._find_best_hypothesis(corrected, suspects) if suspects else None
             if best is None:
                 break
             differences.append(best)
             corrected = best.hypothesis.applied(corrected)
         hypotheses = [difference.hypothesis for difference in differences]
-        if not differences or not self._is_confirmed(described, corrected, hypotheses):
+        if not differences or not self._are_conventions_confirmed(described, corrected, hypotheses):
             return []
         return differences
 
-    def _is_confirmed(
+    def _are_conventions_confirmed(
         self,
         described: Recording,
         corrected: Recording,
         hypotheses: Sequence[ConventionHypothesis],
     ) -> bool:
-        """Return whether the conventions explain the log better than any set of causes.
+        """Return whether the corrected conventions explain the log better than missing effects do.
 
-        They must also remove most of the missing force, and increase the log-likelihood of all
-        samples.
+        A wrong sign and a missing effect (a cause, such as friction) can leave similar residuals,
+        so a correction must meet all criteria:
+
+        1. It removes most of the missing force (the process noise that the filter needs).
+        2. Its log-likelihood exceeds that of any causes added to the log as described. Both are
+           computed on the segments with the largest movement, which are fast to filter.
+        3. If the filter diverges on the log as described, criterion 2 always holds. Then the
+           correction must leave almost no missing force.
+        4. It increases the log-likelihood of all samples that both versions of the log have.
+
+        Log-likelihoods are those of the recorded values: changing the unit of a signal rescales its
+        density, which `_compute_log_scale_correction` undoes.
 
         Args:
             described: Recording as it is described.
             corrected: Recording with its conventions corrected.
             hypotheses: Differences of the conventions that were corrected.
         """
-        # The comparison with causes takes longest.
+        # 1. Tested first, as the comparison with causes takes longest.
         if not self._removes_missing_force(described, corrected):
             return False
-        parts = self._select_parts(corrected)
+        # 2. Conventions against causes.
+        segments = self._select_segments(corrected)
         with_conventions = _get_log_likelihood(
-            self._filter_runs(parts)
-        ) + _compute_log_scale_correction(hypotheses, parts)
+            self._filter_runs(segments)
+        ) + _compute_log_scale_correction(hypotheses, segments)
         with_causes = self._compute_log_likelihood_of_causes(corrected)
         if with_conventions < with_causes + CAUSES_MARGIN:
             return False
-        # If the filter diverges on the log as described, causes cannot be compared: only a
-        # correction that leaves nothing unexplained is certain.
+        # 3. Minus infinity: the filter diverged, so causes could not be compared.
         if (
             np.isinf(with_causes)
             and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE
         ):
             return False
+        # 4. All samples that both recordings have.
         before, after = (
             _get_log_likelihood(self._filter_runs(recording))
             for recording in _cut_to_common_samples(described, corrected)
@@ -257,7 +270,7 @@ class ConventionComparison:
         Args:
             recording: Recording under one hypothesis.
         """
-        followed = self._filter_runs(self._select_parts(recording))
+        followed = self._filter_runs(self._select_segments(recording))
         return (
             float((followed.force / followed.typical).max())
             if followed.has_expected_innovations
@@ -368,7 +381,7 @@ class ConventionComparison:
             robot, recording
         ):
             return -np.inf
-        parts = self._select_parts(hypothesis.applied(recording), run)
+        parts = self._select_segments(hypothesis.applied(recording), run)
         forces = compute_joint_forces(robot, parts, parts.runs[0])
         squares = np.square(forces.needed - forces.driven).mean(axis=0)
         return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
@@ -445,7 +458,7 @@ class ConventionComparison:
             run: Number of the only run; None for all runs with parts.
         """
         self.evaluations += 1
-        parts = self._select_parts(hypothesis.applied(recording), run)
+        parts = self._select_segments(hypothesis.applied(recording), run)
         followed = self._filter_runs(parts, max_linearisations=1)
         return _get_log_likelihood(followed) + _compute_log_scale_correction([hypothesis], parts)
 
@@ -481,7 +494,7 @@ class ConventionComparison:
             corrected: Recording with its conventions corrected.
         """
         subject = self.subject
-        parts = self._select_parts(subject.recording)
+        parts = self._select_segments(subject.recording)
         evaluator = RunEvaluator(
             subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
         )
@@ -517,7 +530,7 @@ class ConventionComparison:
             return best
         return max(best, selected.log_likelihood - penalty)
 
-    def _select_parts(self, recording: Recording, run: int | None = None) -> Recording:
+    def _select_segments(self, recording: Recording, run: int | None = None) -> Recording:
         """Return the parts of some training runs with the largest movement.
 
         Args:

@@ -355,8 +355,12 @@ def _map_effects_to_model(
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
 
+    The effects of a system have no place, as it has one joint. Effects of a robot need one, so
+    each gets the name of the joint, actuator or channel on which it acts.
+
     A friction law that MuJoCo does not have becomes a constant dry friction (its mean over the
-    runs), with a note.
+    runs), with a note. All such means are added to the fitted Coulomb friction, if there is one,
+    because MuJoCo has one ``frictionloss`` for each joint.
 
     Args:
         sheet: content of the data sheet, with the fitted effects.
@@ -364,7 +368,7 @@ def _map_effects_to_model(
         model: the MJCF model.
 
     Returns:
-        Coefficients by effect and place, and the notes.
+        Coefficients by name of the effect with its place (``EFFECT@PLACE``), and the notes.
     """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
@@ -373,7 +377,7 @@ def _map_effects_to_model(
         "actuator": model.actuator,
         "channel": model.signals["q"],
     }
-    causes: dict[str, Mapping[str, FittedValue]] = {}
+    coefficients_by_place: dict[str, Mapping[str, FittedValue]] = {}
     dry_friction, notes = 0.0, []
     for name, numbers in sheet.extended.effects.items():
         effect = library.get_effect(name)
@@ -390,10 +394,10 @@ def _map_effects_to_model(
         coefficients = {
             c.name: numbers.get(c.name, zero_value) for c in effect.on(sheet.subject.kind.system)
         }
-        causes[f"{name}@{place}" if place else name] = coefficients
+        coefficients_by_place[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
         key = f"friction.coulomb@{model.joint}"
-        fitted_friction = causes.get(key, {}).get("coefficient")
+        fitted_friction = coefficients_by_place.get(key, {}).get("coefficient")
         total = dry_friction + (fitted_friction.value if fitted_friction else 0.0)
-        causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
-    return causes, notes
+        coefficients_by_place[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
+    return coefficients_by_place, notes

@@ -113,7 +113,12 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
 
 
 def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:
-    """Return half the log-determinant of whitening at unit variance: -m/2 log(1 - φ²).
+    """Return the log-determinant term of the Gaussian log-likelihood of AR(1) noise.
+
+    It is -1/2 log det Σ, where Σ is the correlation matrix of the noise of a channel, summed over
+    the channels. For AR(1) noise it equals -m/2 log(1 - φ²), where m is the number of recorded
+    samples whose preceding sample is also recorded. The standard deviations of the channels enter
+    the log-likelihood separately.
 
     Shapes: R runs, T samples, C channels.
 

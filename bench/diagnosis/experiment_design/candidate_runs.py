@@ -125,7 +125,10 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
 
 
 def _get_effort_limit(robot: Any, joint: Any) -> Interval:
-    """Return the interval of the total actuator force on a joint, in N or N·m.
+    """Return the interval of the effort of all actuators on a joint, in N or N·m.
+
+    A proposed run must not ask for more than the joint's limit. It is unlimited if the model file
+    states no limit of the effort (``actuatorfrcrange`` in MJCF, ``effort`` in URDF).
 
     Args:
         robot: model of the robot.
@@ -133,6 +136,7 @@ def _get_effort_limit(robot: Any, joint: Any) -> Interval:
     """
     if joint.effort is None:
         return UNLIMITED
+    # `joint.effort` is only the upper limit; the compiled model has both.
     low, high = robot.compiled.jnt_actfrcrange[joint.id].tolist()
     return low, high
 

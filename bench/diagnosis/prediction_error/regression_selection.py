@@ -320,13 +320,14 @@ class Regression:
 
 
 def _normalise_gram(gram: Array, columns: IndexArray) -> tuple[Array, Array]:
-    """Return the scaled normal matrix of some columns, and the lengths of these columns.
+    """Return the scaled normal matrix of some regression columns, and their lengths.
 
-    Its diagonal is one plus the ridge.
+    Columns of effects differ by many orders of magnitude. Scaling them to unit length, and adding
+    a small ridge to the diagonal, keeps the normal equations well conditioned.
 
     Args:
-        gram: (K, K) G of eq. (1).
-        columns: (k,) indices of the columns.
+        gram: (K, K) inner products of all regression columns, G = Wᵀ W of the module's eq. (1).
+        columns: (k,) indices of the columns to use.
 
     Returns:
         Matrix (k, k), and lengths (k,).

@@ -327,7 +327,7 @@ def render_report(
     if report.held_out:
         residual_split, residual_runs = report.held_out, report.validation_run
     open_verdict = verdict.verdict if verdict.cut is None else "unidentifiable"
-    splits = _list_splits(report)
+    splits = _list_error_rows(report)
     return page.render(
         _TEMPLATE,
         # Report data.
@@ -538,20 +538,24 @@ class ChannelRow(NamedTuple):
     errors: list[str]
 
 
-def _list_splits(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
-    """List name, runs, and `` before`` or `` after``, of each error of a channel.
+def _list_error_rows(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
+    """List the sets of runs and models for which the table states the error of each channel.
 
-    The fitted and the held-out runs are reported separately, each before and after the causes are
-    added.
+    The fitted and the held-out runs have separate rows. If causes were found, each has two rows:
+    for the model before and after they are added.
 
     Args:
         report: Data of the report.
+
+    Returns:
+        Name of the set of runs ("fitted", "held-out" or "left-out"), its runs, and the suffix of
+        the row's label: " before", " after", or nothing if no causes were found.
     """
     model_suffixes = (" before", " after") if report.verdict.causes else ("",)
-    splits = [("fitted", report.fitting), (report.validation_run, report.held_out)]
+    run_sets = [("fitted", report.fitting), (report.validation_run, report.held_out)]
     return [
         (name, split, model_suffix)
-        for name, split in splits
+        for name, split in run_sets
         if split is not None and len(split.names)
         for model_suffix in model_suffixes
     ]
@@ -561,11 +565,11 @@ def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
     """List each channel with its noise, the source of the noise, and its RMS errors.
 
     `columns` has one array (C,) of errors for each combination of runs and model; see
-    `_list_splits`.
+    `_list_error_rows`.
     """
     columns = [
         compute_channel_errors(split)[:, int(model_suffix == " after")]
-        for _, split, model_suffix in _list_splits(report)
+        for _, split, model_suffix in _list_error_rows(report)
     ]
     rows = []
     for i, channel in enumerate(report.channels):

@@ -367,12 +367,15 @@ def select_worst_run(report: DiagnosisReportData) -> RunView:
 
 
 def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
-    """Format the name of the run, and why `select_worst_run` has selected it.
+    """Format the phrase of a caption that names a run and says why it is shown.
+
+    For example "Run swing3, the held-out run with the largest gap".
 
     Args:
         report: content of the report, whose verdict gives the reason.
-        view: the selected run.
+        view: the run that `select_worst_run` selected.
     """
+    # `validation_run` is an adjective: "held-out" or "left-out".
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
     return f"Run {shorten_label(view.data_split.names[view.row])}, the {kind} {reason}"

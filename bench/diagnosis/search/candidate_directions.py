@@ -178,7 +178,7 @@ def iterate_first_probes(
             )
         group += 1
     if first_coefficient.of == "stop":
-        yield from _make_end_stop_probes(evaluator, name, group)
+        yield from _make_end_stop_candidates(evaluator, name, group)
         return
     lowest, _ = parameters[0].bounds
     # A small limit does not act like a large one, so limits are tried at values that the input
@@ -207,17 +207,19 @@ def _is_contained_in_model(
     return bool(members & set(evaluator.available_effects[name].contains))
 
 
-def _make_end_stop_probes(
-    evaluator: RunEvaluator, name: str, first_group: int
+def _make_end_stop_candidates(
+    evaluator: RunEvaluator, name: str, first_grid_point: int
 ) -> Iterator[CandidateDirection]:
     """Yield end stops of several depths and stiffnesses at both ends of the range of a coordinate.
 
-    Each is one candidate that is valid only at its size.
+    The response to an end stop is not proportional to its coefficients: the coordinate touches it
+    only beyond a position. So a derivative at zero says nothing, and each combination is simulated
+    as it is, as one candidate.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator of the recorded runs.
         name: name of the end-stop effect.
-        first_group: number of the first grid point.
+        first_grid_point: number of the first candidate; the following ones count up from it.
     """
     end_stops = [
         coefficients
@@ -226,12 +228,14 @@ def _make_end_stop_probes(
             evaluator, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
         )
     ]
-    for group, coefficients in enumerate(end_stops, start=first_group):
+    for grid_point, coefficients in enumerate(end_stops, start=first_grid_point):
         yield CandidateDirection(
             effect=name,
-            grid_point=group,
+            grid_point=grid_point,
             coefficient_index=0,
             coefficients=coefficients,
+            # Its score is not restricted to a positive sign: the sign of the first coefficient
+            # tells the end of the range, and both are valid.
             can_be_negative=True,
             is_single_size=True,
         )

@@ -163,7 +163,7 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
         evaluator.begin_at(states, deviations)
         search.models.clear()
         search.add_fit(base.fit)
-        for start in _list_single_starts(search):
+        for start in _list_single_effect_starts(search):
             fits.append(_fit_about_its_first_states(search, start))
             if _is_explained(search, fits[-1]):
                 break
@@ -174,32 +174,41 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
     return None
 
 
-def _list_single_starts(search: EffectSearch) -> list[FitStart]:
-    """Return starts of the effects that explain most from the initial states of the base model.
+def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
+    """Return starts of fits with one effect each, best first.
 
-    Effects at contacts are scanned over their range. Of the others, those with the best scores are
-    fitted, and the members of a fitted family are tried alone. An effect with more coefficients has
-    to explain more.
+    They start at the initial states of the base model. Their rank is the number of coefficients
+    times the remaining sum of squares (the cost), lower is better. So an effect with more
+    coefficients has to explain more.
+
+    1. Effects at contacts are scanned over the range of their coefficient, without a fit.
+    2. Of all other effects, those with the best scores are fitted.
+    3. Of a fitted family (one effect at all joints), each member is also tried alone.
 
     Args:
-        search: Search with its models.
+        search: Search with its models. The fits of step 2 are added to `search.models`.
     """
     base, evaluator = search.base_model, search.evaluator
     states = base.fit.initial_states
-    ranked = [
+    # 1. Effects at contacts.
+    ranked_starts = [
         (value.squares, _make_start(search, value, states))
         for value in _rank_effects_at_contacts(search, base)
     ]
+    # 2. The other effects; `refit_extensions` adds its fits to `search.models`.
     exclude_laws_with_many_shapes(search)
     search.refit_extensions([base], MAX_REFITTED_CANDIDATES)
     for model in search.models.values():
         if model.effects:
-            count = len(evaluator.get_coefficient_indices(model.effects[0]))
-            ranked.append((count * model.fit.cost, model.fit.make_start()))
-            ranked += _list_member_starts(search, model)
+            coefficient_count = len(evaluator.get_coefficient_indices(model.effects[0]))
+            ranked_starts.append((coefficient_count * model.fit.cost, model.fit.make_start()))
+            # 3. Members of a family.
+            ranked_starts += _list_member_starts(search, model)
     limit = MAX_SCAN_RATIO * base.fit.cost
-    useful = sorted((pair for pair in ranked if pair[0] < limit), key=lambda pair: pair[0])
-    return [start for _, start in useful[:MAX_TRIED_EFFECTS]]
+    useful_starts = sorted(
+        (pair for pair in ranked_starts if pair[0] < limit), key=lambda pair: pair[0]
+    )
+    return [start for _, start in useful_starts[:MAX_TRIED_EFFECTS]]
 
 
 def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[float, FitStart]]:

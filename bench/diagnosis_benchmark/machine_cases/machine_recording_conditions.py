@@ -196,11 +196,15 @@ def draw_conditions(
 
 
 def _draw_servo_parameters(rng: np.random.Generator) -> dict[str, float]:
-    """Draw the fitted parameters of a servo; its other constants are those of the simulator.
+    """Draw the true parameters of the servo of a synthetic recording.
+
+    Diagnosers have to find them, so they differ between recordings. The ranges are those of
+    typical servos. Only parameters that diagnosers fit are random; all other constants are those
+    of the simulator.
 
     Returns:
-        Torque constant in N m/A, resistance in Ohm, inertia of the rotor in kg m^2, and the
-        constants, by name.
+        All parameters by name: torque constant in N m/A, resistance in Ohm, inertia of the rotor
+        in kg m^2, and the constants of the simulator.
     """
     fitted_parameters = {
         # In N m/A, Ohm and kg m².

@@ -132,13 +132,14 @@ def guess_role(column: LogColumn) -> Role | None:
         return "command"
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
-    return _guess_measured_role(column_words) or _guess_measured_role(file_words)
+    return _guess_role(column_words) or _guess_role(file_words)
 
 
 def get_commanded_role(column: LogColumn) -> Role | None:
-    """Return the quantity that a command sets: position, velocity or force; None if unknown.
+    """Return the role of a command: it sets a position, a velocity or a force; None if unknown.
 
-    The column's name and unit are used first, then its file's name.
+    The quantity that belongs to the column's unit decides (such as "angle" for rad). Without a
+    unit, words of the column's name do, then words of its file's name.
     """
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
@@ -146,7 +147,7 @@ def get_commanded_role(column: LogColumn) -> Role | None:
         return "position"
     column_words, file_words = _split_into_words(column)
     # `joint_command` gives no more information than `command`; `joint_position_command` does.
-    return _guess_measured_role(column_words - _WEAK_ROLE_WORDS) or _guess_measured_role(
+    return _guess_role(column_words - _WEAK_ROLE_WORDS) or _guess_role(
         file_words - _WEAK_ROLE_WORDS
     )
 
@@ -163,8 +164,8 @@ def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
     return set(split_name(column.bare)), set(split_name(stem))
 
 
-def _guess_measured_role(words: set[str]) -> Role | None:
-    """Return the role of a measured signal that some words indicate; None if there is none.
+def _guess_role(words: set[str]) -> Role | None:
+    """Return the role of a signal that words indicate; None if they indicate none.
 
     Args:
         words: Words of a column's or file's name, in lower case.

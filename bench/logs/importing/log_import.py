@@ -167,7 +167,12 @@ class DescriptionWriter:
         return [*lines, ""]
 
     def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
-        """Estimate the gains of a servo that the model file lacks, and note their origin.
+        """Estimate the gains of a servo that the model file lacks, and tell the user their origin.
+
+        If the log moves the joint, the gains are free: `explain` fits them, starting from values
+        measured from the response to the command, or else from those of a typical servo. This is
+        listed with the guesses. If the log does not move the joint, the gains are fixed and only
+        hold its position. The user has to check this, so it is listed with the checks.
 
         Args:
             name: name of the new servo.

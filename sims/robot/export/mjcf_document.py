@@ -412,7 +412,9 @@ class MjcfDocument:
         tags_by_element = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
         tags_by_element |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
         tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
-        _compare_with_model(tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators)))
+        _check_elements_match_model(
+            tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators))
+        )
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         pair_ids = {
             frozenset(str(model.geom(geom).name) for geom in geoms): i
@@ -535,10 +537,13 @@ class MjcfDocument:
                 tag.new["file"] = str((self.path.parent / name).resolve())
 
 
-def _compare_with_model(
+def _check_elements_match_model(
     tags_by_element: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
 ) -> None:
-    """Raise an error if elements differ from those of the compiled model.
+    """Check that the text has the elements of the compiled model, in the same order.
+
+    Edits find the text of an element by its index in the compiled model. If the compiler added,
+    removed or reordered elements, they would change the wrong element.
 
     Args:
         tags_by_element: element of the text for each body, joint and actuator of the model.
@@ -546,7 +551,7 @@ def _compare_with_model(
         counts: numbers of bodies, joints and actuators in the text.
 
     Raises:
-        NotEditableError: they differ.
+        NotEditableError: the numbers, the names or the order of the elements differ.
     """
     compiled_counts = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
     if counts != compiled_counts:

@@ -39,18 +39,23 @@ class ExcitationCommand(NamedTuple):
     Attributes:
         name: name of the input.
         centre: mean value.
-        size: amplitude.
+        amplitude: amplitude of the oscillation about `centre`.
         address: index of the control, or of the generalised force.
     """
 
     name: str
     centre: float
-    size: float
+    amplitude: float
     address: int
 
     def to_signal_text(self, share: float) -> str:
-        """Format as a signal text, with the amplitude multiplied by a share."""
-        signal_text = f"multisine:{share * self.size:.4g}:{MIN_COMMAND_HZ:g}:{MAX_COMMAND_HZ:g}"
+        """Format as the text that describes a signal in a recording's description file.
+
+        Args:
+            share: factor of the amplitude, from 0 to 1, which keeps the joints in their ranges.
+        """
+        amplitude = share * self.amplitude
+        signal_text = f"multisine:{amplitude:.4g}:{MIN_COMMAND_HZ:g}:{MAX_COMMAND_HZ:g}"
         return f"{self.centre:.6g} + {signal_text}" if self.centre else signal_text
 
 
@@ -203,13 +208,17 @@ def _make_command(
 def _stays_within_ranges(
     robot: RobotModel, joints: Sequence[Joint], commands: Sequence[ExcitationCommand], share: float
 ) -> bool:
-    """Return whether no joint leaves its range under commands of reduced amplitude in phase.
+    """Simulate commands of reduced amplitude, and return whether no joint leaves its range.
+
+    The largest share for which this holds becomes the amplitude of the default recording. As the
+    worst case, all commands are one sine with the frequency `CENTRE_FREQUENCY`, in phase, for
+    `TRIAL_SECONDS`.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: the robot with its compiled MuJoCo model.
         joints: joints to check.
         commands: commands with full amplitude.
-        share: share of the amplitude, from 0 to 1.
+        share: factor of all amplitudes, from 0 to 1.
     """
     import mujoco
 
@@ -223,12 +232,12 @@ def _stays_within_ranges(
         np.minimum(low, model.qpos0[addresses_of_joints]),
         np.maximum(high, model.qpos0[addresses_of_joints]),
     )
-    control_array: Any = (
-        data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
-    )
-    addresses = [c.address for c in commands]
-    centres = np.array([c.centre for c in commands])
-    amplitudes = share * np.array([c.size for c in commands])
+    # Inputs named "u.NAME" are commands of actuators; others are forces applied at the joints.
+    has_actuators = any(command.name.startswith("u.") for command in commands)
+    control_array: Any = data.ctrl if has_actuators else data.qfrc_applied
+    addresses = [command.address for command in commands]
+    centres = np.array([command.centre for command in commands])
+    amplitudes = share * np.array([command.amplitude for command in commands])
     for k in range(int(TRIAL_SECONDS / model.opt.timestep)):
         control_array[addresses] = centres + amplitudes * np.sin(
             CENTRE_FREQUENCY * k * model.opt.timestep
