@@ -162,10 +162,15 @@ class ConventionComparison:
         self._generator = HypothesisGenerator(subject)
 
     def differences(self) -> list[ConventionDifference]:
-        """Return the conventions that differ, in the order of the search; empty if none.
+        """Return the conventions of the log that differ from the model file.
 
-        If commands are copies of measurements, only these are returned: without commands, no other
-        convention can be compared.
+        Commands that are copies of measurements are returned alone: without commands, no other
+        convention can be compared. Otherwise the search is greedy:
+
+        1. Find the joints at which the filter needs a missing force (suspects).
+        2. Select the best hypothesis about them, and correct the log by it.
+        3. Repeat from 1 until no hypothesis is clearly better.
+        4. Confirm all corrections together; if they are not confirmed, return none.
         """
         copies = [
             ConventionDifference(
@@ -185,14 +190,17 @@ class ConventionComparison:
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
+            # 1. Suspects.
             suspects = self._list_suspect_joints(
                 self._filter_runs(self._select_segments(corrected))
             )
+            # 2. The best hypothesis.
             best = self._find_best_hypothesis(corrected, suspects) if suspects else None
             if best is None:
                 break
             differences.append(best)
             corrected = best.hypothesis.applied(corrected)
+        # 4. Confirmation.
         hypotheses = [difference.hypothesis for difference in differences]
         if not differences or not self._are_conventions_confirmed(described, corrected, hypotheses):
             return []
@@ -250,7 +258,7 @@ class ConventionComparison:
         return after > before + LOG_LIKELIHOOD_MARGIN
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
-        """Return whether the corrections leave only a small part of the largest missing force.
+        """Return whether the corrections remove most of the largest missing force of a joint.
 
         Args:
             described: recording with the conventions of its description.
@@ -260,29 +268,27 @@ class ConventionComparison:
         return after <= MAX_REMAINING_FORCE * before
 
     def _compute_largest_missing_force(self, recording: Recording) -> float:
-        """Return the largest missing force of a joint, as a share of its typical force.
+        """Return the largest missing force of a joint, relative to its typical force.
 
-        It is infinite if the filter diverges.
-
-        A missing force is the process noise with which the filter has to follow the readings; it is
-        large if a convention is wrong.
+        A missing force is the process noise with which the filter has to follow the readings. It is
+        large if a convention is wrong, and infinite if the filter diverges.
 
         Args:
             recording: Recording under one hypothesis.
         """
-        followed = self._filter_runs(self._select_segments(recording))
+        filtered_runs = self._filter_runs(self._select_segments(recording))
         return (
-            float((followed.force / followed.typical).max())
-            if followed.has_expected_innovations
+            float((filtered_runs.force / filtered_runs.typical).max())
+            if filtered_runs.has_expected_innovations
             else np.inf
         )
 
     def _list_suspect_joints(self, filtered_runs: FollowedRuns) -> list[JointSignals]:
-        """Return the joints at which the filter needs a large missing force.
+        """Return the joints whose conventions may be wrong.
 
-        The missing force is the standard deviation of the force noise (process noise) with which
-        the filter follows the readings. A wrong sign, unit or joint order shows as such a force. If
-        the filter diverges, all joints are suspects.
+        These are the joints at which the filter needs a large missing force: the standard deviation
+        of the force noise (process noise) with which it follows the readings. A wrong sign, unit or
+        joint order shows as such a force. If the filter diverges, all joints are suspects.
 
         Args:
             filtered_runs: Result of the filter, with the missing and the typical force of each
@@ -291,24 +297,33 @@ class ConventionComparison:
         if not filtered_runs.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
-        shares = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
-        is_missing = filtered_runs.missing_forces.any() or shares.max() > ABSURD_MISSING_FORCE
-        if not is_missing or shares.max() <= MIN_MISSING_FORCE:
+        relative_forces = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
+        is_missing = (
+            filtered_runs.missing_forces.any() or relative_forces.max() > ABSURD_MISSING_FORCE
+        )
+        if not is_missing or relative_forces.max() <= MIN_MISSING_FORCE:
             return []
-        limit = min(SUSPECT_SHARE * max(1.0, float(shares.max())), MAX_SUSPECT_LIMIT)
-        if shares.max() < LARGE_MISSING_FORCE:
-            limit = SIMILAR_SHARE * float(shares.max())
-        share_of = dict(zip(coordinates, shares.tolist(), strict=True))
-        return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
+        limit = min(SUSPECT_SHARE * max(1.0, float(relative_forces.max())), MAX_SUSPECT_LIMIT)
+        if relative_forces.max() < LARGE_MISSING_FORCE:
+            limit = SIMILAR_SHARE * float(relative_forces.max())
+        relative_force_of = dict(zip(coordinates, relative_forces.tolist(), strict=True))
+        return [j for j in self._generator.joints if relative_force_of[f"q.{j.name}"] > limit]
 
     def _find_best_hypothesis(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> ConventionDifference | None:
-        """Return the convention with which the model predicts the recording clearly best.
+        """Return the convention with which the model predicts the recording clearly best, or None.
 
-        Each hypothesis about the suspects is evaluated by the log-likelihood of a Kalman filter.
-        Return None if none exceeds that of the log as described by `LOG_LIKELIHOOD_MARGIN`.
+        Its log-likelihood must exceed that of the log as described by `LOG_LIKELIHOOD_MARGIN`.
+        Filtering all runs is slow, so cheap tests come first:
+
+        1. Compute the limits that a hypothesis has to exceed, on all runs and on the worst run.
+        2. Reject hypotheses by inverse dynamics, then by a filter on the worst run.
+        3. Compute the log-likelihood of the others on all runs.
+        4. Refine free offsets, and require that factors of inputs are better than no inputs.
+        5. Of equally likely hypotheses, select the simplest; the others are stated with it.
         """
+        # 1. Limits.
         described = ConventionHypothesis("")
         limit = self._compute_log_likelihood(described, recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses already fail on the run that the log as described explains worst.
@@ -328,6 +343,7 @@ class ConventionComparison:
             if key in evaluated_changes:
                 continue
             evaluated_changes.append(key)
+            # 2. Cheap tests.
             growth = self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
             if growth > MAX_FORCE_ERROR_GROWTH:
                 continue
@@ -336,11 +352,13 @@ class ConventionComparison:
                 > min_log_likelihood
             ):
                 continue
+            # 3. All runs.
             score = self._compute_log_likelihood(hypothesis, recording)
             # For several offsets of one signal, the best one is refined.
             best_known = best_by_description.get(hypothesis.description, (limit, hypothesis))
             if score > best_known[0]:
                 best_by_description[hypothesis.description] = score, hypothesis
+        # 4. Refinement.
         ranked = sorted(best_by_description.values(), key=lambda pair: -pair[0])
         refined = [self._refine_offset(*pair, recording) for pair in ranked[:MAX_REFINED]]
         accepted = [
@@ -350,6 +368,7 @@ class ConventionComparison:
         ]
         if not accepted:
             return None
+        # 5. The simplest of the best.
         best = max(score for score, _ in accepted)
         equally_likely = [
             rated_hypothesis
@@ -363,11 +382,13 @@ class ConventionComparison:
     def _compute_log_force_error(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int
     ) -> float:
-        """Return the logarithm of the joint forces that the drives lack on the short part of a run.
+        """Return how much joint forces and drives disagree under a hypothesis (logarithm).
 
-        The forces are computed by inverse dynamics, and the logarithms of all joints are added. If
-        the forces cannot be computed, or the hypothesis is about another quantity than positions
-        and inputs, the result is minus infinity.
+        Inverse dynamics of the recorded motion gives the force that each joint needs; the drives
+        give another one if a sign or a unit is wrong. This takes less time than a filter. The
+        result is the sum over the joints of the logarithm of the RMS difference, on the segment of
+        one run. It is minus infinity (no objection) if the forces cannot be computed, or if the
+        hypothesis does not concern positions.
 
         Args:
             hypothesis: assumed conventions, such as another sign of a joint.
@@ -381,22 +402,23 @@ class ConventionComparison:
             robot, recording
         ):
             return -np.inf
-        parts = self._select_segments(hypothesis.applied(recording), run)
-        forces = compute_joint_forces(robot, parts, parts.runs[0])
+        segment = self._select_segments(hypothesis.applied(recording), run)
+        forces = compute_joint_forces(robot, segment, segment.runs[0])
         squares = np.square(forces.needed - forces.driven).mean(axis=0)
         return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
 
     def _uses_inputs(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
     ) -> bool:
-        """Return whether a hypothesis on units of inputs alone is better than no inputs at all.
+        """Return whether a hypothesis on units of inputs is better than having no inputs at all.
 
-        A factor that only switches an input off is not a unit.
+        A factor near zero switches an input off. This can improve the likelihood of a wrong model,
+        but it is not a unit. Hypotheses on other signals are accepted as they are.
 
         Args:
             score: log-likelihood with the hypothesis.
-            hypothesis: hypothesis: changed signs, units or orders of signals.
-            recording: short part of the recording.
+            hypothesis: assumed conventions: changed signs, units or orders of signals.
+            recording: segments of the recording.
         """
         inputs = recording.runs[0].inputs
         changes = hypothesis.changes
@@ -412,14 +434,14 @@ class ConventionComparison:
     def _refine_offset(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
     ) -> tuple[float, ConventionHypothesis]:
-        """Improve the offset of a hypothesis by a pattern search.
+        """Improve the free offset of a hypothesis, such as a zero position, by a pattern search.
 
-        The method is that of R. Hooke, T. A. Jeeves, J. ACM 8(2), 212, 1961,
-        doi:10.1145/321062.321069.
+        The offset is moved by a step while the log-likelihood increases, then the step is halved
+        (R. Hooke, T. A. Jeeves, J. ACM 8(2), 212, 1961, doi:10.1145/321062.321069).
 
         Args:
             score: log-likelihood with the hypothesis.
-            hypothesis: the hypothesis, with a first offset.
+            hypothesis: hypothesis, with a first offset.
             recording: short part of the recording.
 
         Returns:
@@ -483,27 +505,43 @@ class ConventionComparison:
         return followed
 
     def _compute_log_likelihood_of_causes(self, corrected: Recording) -> float:
-        """Return the penalised log-likelihood of the log as described with the best set of causes.
+        """Return the log-likelihood of the log as described, with the best set of causes.
 
-        Each effect has a penalty of half the logarithm of the number of samples for each
-        coefficient (BIC), and of the logarithm of the number of effects. With large missing forces,
-        regression is inaccurate, so the likelihood is computed by filters with the effects in the
-        model. If the corrected log is not explained either, the larger of both is used.
+        Conventions must exceed it to be confirmed. Each effect is penalised by half the logarithm
+        of the number of samples for each coefficient (BIC), and by the logarithm of the number of
+        effects.
+
+        1. Filter the segments without effects. If this diverges, the result is minus infinity.
+        2. Select effects by regression of the filter's prediction errors.
+        3. Add the selected effects to the model one by one, and filter again: with large missing
+           forces, the regression is inaccurate.
+        4. Also try soft friction, which has no linear response.
+        5. If the corrected log is not explained either, the larger of regression and filters is
+           used.
 
         Args:
             corrected: Recording with its conventions corrected.
         """
         subject = self.subject
-        parts = self._select_segments(subject.recording)
+        segments = self._select_segments(subject.recording)
         evaluator = RunEvaluator(
-            subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
+            subject.kind,
+            segments,
+            segments.training(),
+            subject.engine,
+            list_hat_effects(subject.kind),
         )
+        # 1. No effects.
         filtered = FollowedRuns.follow(
-            evaluator, evaluator.get_nominal_theta(), _estimate_white_noise(evaluator, parts), None
+            evaluator,
+            evaluator.get_nominal_theta(),
+            _estimate_white_noise(evaluator, segments),
+            None,
         )
         if not filtered.has_expected_innovations:
             evaluator.close()
             return -np.inf
+        # 2. Regression.
         excluded_effects = MANY_SHAPES | CONVENTION_EFFECTS
         names = [
             name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
@@ -511,6 +549,7 @@ class ConventionComparison:
         probes = [probe for name in names for probe in iterate_first_probes(evaluator, (), name)]
         selected = identify(filtered, filtered.columns(probes))
         samples = int(filtered.runs.recorded.sum())
+        # 3. Filters with the effects.
         best, penalty = filtered.log_likelihood, 0.0
         for count, group in enumerate(selected.groups, start=1):
             penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
@@ -524,8 +563,10 @@ class ConventionComparison:
                 )
             fitted = _fit_coefficients(filtered.with_parameters(theta), groups)
             best = max(best, fitted.log_likelihood - penalty)
+        # 4. Soft friction.
         best = max(best, _compute_log_likelihood_of_soft_friction(filtered))
         evaluator.close()
+        # 5. Regression, if its result is the larger one.
         if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
@@ -650,9 +691,9 @@ def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
 
 
 def _select_liveliest_part(run: Run) -> slice:
-    """Return the part of a run, of `PART_SAMPLES` samples, in which its channels move most.
+    """Return the slice of a run, of `PART_SAMPLES` samples, in which its channels move most.
 
-    Hypotheses are compared on such parts, because whole runs would take too long.
+    Hypotheses are compared on such segments, because filtering whole runs would take too long.
     """
     # The commands after the end of a run are not known, and a hypothesis may move them.
     count = run.times.size - max(LATE_SAMPLES)
@@ -660,17 +701,18 @@ def _select_liveliest_part(run: Run) -> slice:
         return slice(0, max(count, min(run.times.size, 2)))
 
     def movement(begin: int) -> float:
-        """Sum the standard deviations of all channels in the part that starts at sample `begin`.
+        """Return how much all channels move in the segment that starts at sample `begin`.
 
-        Each is divided by the standard deviation of the channel in the whole run, so that channels
-        with different units can be added. Channels without samples in the part are skipped.
+        The movement of a channel is its standard deviation in the segment relative to that in the
+        whole run, so that channels with different units can be added. Channels without samples in
+        the segment are skipped.
         """
-        total = 0.0
+        movement_sum = 0.0
         for values in run.channels.values():
-            part = values[begin : begin + PART_SAMPLES]
-            if np.isfinite(part).any():
-                total += float(np.nanstd(part)) / max(float(np.nanstd(values)), 1e-12)
-        return total
+            segment = values[begin : begin + PART_SAMPLES]
+            if np.isfinite(segment).any():
+                movement_sum += float(np.nanstd(segment)) / max(float(np.nanstd(values)), 1e-12)
+        return movement_sum
 
     begins = range(0, count - PART_SAMPLES + 1, PART_SAMPLES // 2)
     best = max(begins, key=movement)

@@ -128,9 +128,9 @@ class ConventionHypothesis:
         earlier = {name: values[1] for name, values in run.before.items()}
 
         def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
-            """Return signals by name; a signal that differs is computed from `source`.
+            """Return signals by name, with those that the hypothesis changes converted.
 
-            `self.changes` has the changed signals of the hypothesis by name.
+            A change may need another signal, for example if two joints are exchanged.
 
             Args:
                 values: signals to convert, (T,) by name.
@@ -249,13 +249,18 @@ class HypothesisGenerator:
     def generate(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> Iterator[ConventionHypothesis]:
-        """Yield hypotheses.
+        """Yield hypotheses about the conventions of the log, those about single joints first.
+
+        1. Signs, zero positions and units of each suspect joint, and its wrapped angles.
+        2. Orders of the joints.
+        3. Units of the whole log, if at least half of the joints are suspects.
+        4. Commands that are recorded late.
 
         Args:
             recording: Recording as read, or with some conventions corrected.
-            suspects: Joints whose own conventions are tested. Conventions of the whole log are
-                tested if at least half of the joints are suspects.
+            suspects: Joints whose own conventions are tested.
         """
+        # 1. Single joints.
         suspects = [joint for joint in suspects if joint.channels]
         for joint in suspects:
             yield from _generate_signs(joint)
@@ -263,10 +268,13 @@ class HypothesisGenerator:
             for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
                 yield from _generate_units([self._signals[name]], recording)
         yield from _generate_wrapped_angles(suspects, recording)
+        # 2. Orders.
         yield from _generate_joint_orders(self.joints, recording, suspects)
+        # 3. The whole log.
         if 2 * len(suspects) >= len(self.joints):
             yield from self._generate_common_units(recording)
             yield from self._generate_normalised_positions()
+        # 4. Late commands.
         yield from _generate_late_commands(recording)
 
     def _generate_common_units(self, recording: Recording) -> Iterator[ConventionHypothesis]:
@@ -335,19 +343,22 @@ def _generate_zero_offsets(
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that the angle of a hinge is measured from another zero position.
 
-    Either the position and the command of its servo have the same offset, or the position alone. An
-    offset is a free angle in rad: several are tried, and the best one is refined later. If the
+    1. The position and the command of its servo have the same offset.
+    2. The position alone has an offset.
+
+    An offset is a free angle in rad: several are tried, and the best one is refined later. If the
     hinge has a servo, the offset of the position alone is estimated as the mean difference of
     command and position.
 
     Args:
-        joint: the joint and its recorded signals.
-        recording: the recording, of whose training runs the mean difference is taken.
+        joint: joint with its recorded signals.
+        recording: recording, of whose training runs the mean difference is taken.
     """
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
         return
     tried_offsets = position_offsets = TRIED_ZERO_OFFSETS.tolist()
+    # 1. Position and command.
     if joint.servo_inputs:
         text = f"joint {joint.name} looks counted from another zero, command and position"
         for offset in tried_offsets:
@@ -357,6 +368,7 @@ def _generate_zero_offsets(
         command = joint.servo_inputs[0]
         differences = [run.inputs[command] - run.channels[position] for run in recording.training()]
         position_offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
+    # 2. Position alone.
     text = f"position {position} looks counted from another zero"
     for offset in position_offsets:
         if abs(offset) > MIN_OFFSET:
@@ -394,14 +406,15 @@ def _compute_largest_jump(values: Array) -> float:
 def _generate_joint_orders(
     joints: Sequence[JointSignals], recording: Recording, suspects: Sequence[JointSignals]
 ) -> Iterator[ConventionHypothesis]:
-    """Yield other orders of the joints: of channels, of commands, and of both.
+    """Yield hypotheses that the columns of the log belong to the joints in another order.
 
-    Pairs of suspects are exchanged. Orders of all joints are the alphabetical one, the reversed
-    one, and the one in which positions follow commands best. An order maps the index of a joint to
-    the index of the joint whose columns it has.
+    The channels, the commands, or both have this order. Pairs of suspects are exchanged. Orders of
+    all joints are the alphabetical one, the reversed one, and the one in which positions follow
+    commands best. An order maps the index of a joint to the index of the joint whose columns it
+    has.
 
     Args:
-        joints: signals of all joints, in the order of the model.
+        joints: joints with their signals, in the order of the model.
         recording: the recording, whose commands the positions may follow.
         suspects: joints whose columns may be exchanged.
     """
@@ -463,12 +476,13 @@ def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording
 def _generate_units(
     signals: Sequence[Signal], recording: Recording
 ) -> Iterator[ConventionHypothesis]:
-    """Yield hypotheses of another unit for signals that share a unit.
+    """Yield hypotheses that some signals have another unit than the description states.
 
-    If all values of an angle are integers, encoder ticks are tried as well.
+    The signals share a stated unit. If all values of an angle are integers, encoder ticks are tried
+    as well.
 
     Args:
-        signals: signals with the same specified unit.
+        signals: signals with the same stated unit.
         recording: recorded runs, with their channels, inputs and constants.
     """
     first_signal = signals[0]
@@ -549,6 +563,9 @@ def find_copied_commands(
 ) -> Iterator[tuple[str, str, str]]:
     """Find commands of servos that equal the measurement of their joint in all samples.
 
+    Such a log does not contain the command: a servo whose command equals its position exerts no
+    force.
+
     Args:
         recording: Recording of a robot.
         kind: Simulator class of the robot.
@@ -575,10 +592,11 @@ def find_copied_commands(
 
 
 def _find_likely_column(recording: Recording, channel: str) -> str:
-    """Find the column of the log that is the likely command of a recorded position.
+    """Find the column of the log that is probably the true command of a servo.
 
-    It is the column with the highest correlation that the description does not use. Return
-    `UNKNOWN_COLUMN` if none correlates enough.
+    The message proposes it to the user. Of the columns that the description does not use, it is the
+    one with the highest correlation to the recorded position. Return `UNKNOWN_COLUMN` if none
+    correlates enough.
 
     Args:
         recording: the recording, with its description and logs.

@@ -29,12 +29,12 @@ CORRECTED_KEYS = ("column", "unit", "scale", "offset", "unwrap")
 def correct_description(
     meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
 ) -> dict[str, Any]:
-    """Return the content of a description with conventions corrected one after another.
+    """Return the content of a description file with the conventions of the log corrected.
 
     Args:
-        meta: Content of the description.
+        meta: Content of the present description file.
         declared: Simulator of the robot, with the units of its signals.
-        differences: Differences to correct, in this order.
+        differences: Differences to correct, one after another in this order.
     """
     corrected = copy.deepcopy(dict(meta))
     units = {
@@ -88,11 +88,12 @@ def _move_to_column(
 def _change_scale(
     table: dict[str, Any], si: str, change: SignalChange, hypothesis: ConventionHypothesis
 ) -> dict[str, Any]:
-    """Return the table of a signal with another unit, scale or offset.
+    """Return the table of a signal in the description with a corrected unit, scale or offset.
 
-    With the gain g of the specified unit and the old scale k and offset b of the table, recorded
-    values r are g (k r + b) in SI units. The change converts them to c (g (k r + b)) + d, with its
-    factor c and its offset d in SI units.
+    With the gain g of the stated unit and the present scale k and offset b of the table, a recorded
+    value r is g (k r + b) in SI units. The correction converts this to c (g (k r + b)) + d, with
+    its factor c and its offset d in SI units. So the new scale is c k, and the new offset c b + d /
+    g.
 
     Args:
         table: present table of the signal in the description.
@@ -122,7 +123,7 @@ def _round_value(value: float) -> float:
 def list_changed_tables(
     meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
 ) -> Iterator[str]:
-    """Yield the tables of the signals that a correction changes, one line each.
+    """Yield the lines that a user has to change in the description, one for each corrected signal.
 
     Args:
         meta: Content of the description.

@@ -198,7 +198,7 @@ class Hypothesis:
         return {s.name: self.scale * _get_unit_gain(s, unit) / s.gain for s, unit in pairs}
 
     def make_error(self, file: str, before: float | None, after: float | None) -> RecordingFault:
-        """Describe the hypothesis as a fault of the recording, with the lines to change.
+        """Return the hypothesis as a fault of the recording, with the lines to change.
 
         Args:
             file: Name of the description file.
@@ -281,7 +281,9 @@ class Subject:
         return self.recording.path.with_suffix(".toml").name
 
     def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
-        """Return the recorded signals with the units that the description specifies.
+        """Return the recorded signals with the units that the description states.
+
+        They are the signals whose units may be wrong.
 
         Args:
             channels: Names of the recorded channels.
@@ -331,9 +333,11 @@ def find_wrong_units(
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
 
-    Each promising hypothesis rescales signals, and the base model is fitted again. A hypothesis is
-    accepted if it removes most of the misfit and other factors do not. Of several, the one with the
-    fewest signals is preferred; the others are stated as alternatives.
+    1. Stop if the base model explains every channel well enough.
+    2. Select promising hypotheses, which rescale some signals.
+    3. Fit the base model again with each. A hypothesis is accepted if it removes most of the misfit
+       and other factors do not, eq. (1) of the module docstring.
+    4. Of several, prefer the one with the fewest signals; state the others as alternatives.
 
     Args:
         subject: Recording and simulator to check.
@@ -344,21 +348,24 @@ def find_wrong_units(
     Returns:
         The fault; None if there is none, or no channel has a gross misfit.
     """
+    # 1. Misfit of the base model.
     is_recorded = np.isfinite(evaluator.observed)
     residual = np.where(is_recorded, evaluator.observed - base.fit.simulated, 0.0)
     shares = _compute_residual_shares(evaluator, residual, noise)
     if not (shares > MIN_BASE_RESIDUAL_SHARE).any():
         return None
+    # 2. Promising hypotheses.
     before = _compute_residual_rms(residual, is_recorded, noise)
     known_before = before if np.isfinite(before) else None
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
-    excess = MAX_REMAINING_SHARE * (before - 1.0)
+    max_excess = MAX_REMAINING_SHARE * (before - 1.0)
     accepted: list[tuple[Hypothesis, float]] = []
     alternative_texts: list[str] = []
+    # 3. Fits.
     for hypothesis in _select_promising(subject, hypotheses):
-        after, residual_share = _fit_rescaled(subject, hypothesis.factors(), 1.0 + excess)
-        if after - 1.0 > excess or residual_share > MAX_RESIDUAL_SHARE:
+        after, residual_share = _fit_rescaled(subject, hypothesis.factors(), 1.0 + max_excess)
+        if after - 1.0 > max_excess or residual_share > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction == "sharp":
@@ -371,6 +378,7 @@ def find_wrong_units(
             ]
     if not accepted:
         return None
+    # 4. Choice.
     # Among hypotheses that fit equally well, the simplest is preferred.
     lowest_misfit = min(after for _, after in accepted)
     equally_good = [pair for pair in accepted if pair[1] <= MAX_EQUAL_RATIO * lowest_misfit]
@@ -393,9 +401,15 @@ def find_wrong_units(
 def find_imitated_unit(
     subject: Subject, evaluator: RunEvaluator, cause: Cause, base: TrajectoryFit
 ) -> RecordingFault | None:
-    """Find the wrong unit or sign that a fitted gain of a sensor or an input imitates.
+    """Return the wrong unit or sign that a fitted gain of a sensor or an input probably is.
 
-    A gain that makes a reading nearly independent of the simulation is reported as a fault too.
+    The search may explain a wrong unit as a gain error: a gain of 57.3 is degrees instead of
+    radians. A gain that makes a reading nearly independent of the simulation is reported as a fault
+    too.
+
+    1. Find the signal that the gain scales.
+    2. Compare the gain with the factors of all units.
+    3. Test for a gain near zero.
 
     Args:
         subject: Recording and simulator to check.
@@ -406,6 +420,7 @@ def find_imitated_unit(
     Returns:
         The fault; None if the cause is not such a gain.
     """
+    # 1. The signal.
     effect = cause.effect.partition("@")[0]
     if effect not in ("sensor.gain", "input.gain") or len(cause.coefficients) != 1:
         return None
@@ -423,11 +438,12 @@ def find_imitated_unit(
     )
     if signal is None or not gain:
         return None
+    # 2. Units.
     # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
     for hypothesis in _generate_unit_hypotheses((signal,)):
-        wanted = hypothesis.factors()[signal.name]
-        if wanted * factor > 0 and abs(math.log(wanted / factor)) < GAIN_TOLERANCE:
+        unit_factor = hypothesis.factors()[signal.name]
+        if unit_factor * factor > 0 and abs(math.log(unit_factor / factor)) < GAIN_TOLERANCE:
             alternatives = tuple(
                 PARAMETER_AT_BOUND_TEXT.format(name)
                 for name in _list_parameters_at_bounds(evaluator, base)
@@ -435,6 +451,7 @@ def find_imitated_unit(
             return replace(
                 hypothesis.make_error(subject.file, None, None), alternatives=alternatives
             )
+    # 3. A gain near zero.
     if kind == "channels" and abs(gain) <= MIN_SENSOR_GAIN:
         message = (
             f"The fit makes {signal.signal_text} nearly independent of the simulation "
@@ -493,9 +510,10 @@ def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> l
 
 
 def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
-    """Compute the RMS residual beyond the noise, as a share of each channel's deviation (C,).
+    """Return the RMS residual beyond the noise, relative to each channel's deviation (C,).
 
-    It is 0 for a channel that does not move beyond its noise.
+    It is 0 for a channel that does not move beyond its noise. A large value means a gross misfit,
+    as a wrong unit causes.
 
     Shapes: R runs, T samples, C channels.
 
@@ -504,7 +522,7 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
         residual: (R, T, C) residual of the base model; zero where no sample exists.
         noise: noise of each channel.
     """
-    shares = []
+    residual_ratios = []
     for channel_index, sigma in enumerate(noise.sigma.tolist()):
         is_recorded = np.isfinite(evaluator.observed[..., channel_index])
         deviation = (
@@ -517,8 +535,8 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
             np.mean(np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf) ** 2)
         )
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
-        shares.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
-    return np.array(shares)
+        residual_ratios.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
+    return np.array(residual_ratios)
 
 
 def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
@@ -555,24 +573,29 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
 def _generate_hypotheses(
     signals: Sequence[Signal], suspects: frozenset[str] | None
 ) -> Iterator[Hypothesis]:
-    """Yield all hypotheses.
+    """Yield all hypotheses about wrong units and signs.
 
-    They concern single signals, all signals with one unit, logs in one system of units, and joints
-    whose direction is reversed.
+    1. One signal has another unit.
+    2. All signals with one stated unit have another one.
+    3. All signals are in another system of units, such as millimetres and degrees.
+    4. The direction of a joint is reversed in all its signals.
 
     Args:
         signals: recorded channels and inputs.
         suspects: names of the joints and actuators to check; None for all.
     """
+    # 1. Single signals.
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
             yield from _generate_unit_hypotheses((signal,))
     by_unit: dict[tuple[str, str, str], list[Signal]] = {}
     for signal in signals:
         by_unit.setdefault((signal.kind, signal.si, signal.specified_unit), []).append(signal)
+    # 2. Common unit.
     for same_unit_signals in by_unit.values():
         if len(same_unit_signals) > 1:
             yield from _generate_unit_hypotheses(tuple(same_unit_signals))
+    # 3. Systems of units.
     for units in UNIT_SYSTEMS:
         related_signals = [s for s in signals if s.si in units]
         for actual_units in (units, {si: si for si in units}):
@@ -587,6 +610,7 @@ def _generate_hypotheses(
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
             yield Hypothesis(tuple(related_signals), specified_units, 1.0 / UNITS[si][units[si]])
+    # 4. Reversed joints.
     yield from _generate_reversed_joints(signals, suspects)
 
 
@@ -637,14 +661,14 @@ def _generate_reversed_joints(
 
 
 def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Select the hypotheses that fit best from the starts of the base fit.
+    """Select the hypotheses that are worth a fit, by their misfit without a fit.
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
     the whole runs.
 
     Args:
-        subject: recording and simulator.
-        hypotheses: all hypotheses.
+        subject: recording with its simulator.
+        hypotheses: hypotheses to select from.
     """
 
     def best(hypotheses: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
@@ -652,11 +676,9 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
 
         The recording is simulated with the starting values of the base fit; nothing is fitted here.
 
-        `subject` is the recording with its simulator.
-
         Args:
             hypotheses: changes of units or signs of signals.
-            share: simulated share of each run, from 0 to 1.
+            share: fraction of each run that is simulated, from 0 to 1.
         """
         scores = []
         for hypothesis in hypotheses:
@@ -694,7 +716,7 @@ def _build_rescaled_evaluator(
 def _fit_rescaled(
     subject: Subject, factors: Mapping[str, float], max_rms: float = np.inf
 ) -> tuple[float, float]:
-    """Fit the base model to the rescaled recording.
+    """Fit the base model to the recording with some signals rescaled, and return its misfit.
 
     Args:
         subject: Recording and simulator to check.
@@ -740,10 +762,16 @@ def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float
 def _test_distinctness(
     subject: Subject, hypothesis: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
-    """Test whether a hypothesis is distinct from nearby factors, the second half of (1).
+    """Test whether a hypothesis fits clearly better than nearby factors, the second half of (1).
 
-    With the excess residual e(k) at factor k, the condition is e(k) < e(k / STEP) and e(k) < e(k
-    STEP), part of (1).
+    A wrong unit has one exact factor k. If other factors fit as well, the misfit has another
+    reason. With the excess residual e(k), the condition is e(k) < e(k / STEP) and e(k) < e(k STEP).
+    The tests are:
+
+    1. A reversed sign has no nearby factors.
+    2. A factor within 4 % of k that fits much better means a gain error.
+    3. Clearly different factors must fit worse.
+    4. Parameters may absorb the scale of an input. Then a factor of zero must fit clearly worse.
 
     Args:
         subject: Recording and simulator to check.
@@ -762,21 +790,25 @@ def _test_distinctness(
             0
         ]
 
+    # 1. Sign.
     if hypothesis.scale == -1.0 and hypothesis.units == tuple(
         s.specified_unit for s in hypothesis.signals
     ):
         return "sharp"
+    # 2. Gain error.
     if after > MAX_EXPLAINED_RESIDUAL:
         nearby_residual = min(
             residual_with_factor(1.0 / SMALL_FACTOR_STEP), residual_with_factor(SMALL_FACTOR_STEP)
         )
         if nearby_residual - 1.0 < MAX_NEARBY_SHARE * (after - 1.0):
             return "none"
+    # 3. Clearly different factors.
     nearby_residual = min(
         residual_with_factor(1.0 / FACTOR_STEP), residual_with_factor(FACTOR_STEP)
     )
     if 2.0 * samples * math.log(nearby_residual / after) > MIN_DISTINCT_GAIN:
         return "sharp"
+    # 4. Absorbed scale.
     # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
     is_unit = hypothesis.scale == 1.0 and all(
         signal.kind == "inputs" for signal in hypothesis.signals

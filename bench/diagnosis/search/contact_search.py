@@ -94,10 +94,15 @@ MIN_COST_RATIO = 0.7
 
 
 def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvaluator]) -> None:
-    """Fit single effects from initial states that belong to them, the likeliest at a contact first.
+    """Fit single effects in a recording with contacts, each with its own initial states.
 
-    Nothing is fitted if the base model leaves only noise, and no further effect if one explains the
+    The effects and initial states that it finds are where the search of all effects starts. It does
+    nothing if the base model leaves only noise, and it stops at the first effect that explains the
     recording.
+
+    1. Search better initial states of the base model.
+    2. Fit single effects, the likeliest effect at a contact first.
+    3. Use the initial states of the best model for all runs, also held-out ones.
 
     Args:
         search: search with the fitted base model; it gets models with one effect.
@@ -109,13 +114,16 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     base = search.base_model
     if search.is_noise_like(base):
         return
+    # 1. Initial states of the base model.
     _search_states_of_base(search)
     base = search.base_model
     if search.is_noise_like(base):
         return
     try:
+        # 2. Single effects.
         best = _fit_single_effects(search)
         if best is not None:
+            # 3. Initial states of all runs.
             _use_first_states_of(search, evaluators, best)
     except SearchStoppedError:
         search.models.setdefault(frozenset(), base)
@@ -123,10 +131,11 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
 
 
 def _search_states_of_base(search: EffectSearch) -> None:
-    """Search the initial states at random with the base model, and fit it again if they are better.
+    """Search initial states at random with the base model, and keep them if it fits better.
 
-    The model may lack nothing where the smoothed states do not explain the recording. Far from the
-    noise, it lacks something.
+    Smoothed initial states can be wrong where contacts make the motion rough. Then the base model
+    may be complete although it does not explain the recording. If its residual is far above the
+    noise, it lacks an effect, and nothing is searched.
     """
     base = search.base_model
     if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
@@ -145,7 +154,11 @@ def _search_states_of_base(search: EffectSearch) -> None:
 
 
 def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
-    """Fit single effects until one explains the recording.
+    """Fit models with one effect until one explains the recording.
+
+    1. Fit the effect at a contact that a filter finds likeliest.
+    2. If it does not explain the recording, fit the best of all effects, one after another.
+    3. Return the best fit if it removes a large part of the discrepancy.
 
     Returns:
         The best model; None if none removes a large part of the discrepancy. Then the initial
@@ -155,10 +168,12 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
     states, deviations = evaluator.initial_state_guesses, evaluator.state_prior
     assert deviations is not None
     fits: list[FittedModel] = []
+    # 1. The likeliest effect at a contact.
     likeliest = _find_likeliest_effect(search)
     if likeliest is not None:
         value = _refine_coefficient(search, likeliest)
         fits.append(_fit_about_its_first_states(search, _make_start(search, value, states)))
+    # 2. Other effects, from the initial states of the base model.
     if not any(_is_explained(search, model) for model in fits):
         evaluator.begin_at(states, deviations)
         search.models.clear()
@@ -167,6 +182,7 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
             fits.append(_fit_about_its_first_states(search, start))
             if _is_explained(search, fits[-1]):
                 break
+    # 3. The best fit.
     best = min(fits, key=lambda model: model.fit.cost, default=base)
     if best.fit.cost < MAX_COST_RATIO * base.fit.cost:
         return best
@@ -212,9 +228,10 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
 
 
 def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[float, FitStart]]:
-    """Return starts of the members of a fitted family, with their sums of squares.
+    """Return starts with single members of a fitted family, with their sums of squares.
 
-    Members have one coefficient each.
+    A family is one effect with a coefficient for each place, such as friction at all joints. Often
+    only one member acts, and a model with one coefficient is simpler.
 
     Args:
         search: Search with its run evaluator.
@@ -244,8 +261,13 @@ def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[
 def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> FittedModel:
     """Fit an effect and estimate the initial states in turn, while the sum of squares decreases.
 
-    Contacts make the sum of squares rough, so initial states are estimated by a smoother, then
-    coefficients and initial states by random search, and finally all by Levenberg-Marquardt.
+    Contacts make the sum of squares rough, so Levenberg-Marquardt alone would stop at a wrong
+    place. Each round has these steps:
+
+    1. Estimate the initial states by a smoother.
+    2. Scan the coefficient of an effect at a contact.
+    3. Improve coefficients and initial states by random search.
+    4. Fit all of them by Levenberg-Marquardt.
 
     Args:
         search: Search with its models and run evaluator.
@@ -260,19 +282,27 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     limit = MAX_REPEATED_COST_RATIO * search.base_model.fit.cost
     theta = start.theta
     for _ in range(MAX_STATE_ESTIMATES):
+        # 1. Smoother.
         smoothed = smooth_first_states(evaluator, theta, sigma)
         if smoothed is None:
             return search.fit_one(start)
+        # 2. Scan.
         if is_at_contact:
             value = _ScannedValue(name, float(theta[indices[0]]), _get_unit(search, name), np.inf)
             states = np.array([one.mean for one in smoothed])
             theta = _add_effect(search, _scan_in_turn(search, value, NEAR_SCAN_WIDTHS, states))
+        # 3. Random search.
         widths = _compute_widths(search, name, theta[indices])
-        found = RandomSearch(evaluator, sigma, smoothed, rng).run(theta, indices, widths, bounds)
-        evaluator.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
+        best_sample = RandomSearch(evaluator, sigma, smoothed, rng).run(
+            theta, indices, widths, bounds
+        )
+        evaluator.begin_at(
+            best_sample.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed)
+        )
+        # 4. Levenberg-Marquardt.
         # Sums of squares about other initial states are not comparable.
         search.models.pop(frozenset(start.effects), None)
-        model = search.fit_one(FitStart(start.effects, found.theta, found.states))
+        model = search.fit_one(FitStart(start.effects, best_sample.theta, best_sample.states))
         if _is_explained(search, model) or not model.fit.cost < limit:
             break
         limit, theta = MIN_COST_RATIO * model.fit.cost, model.fit.theta
@@ -280,9 +310,10 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
 
 
 def _compute_widths(search: EffectSearch, name: str, coefficients: Array) -> Array:
-    """Return the standard deviations (K,) of the samples of an effect's coefficients (K,).
+    """Return the standard deviations (K,) with which a random search varies K coefficients.
 
-    The uncertainty of an effect at a contact is relative to the number of the model file.
+    They are relative to the coefficients; for an effect at a contact, which may be zero, they are
+    relative to the value of the model file that it changes.
     """
     is_at_contact = search.evaluator.available_effects[name].at == "contact"
     units = _get_unit(search, name) if is_at_contact else np.abs(coefficients)
@@ -290,16 +321,17 @@ def _compute_widths(search: EffectSearch, name: str, coefficients: Array) -> Arr
 
 
 def _is_explained(search: EffectSearch, model: FittedModel) -> bool:
-    """Return whether no better initial states are needed for a model."""
+    """Return whether a model explains the recording with its present initial states."""
     return search.compute_excess_residual(model) < MAX_EXPLAINED_EXCESS
 
 
 def _use_first_states_of(
     search: EffectSearch, evaluators: Sequence[RunEvaluator], model: FittedModel
 ) -> None:
-    """Use the initial states of a model for all runs, and fit it and the base model about them.
+    """Use the initial states of a model for all runs, and fit this model and the base model again.
 
-    Those of held-out runs are estimated with its final coefficients.
+    All models of the search are compared with these initial states. Those of held-out runs are
+    estimated with the final coefficients of the model.
 
     Args:
         search: Search whose base model is fitted again.
@@ -322,6 +354,8 @@ def _use_first_states_of(
 def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array) -> None:
     """Search initial states at random if the smoothed ones do not explain the runs.
 
+    They replace those of the runs only if the sum of squares decreases.
+
     Shapes: P parameters.
 
     Args:
@@ -329,37 +363,41 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
         runs: the runs, which begin at smoothed states.
         theta: (P,) parameters of the model.
     """
-    sigma, count = search.noise.sigma, int(np.isfinite(runs.observed).sum())
+    sigma, sample_count = search.noise.sigma, int(np.isfinite(runs.observed).sum())
     (before,) = _compute_squares(runs, sigma, theta[None], runs.initial_state_guesses)
     smoothed = None
-    if before > EXPLAINED_SQUARES * count:
+    if before > EXPLAINED_SQUARES * sample_count:
         smoothed = smooth_first_states(runs, theta, sigma)
     if smoothed is None:
         return
     rng = search.make_rng("initial states")
-    found = RandomSearch(runs, sigma, smoothed, rng).run(theta, [], np.zeros(0), np.zeros((0, 2)))
-    if found.mean_square * count < before:
-        runs.begin_at(found.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
+    best_sample = RandomSearch(runs, sigma, smoothed, rng).run(
+        theta, [], np.zeros(0), np.zeros((0, 2))
+    )
+    if best_sample.mean_square * sample_count < before:
+        runs.begin_at(best_sample.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
 
 
 def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, states: Array) -> Array:
-    """Return sums of squares (N,) of the residual, in units of the noise.
+    """Simulate the runs with N sets of parameters, and return the sums of squares (N,).
+
+    The residuals are in units of the noise. A simulation that diverges has an infinite sum.
 
     Shapes: R runs, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         sigma: (C,) standard deviation of the noise of each channel.
-        samples: (N, P) parameters.
+        samples: (N, P) sets of parameters.
         states: (R, s) initial states.
     """
-    runs, count = len(states), len(samples)
+    runs, sample_count = len(states), len(samples)
     simulated = evaluator.simulate(
         np.repeat(samples, runs, axis=0),
-        np.tile(np.arange(runs), count),
-        np.tile(states, (count, 1)),
+        np.tile(np.arange(runs), sample_count),
+        np.tile(states, (sample_count, 1)),
     )
-    residual = simulated.reshape(count, *evaluator.observed.shape) - evaluator.observed
+    residual = simulated.reshape(sample_count, *evaluator.observed.shape) - evaluator.observed
     scaled = np.where(np.isfinite(evaluator.observed), residual, 0.0) / sigma
     squares = np.square(scaled).sum(axis=(1, 2, 3))
     return np.where(np.isfinite(squares), squares, np.inf)
@@ -392,16 +430,20 @@ def _list_effects_at_contacts(search: EffectSearch) -> list[_ScannedValue]:
 
 
 def _get_unit(search: EffectSearch, name: str) -> float:
-    """Return the number of the model file that an effect at a contact changes, in its unit."""
+    """Return the value of the model file that an effect at a contact changes, such as a friction.
+
+    Coefficients at contacts are scanned in multiples of this value.
+    """
     # A coefficient is limited below, where the number of the file becomes zero.
     return -compute_coefficient_bounds(search.evaluator, name)[0][0]
 
 
 def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
-    """Return the likeliest of some values of all effects at contacts; None if there are none.
+    """Return the effect at a contact, with a coefficient, that a Kalman filter finds likeliest.
 
-    Each effect at a contact is tried at several smaller and larger values, by the likelihood of a
-    filter.
+    Each effect at a contact is tried at several smaller and larger values of its coefficient. A
+    filter follows the data also where a simulation would diverge. Return None if there are no such
+    effects, or the filter fails for all.
 
     Args:
         search: Search with its run evaluator.
@@ -418,7 +460,7 @@ def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
 
 
 def _refine_coefficient(search: EffectSearch, value: _ScannedValue) -> _ScannedValue:
-    """Return the likeliest coefficient of an effect near a value."""
+    """Refine the coefficient of an effect by the likelihood of the filter, on two finer grids."""
     for width in REFINEMENT_WIDTHS:
         values = _list_nearby_values(search, value, width * np.array(GRID))
         value = values[int(np.argmax(_compute_log_likelihoods(search, values)))]
@@ -426,35 +468,42 @@ def _refine_coefficient(search: EffectSearch, value: _ScannedValue) -> _ScannedV
 
 
 def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_ScannedValue]:
-    """Scan each effect at a contact over its range, from the initial states of the base model.
+    """Scan each effect at a contact over its range, and rank those that explain the residual.
+
+    The scans simulate the runs from the initial states of the base model.
 
     Args:
         search: Search with its run evaluator.
-        base: Base model.
+        base: Fitted base model.
 
     Returns:
         The best value of each effect that explains a part of the discrepancy, the best effect
         first.
     """
-    found = _scan_effects_at_contacts(search, base.fit.initial_states)
-    if not found:
+    scanned_values = _scan_effects_at_contacts(search, base.fit.initial_states)
+    if not scanned_values:
         return []
-    unchanged = _scan(search, found[0]._replace(coefficient=0.0), 0.0, base.fit.initial_states)
-    useful = [value for value in found if value.squares < MAX_SCAN_RATIO * unchanged.squares]
+    unchanged = _scan(
+        search, scanned_values[0]._replace(coefficient=0.0), 0.0, base.fit.initial_states
+    )
+    useful = [
+        value for value in scanned_values if value.squares < MAX_SCAN_RATIO * unchanged.squares
+    ]
     return sorted(useful, key=lambda value: value.squares)[:MAX_TRIED_EFFECTS]
 
 
 def find_lowest_scan(search: EffectSearch) -> float:
     """Return the lowest sum of squares of scans of all effects at contacts; infinite without any.
 
-    The initial states are those that were estimated with the present model.
+    If it is far below that of the present model, an effect at a contact acts. The initial states
+    are those that were estimated with the present model.
     """
-    found = _scan_effects_at_contacts(search, search.evaluator.initial_state_guesses)
-    return min((value.squares for value in found), default=np.inf)
+    scanned_values = _scan_effects_at_contacts(search, search.evaluator.initial_state_guesses)
+    return min((value.squares for value in scanned_values), default=np.inf)
 
 
 def _scan_effects_at_contacts(search: EffectSearch, states: Array) -> list[_ScannedValue]:
-    """Return the best value of each effect at a contact over its range, from initial states."""
+    """Scan each effect at a contact over its whole range, and return its best value."""
     values = _list_effects_at_contacts(search)
     return [_scan_in_turn(search, value, SCAN_WIDTHS, states) for value in values]
 
@@ -462,7 +511,7 @@ def _scan_effects_at_contacts(search: EffectSearch, states: Array) -> list[_Scan
 def _scan_in_turn(
     search: EffectSearch, value: _ScannedValue, widths: Sequence[float], states: Array
 ) -> _ScannedValue:
-    """Return the best value of scans with these widths, each about the best value of the last."""
+    """Scan a coefficient with intervals of decreasing widths, each about the best value so far."""
     for width in widths:
         value = _scan(search, value, width, states)
     return value
@@ -471,14 +520,17 @@ def _scan_in_turn(
 def _list_nearby_values(
     search: EffectSearch, value: _ScannedValue, distances: Array
 ) -> list[_ScannedValue]:
-    """Return possible values at distances relative to the number of the model file."""
+    """Return coefficients near a value, within its bounds.
+
+    `distances` are in units of the value of the model file that the effect changes.
+    """
     ((low, high),) = compute_coefficient_bounds(search.evaluator, value.name)
     coefficients = np.clip(value.coefficient + value.unit * distances, low, high)
     return [value._replace(coefficient=float(c)) for c in coefficients]
 
 
 def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Array) -> _ScannedValue:
-    """Return the value that has the lowest sum of squares.
+    """Simulate the runs with equidistant coefficients, and return the value with the best fit.
 
     Shapes: R runs, s states of a run.
 
@@ -498,9 +550,10 @@ def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Arra
 
 
 def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValue]) -> Array:
-    """Return the log-likelihood (N,) of each value, summed over the runs.
+    """Return the log-likelihood (N,) of each value of a coefficient, summed over the runs.
 
-    A cubature filter follows each run under each value.
+    A cubature Kalman filter follows each run with each value. It adds a missing force, so it
+    follows the data even if the model lacks an effect.
 
     Args:
         search: Search with its run evaluator and noise.
@@ -515,8 +568,8 @@ def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValu
         for run in runs
     ]
     results = filter_hypotheses(evaluator, search.noise.sigma, hypotheses)
-    found = np.array([result.log_likelihood for result in results])
-    total: Array = found.reshape(len(values), len(runs)).sum(axis=1)
+    log_likelihoods = np.array([result.log_likelihood for result in results])
+    total: Array = log_likelihoods.reshape(len(values), len(runs)).sum(axis=1)
     return total
 
 
@@ -533,19 +586,25 @@ def _add_effect(search: EffectSearch, value: _ScannedValue) -> Array:
 
 
 def search_in_contact(search: EffectSearch) -> FittedModel:
-    """Return the model of all effects that a recording with contacts shows.
+    """Search the effects of a recording with contacts, and return the best model.
 
-    Laws with many shapes are candidates only if the simpler ones do not explain the recording.
+    Laws with many shapes are candidates only if the simpler ones do not explain the recording,
+    because scoring every shape takes long.
+
+    1. Search without laws with many shapes.
+    2. If the best model leaves more than noise, discard all scores, and search with all laws.
 
     Args:
         search: the search, which contains the base model and models of one effect at a contact.
     """
+    # 1. Simple laws.
     exclude_laws_with_many_shapes(search)
     model = _search_simple_laws(search)
     if search.is_noise_like(model):
         search.settled_effects = frozenset(model.effects)
         search.best_supported_model = model
         return model
+    # 2. All laws.
     search.excluded_effects = frozenset()
     search.cached_scans.clear()
     search.superseded_scans.clear()
@@ -554,7 +613,7 @@ def search_in_contact(search: EffectSearch) -> FittedModel:
 
 
 def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
-    """Exclude effects from scores whose shape parameters have many values to try.
+    """Exclude effects with many values of their shape parameters from the scores.
 
     They are searched by separate fits, because scoring every shape would take too long.
 
@@ -574,8 +633,8 @@ def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
 def _search_simple_laws(search: EffectSearch) -> FittedModel:
     """Search the effects that are not excluded, and return the best model.
 
-    If the best model already explains the residual, no further search is needed, and only its
-    single-effect competitors are fitted.
+    If a single effect already explains the recording, a full search is not needed. Then only other
+    single effects that might explain it as well are fitted (its competitors).
 
     Args:
         search: Search with its models.
@@ -592,11 +651,16 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
 
 
 def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
-    """Fit the effects that may replace the only effect of a model.
+    """Fit the single effects that may replace the only effect of a model.
 
-    The change by the present effect is added to the residual, and the other effects are scored
-    against it: those that explain it with a small remainder may replace the effect, and are fitted
-    from their best starting values.
+    To first order, the model without the effect leaves the residual e + c d: the residual e of the
+    fit, plus the change c d by the effect with coefficient c. An effect that explains this sum may
+    replace the present one.
+
+    1. Compute the change by the present effect.
+    2. Score all other effects against the sum, about the model without the effect.
+    3. Select those that leave almost as small a residual as the present effect does.
+    4. Fit them from their best coefficients.
 
     Args:
         search: the search, with scores about the model.
@@ -606,8 +670,10 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     model = search.refine_jacobian(model)
     scan = search.cached_scans[frozenset(model.effects)]
     residual = search.compute_residual(model.fit)
+    # 1. Change by the present effect.
     columns = _find_columns(search, model)
     change = _compute_change(search, model)
+    # 2. Scores.
     # A test about the model itself would project out the change.
     fit_without_effect = replace(
         model.fit,
@@ -622,15 +688,20 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
         search.compute_channel_weights(model),
     )
     scores = test.compute_scores(residual + change)
+    # 3. Selection.
     # Initial states absorb a part of the change.
     before, after = (
         float(np.square(values / search.noise.sigma).sum())
         for values in (test.project_out((residual + change)[None])[0], residual)
     )
-    count = int(search.observed_mask.sum())
+    sample_count = int(search.observed_mask.sum())
     # Without autocorrelation, a score is n log(SS / SS_k) of the sums of squares.
-    sizes = np.sqrt(before * np.exp(-scores.white_noise_scores / count) / after)
-    order = [int(i) for i in np.argsort(sizes) if sizes[i] < MAX_COMPETITOR_SIZE][:MAX_COMPETITORS]
+    relative_residuals = np.sqrt(before * np.exp(-scores.white_noise_scores / sample_count) / after)
+    order = [
+        int(i)
+        for i in np.argsort(relative_residuals)
+        if relative_residuals[i] < MAX_COMPETITOR_SIZE
+    ][:MAX_COMPETITORS]
     if not order:
         return
     competitors = replace(
@@ -642,6 +713,7 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
         null_scores=scores.null_scores[order],
         white_noise_scores=scores.white_noise_scores[order],
     )
+    # 4. Fits.
     theta = model.fit.theta.copy()
     theta[search.evaluator.coefficient_slices[name]] = 0.0
     base = search.base_model
@@ -660,17 +732,19 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
 
 
 def _find_columns(search: EffectSearch, model: FittedModel) -> list[int]:
-    """Return the columns of a fit's derivatives that belong to the only effect of a model."""
+    """Return the columns of a fit's Jacobian that belong to the only effect of a model."""
     (name,) = model.effects
-    places = search.evaluator.get_coefficient_indices(name)
-    return [int(np.flatnonzero(model.fit.free_indices == place)[0]) for place in places]
+    parameter_indices = search.evaluator.get_coefficient_indices(name)
+    return [int(np.flatnonzero(model.fit.free_indices == index)[0]) for index in parameter_indices]
 
 
 def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
     """Return the change of the runs by the only effect of a model, to first order (R, T, C).
 
-    A difference quotient over a step of the motion is arbitrarily large, so the smallest of several
-    quotients is used.
+    It is the derivative by all coefficients of the effect, scaled together, from central
+    differences. A contact can make the motion jump between two simulations; then a difference
+    quotient is arbitrarily large. So quotients with several step sizes are computed, and the
+    smallest is used.
 
     Shapes: R runs, T samples, C channels.
 

@@ -84,18 +84,19 @@ class GroupBatch:
 
 
 def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
-    """Group the directions of each effect at each grid point of its shape; they act together.
+    """Group the directions that can only be scored together.
 
-    A grid point is one choice of the shape parameters, such as a frequency.
+    These are the directions of one effect at one choice of its shape parameters (a grid point),
+    such as the sine and the cosine of a ripple of one frequency.
 
     Args:
         directions: Directions of all candidate effects.
     """
-    columns_by_group: dict[tuple[str, int], list[int]] = {}
+    columns_by_grid_point: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
-        columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
+        columns_by_grid_point.setdefault((probe.effect, probe.grid_point), []).append(i)
     groups = []
-    for (effect, _), columns in columns_by_group.items():
+    for (effect, _), columns in columns_by_grid_point.items():
         probes = [directions.candidates[i] for i in columns]
         positive = tuple(not probe.can_be_negative for probe in probes)
         groups.append(DirectionGroup(effect, tuple(columns), positive))
@@ -103,10 +104,10 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
 
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
-    """Collect groups with equal sign constraints in batches, which are solved at once.
+    """Collect groups with equal sign constraints in batches, so that one call solves all of them.
 
     Args:
-        members: Groups of directions; coefficients that must be positive constrain their solution.
+        members: Groups of directions. Those whose coefficients must be positive have constraints.
     """
     groups_by_signs: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
@@ -127,29 +128,30 @@ def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
 def compute_explained_squares(
     gram: Array, cross: Array, positive: Sequence[bool]
 ) -> tuple[Array, Array]:
-    """Compute the sums of squares that groups explain, each with its best subset of columns.
+    """Compute the sum of squares that each group of directions explains of each residual.
 
-    A constrained coefficient is fixed at zero if it would be negative. The constrained
-    least-squares solution is the unconstrained solution of some subset of columns, so all subsets
-    are tried (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    This is the largest h'G^-1 h of any subset of the group's columns. A constrained coefficient is
+    fixed at zero if it would be negative. The constrained least-squares solution is the
+    unconstrained solution of some subset of columns, so all subsets are tried (C. L. Lawson, R. J.
+    Hanson, Solving Least Squares Problems, 1974, chapter 23).
 
     Args:
-        gram: G (n, k, k) of each group.
-        cross: h (n, k, S).
+        gram: (n, k, k) inner products G = <D, D> of the k directions of each of n groups.
+        cross: (n, k, S) inner products h = <D, e> of the directions with S residuals.
         positive: (k,) whether each coefficient must be nonnegative.
 
     Returns:
         The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
     """
-    number, count, samples = cross.shape
-    if count > MAX_COLUMNS_FOR_SUBSETS:
+    group_count, column_count, residual_count = cross.shape
+    if column_count > MAX_COLUMNS_FOR_SUBSETS:
         return _solve_unconstrained(gram, cross)
-    best = np.zeros((number, samples))
-    coefficients = np.zeros((number, count))
-    remaining_groups = np.arange(number)
+    best = np.zeros((group_count, residual_count))
+    coefficients = np.zeros((group_count, column_count))
+    remaining_groups = np.arange(group_count)
     # Most effects have no constraint, and then all columns together explain most.
     if not any(positive):
-        solution = _solve_subset(gram, cross, list(range(count)))
+        solution = _solve_subset(gram, cross, list(range(column_count)))
         best[solution.groups] = solution.gain
         coefficients[solution.groups] = solution.coefficients
         remaining_groups = np.setdiff1d(remaining_groups, solution.groups)
@@ -161,22 +163,22 @@ def compute_explained_squares(
 
 
 def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
-    """Try all subsets of columns, and keep for each group and residual the one that explains most.
+    """Find, for each group and residual, the subset of columns that explains most.
 
     A subset counts only if its constrained coefficients are not negative.
 
     Args:
-        gram: (n, k, k) G of each of n groups with k columns.
-        cross: (n, k, S) h of each group and residual.
+        gram: (n, k, k) inner products G of the k directions of each of n groups.
+        cross: (n, k, S) inner products h of the directions with S residuals.
         positive: (k,) whether each coefficient must be nonnegative.
 
     Returns:
         Explained sums of squares (n, S), and coefficients (n, k) for the first residual.
     """
-    number, count, samples = cross.shape
-    best = np.zeros((number, samples))
-    coefficients = np.zeros((number, count))
-    for subset in _enumerate_subsets(count):
+    group_count, column_count, residual_count = cross.shape
+    best = np.zeros((group_count, residual_count))
+    coefficients = np.zeros((group_count, column_count))
+    for subset in _enumerate_subsets(column_count):
         solution = _solve_subset(gram, cross, subset)
         constrained = [j for j, column in enumerate(subset) if positive[column]]
         previous_best = best[solution.groups]
@@ -219,8 +221,9 @@ class _SubsetSolution(NamedTuple):
 def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:
     """Solve the normal equations G c = h of each group for a subset of its columns.
 
-    Groups whose columns are zero or collinear are left out. `gram` G is (n, k, k), `cross` h (n, k,
-    S), and `subset` has the indices of the columns.
+    Groups whose columns are zero or collinear have no unique solution and are left out; a smaller
+    subset of their columns explains the same. `gram` has G (n, k, k) and `cross` has h (n, k, S) of
+    `compute_explained_squares`, and `subset` has the indices of the columns.
     """
     products = gram[:, subset][:, :, subset]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
@@ -245,8 +248,8 @@ def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
     It is used for groups with too many columns to try all subsets.
 
     Args:
-        gram: G (n, k, k) of each group.
-        cross: h (n, k, S).
+        gram: (n, k, k) inner products G = <D, D> of the k directions of each of n groups.
+        cross: (n, k, S) inner products h = <D, e> of the directions with S residuals.
 
     Returns:
         The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
@@ -348,12 +351,16 @@ class ScoreTest:
     def project_out(self, residuals: Array) -> Array:
         """Subtract from residuals (S, R, T, C) what parameters and initial states can absorb.
 
-        Surrogate residuals are treated so, because the real residual is what a fit has left.
+        The real residual is what a fit leaves, so it contains no such component. Surrogate
+        residuals are comparable with it only after this projection.
         """
         return self._design.project_out(residuals)
 
     def compute_scores(self, residual: Array, surrogate: Array | None = None) -> CandidateScores:
-        """Score each candidate effect by how well its sensitivities explain a residual.
+        """Score each candidate effect by how much of the residual its sensitivities explain.
+
+        The score of an effect is twice its gain in log-likelihood, eq. (4) of the module docstring.
+        Surrogate residuals contain no effect: their scores show which scores noise alone reaches.
 
         Shapes: R runs, T samples, C channels.
 
@@ -381,17 +388,17 @@ class ScoreTest:
 def compute_calibrated_scores(
     test: ScoreTest, residual: Array, draw: Callable[[int], Array], count: int
 ) -> CandidateScores:
-    """Score a residual, with more surrogates if the p-value is close to a threshold.
+    """Score a residual, and use more surrogates if the p-value is close to a threshold.
 
-    A p-value of 0.01 from a hundred surrogates is uncertain by a factor of three, and a p-value far
-    from every threshold need not be more accurate (J. Besag, P. Clifford, Sequential Monte Carlo
-    p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
+    A p-value of 0.01 from a hundred surrogates is uncertain by a factor of three. Far from every
+    threshold this does not matter, and surrogates cost time (J. Besag, P. Clifford, Sequential
+    Monte Carlo p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        test: score test about the model.
-        residual: (R, T, C) residual of the model.
+        test: score test of the candidate effects about the fitted model.
+        residual: (R, T, C) residual of the fitted model.
         draw: function that draws the given number of surrogates (S, R, T, C).
         count: number of surrogates that are drawn first.
     """
@@ -442,10 +449,12 @@ class _BestScores:
         self._total_squares = np.zeros(residuals)
 
     def begin_correlation(self, phi: float, determinant: float, total: Array) -> None:
-        """Start a correlation, and compute the likelihood of each residual without any direction.
+        """Start a value of the AR(1) correlation: compute the likelihoods without effects.
+
+        All likelihoods of `add_batch` are compared with it, until `end_correlation`.
 
         Args:
-            phi: the correlation.
+            phi: AR(1) correlation of the noise.
             determinant: log-determinant log det W'W of the whitening W.
             total: (S,) sums of squares of the whitened residuals.
         """
@@ -457,10 +466,9 @@ class _BestScores:
     def _compute_log_likelihood(self, remaining_squares: Array, total_squares: Array) -> Array:
         """Return twice the log-likelihood at the present correlation, with the best noise level.
 
-        It is log det W'W - n log(remaining squares), eq. (3) of the module docstring.
-
-        It is l(phi) = log det W'W - n log(<e, e> - h'G^-1 h) (3), with n samples, the whitened
-        residual e, and h'G^-1 h the part of <e, e> that the directions explain.
+        It is l(phi) = log det W'W - n log(<e, e> - h'G^-1 h), eq. (3) of the module docstring: n is
+        the number of samples, e the whitened residual, and h'G^-1 h the part of <e, e> that the
+        directions explain.
 
         Args:
             remaining_squares: sums of squares of the residual after the directions have explained
@@ -474,34 +482,36 @@ class _BestScores:
         return result
 
     def add_batch(self, batch: GroupBatch, gain: Array, coefficients: Array) -> None:
-        """Update the table with the sums of squares that the groups of a batch explain.
+        """Update the best scores of groups and effects with the results of one batch.
 
         Args:
-            batch: the groups.
-            gain: (n, S) explained sums of squares.
-            coefficients: (n, k) coefficients for the first residual.
+            batch: groups that were solved together.
+            gain: (n, S) sums of squares that the groups explain of each residual.
+            coefficients: (n, k) coefficients of the groups for the first residual, the observed
+                one.
         """
-        rows = self._effect_rows[batch.group_indices]
-        order = np.argsort(rows, kind="stable")
-        present_rows, first = np.unique(rows[order], return_index=True)
-        largest_squares = np.maximum.reduceat(gain[order], first, axis=0)
+        effect_rows = self._effect_rows[batch.group_indices]
+        order = np.argsort(effect_rows, kind="stable")
+        present_rows, first_of_effect = np.unique(effect_rows[order], return_index=True)
+        largest_squares = np.maximum.reduceat(gain[order], first_of_effect, axis=0)
         self._explained_squares[present_rows] = np.maximum(
             self._explained_squares[present_rows], largest_squares
         )
-        value = self._compute_log_likelihood(
+        log_likelihoods = self._compute_log_likelihood(
             self._total_squares[0] - gain[:, 0], self._total_squares[0]
         )
         # The first residual is the observed one; only its coefficients are used as starts of fits.
-        is_better = value > self._group_log_likelihoods[batch.group_indices]
+        is_better = log_likelihoods > self._group_log_likelihoods[batch.group_indices]
         improved_groups = batch.group_indices[is_better]
-        self._group_log_likelihoods[improved_groups] = value[is_better]
+        self._group_log_likelihoods[improved_groups] = log_likelihoods[is_better]
         self._group_phis[improved_groups] = self._phi
         self._group_coefficients[improved_groups, : coefficients.shape[1]] = coefficients[is_better]
 
     def end_correlation(self) -> None:
-        """Finish a correlation: update the best likelihood of each effect from its groups.
+        """Finish a value of the AR(1) correlation: update the best likelihood of each effect.
 
-        It is called once for each correlation phi of the grid, after all groups were scored.
+        It is called once for each correlation phi of the grid, after all groups were scored with
+        it.
         """
         values = self._compute_log_likelihood(
             self._total_squares - self._explained_squares, self._total_squares
@@ -551,10 +561,11 @@ class _BestScores:
         )
 
     def _get_peaks(self, group_indices: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
-        """Return the best group of an effect with its coefficients, as start of a fit.
+        """Return the groups of an effect from which its fit may start, the best first.
 
-        An effect with many shapes, such as frequencies, may have several local maxima of the
-        likelihood; the best of them are returned. `group_indices` are the groups of the effect.
+        Each has the coefficients of its columns. This is the best group of the effect. An effect
+        with many shapes, such as frequencies, may have several local maxima of the likelihood; then
+        the best of them are returned. `group_indices` are the groups of the effect.
         """
         values = self._group_log_likelihoods[group_indices]
         has_many_shapes = len(group_indices) > SHAPE_COUNT_FOR_MULTISTART
@@ -568,39 +579,38 @@ class _BestScores:
         order = np.argsort(-values, kind="stable")
         max_peaks = STARTS_PER_EFFECT if has_many_shapes else 1
         peak_groups = [group_indices[i] for i in order if is_peak[i]][:max_peaks]
-        result = []
+        peaks = []
         for i in peak_groups:
             group = self._groups[i]
-            result.append((group, self._group_coefficients[i, : len(group.column_indices)].copy()))
-        return tuple(result)
+            peaks.append((group, self._group_coefficients[i, : len(group.column_indices)].copy()))
+        return tuple(peaks)
 
 
 def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
-    """Return the p-value of the largest observed value, eq. (5) of the module docstring.
+    """Return the p-value of the largest observed score, eq. (5) of the module docstring.
 
-    Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
-    of a likelihood ratio is.
-
-    It is p = P(max over k of s_k >= max over k of observed_k) (5), with the scores s_k of
-    surrogates for effects k.
+    It is the probability that the largest score of a surrogate, which contains no effect, is at
+    least as large. Probabilities below one in the number of surrogates are extrapolated: beyond the
+    most extreme fifth of the surrogates, the tail is assumed to be exponential, as that of a
+    likelihood ratio is.
 
     Args:
-        null_values: (E, S) values of the surrogates; the maximum over E is compared.
-        observed: (E,) observed values.
+        null_values: (E, S) scores of E effects for S surrogates; the maximum over E is compared.
+        observed: (E,) scores of the effects for the recorded residual.
     """
     if not observed.size:
         return 1.0
     null_maxima = np.sort(null_values.max(axis=0))
-    value = float(observed.max())
-    count = null_maxima.size
-    exceedance_count = int((null_maxima >= value).sum())
+    observed_maximum = float(observed.max())
+    surrogate_count = null_maxima.size
+    exceedance_count = int((null_maxima >= observed_maximum).sum())
     # Counting cannot give less than one in the number of surrogates; smaller p-values are
     # extrapolated.
-    tail = null_maxima[int(TAIL_QUANTILE * count) :]
+    tail = null_maxima[int(TAIL_QUANTILE * surrogate_count) :]
     tail_begin = tail[0]
-    if value <= tail_begin or count < MIN_SURROGATES_FOR_TAIL:
+    if observed_maximum <= tail_begin or surrogate_count < MIN_SURROGATES_FOR_TAIL:
         # The residual counts as one of the surrogates, so the p-value is never zero.
-        return (1.0 + exceedance_count) / (1.0 + count)
+        return (1.0 + exceedance_count) / (1.0 + surrogate_count)
     # The scale of an exponential distribution is its mean excess over the threshold.
     mean_excess = max(float((tail - tail_begin).mean()), 1e-9)
-    return float(TAIL_SHARE * np.exp(-(value - tail_begin) / mean_excess))
+    return float(TAIL_SHARE * np.exp(-(observed_maximum - tail_begin) / mean_excess))

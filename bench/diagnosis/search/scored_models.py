@@ -132,12 +132,14 @@ class ScoredModelSet(ModelSet):
     def score_missing_effects(
         self, model: FittedModel, noise_residual: Array | None = None
     ) -> CandidateScores:
-        """Score every effect that the model lacks.
+        """Score every effect that the model lacks, to find the effects that are worth fitting.
+
+        The scores about a model are computed once and stored, except with a `noise_residual`.
 
         Shapes: R runs, T samples, C channels.
 
         Args:
-            model: fitted model: its effects, parameters, initial states and likelihood.
+            model: fitted model, to whose residual the effects are compared.
             noise_residual: (R, T, C) residual whose spectrum the surrogates have; None for that of
                 the model.
         """
@@ -163,13 +165,15 @@ class ScoredModelSet(ModelSet):
     ) -> None:
         """Score the effects that each of the models lacks, in parallel, and store the results.
 
-        If a model was replaced by nearly the same fit, its stored directions are used again.
+        1. If a model was replaced by nearly the same fit, its stored directions are used again.
+        2. The directions of the other models are simulated, one model in each worker.
+        3. The oldest directions are removed if they take too much memory.
 
         Args:
             models: models to score.
             other_kept_models: further models whose stored results must not be removed.
         """
-        calls, keys = [], []
+        scan_arguments, keys = [], []
         for model in models:
             self._report_scoring(model)
             model = self.refine_jacobian(model)
@@ -178,6 +182,7 @@ class ScoredModelSet(ModelSet):
                 self.compute_residual(model.fit),
                 self.make_rng("library", model.effects),
             )
+            # 1. Directions of a fit that was replaced.
             previous_scan = self.superseded_scans.pop(key, None)
             # A model that has hardly moved keeps its directions.
             if (
@@ -190,7 +195,7 @@ class ScoredModelSet(ModelSet):
                 self._store_scores(key, previous_scan._replace(scores=scores))
                 continue
             keys.append(key)
-            calls.append(
+            scan_arguments.append(
                 (
                     model.fit,
                     self._list_addable_effects(model),
@@ -200,15 +205,18 @@ class ScoredModelSet(ModelSet):
                     rng,
                 )
             )
-        if calls:
-            max_effects = max(len(missing_effects) for _, missing_effects, *_ in calls)
-            further_text = f" added to each of {len(calls)} models" if len(calls) > 1 else ""
+        # 2. The other models.
+        if scan_arguments:
+            max_effects = max(len(missing_effects) for _, missing_effects, *_ in scan_arguments)
+            further_text = (
+                f" added to each of {len(scan_arguments)} models" if len(scan_arguments) > 1 else ""
+            )
             self.evaluator.search_control.begin_stage(
-                f"testing {max_effects} effects{further_text}", len(calls)
+                f"testing {max_effects} effects{further_text}", len(scan_arguments)
             )
         scans = {}
         for model_index, scan in self.evaluator.worker_pool.map_unordered(
-            self.evaluator, _scan_model, calls
+            self.evaluator, _scan_model, scan_arguments
         ):
             scans[model_index] = scan
             self.evaluator.search_control.advance()
@@ -216,6 +224,7 @@ class ScoredModelSet(ModelSet):
             scores = self.scores_by_effects.get(key, scans[model_index].scores)
             # Scores that were kept when the directions were removed remain valid.
             self._store_scores(key, scans[model_index]._replace(scores=scores))
+        # 3. Memory.
         self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
 
     def _report_scoring(self, model: FittedModel) -> None:
@@ -226,9 +235,10 @@ class ScoredModelSet(ModelSet):
         )
 
     def _limit_cache_size(self, kept_keys: Sequence[frozenset[str]]) -> None:
-        """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
+        """Remove the oldest stored directions until they fit in `DIRECTION_CACHE_BYTES`.
 
-        Those of the base model and of the models `kept_keys` are kept.
+        Directions of the base model (the empty key) and of the models `kept_keys` are never
+        removed, because they are needed next.
         """
         for cache in (self.superseded_scans, self.cached_scans):
             for key in [k for k in cache if k and k not in kept_keys]:
@@ -250,9 +260,12 @@ class ScoredModelSet(ModelSet):
     def enter_scores(self, key: frozenset[str], scores: CandidateScores) -> None:
         """Store the scores about a model.
 
+        Those about the base model also give the null-hypothesis level of each effect, which
+        penalises the likelihood of all models with this effect.
+
         Args:
             key: effects of the model.
-            scores: the scores.
+            scores: scores of the effects that the model lacks.
         """
         self.scores_by_effects[key] = scores
         self.best_p_values[key] = scores.p_value
@@ -261,11 +274,13 @@ class ScoredModelSet(ModelSet):
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
     def _compute_fit_distance(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
-        """Return by how much two fits differ: RMS over all samples, in units of the noise.
+        """Return the RMS difference of two simulations over all samples, in units of the noise.
+
+        If it is small, directions about the first fit are also valid for the second.
 
         Args:
-            first: a fit.
-            second: another fit to the same runs.
+            first: fit about which directions were computed.
+            second: later fit to the same runs.
         """
         normalised_difference = (first.simulated - second.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(normalised_difference[self.observed_mask]).mean()))
@@ -287,11 +302,12 @@ class ScoredModelSet(ModelSet):
     ) -> None:
         """Fit the models with one more effect that have the highest scores.
 
-        For robots, models with simpler laws are fitted first, and those with richer laws only if
-        the simpler ones leave more than noise: laws that are evaluated in every step cost most.
+        Scores are linear, so the best candidates are fitted by simulation. For robots, models with
+        simpler laws are fitted first, and those with richer laws only if the simpler ones leave
+        more than noise: laws that are evaluated in every step cost most.
 
         Args:
-            beam: models to extend.
+            beam: models to extend (the best ones of the beam search).
             max_count: maximum number of candidates per model.
             fits_all: whether to include all candidates, also those that were fitted before, and to
                 fit the beginnings of the runs first.
@@ -321,7 +337,8 @@ class ScoredModelSet(ModelSet):
     ) -> list[FitStart]:
         """Return starts of fits of each model of the beam with one more effect.
 
-        Models without stored directions are scored first.
+        Starting values of the effect are those with the best score. Models without stored
+        directions are scored first.
 
         Args:
             beam: the models to extend.
@@ -353,11 +370,11 @@ class ScoredModelSet(ModelSet):
         return starts
 
     def _is_new(self, start: FitStart, model: FittedModel) -> bool:
-        """Return whether a fit from this start may find something new.
+        """Return whether a fit from this start may find a better model than the known fits.
 
         This is the case if no fit of these effects is known. For a robot, whose effects start far
-        from the optimum, it is also the case if the known fit is worse than a model that it
-        contains.
+        from the optimum, a known fit may have stopped in a poor local minimum: it is worse than the
+        model `model`, which it contains. Then it is fitted again.
         """
         stored_model = self.models.get(frozenset(start.effects))
         if stored_model is None:
@@ -366,16 +383,17 @@ class ScoredModelSet(ModelSet):
         return self.evaluator.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
 
     def _list_simpler_models(self, start: FitStart) -> set[frozenset[str]]:
-        """Return the models in which one effect is replaced by a simpler one that it contains.
+        """Return the models in which one effect is replaced by a simpler one it contains.
 
-        Each model is the set of its effects.
+        If such a model already leaves only noise, the start need not be fitted. Each model is the
+        set of its effects.
         """
         effect_names = frozenset(start.effects)
         effects = self.evaluator.available_effects
         return {
-            effect_names - {name} | {part}
+            effect_names - {name} | {simpler_effect}
             for name in effect_names
-            for part in effects[name].contains
+            for simpler_effect in effects[name].contains
         }
 
     def _leaves_only_noise(self, keys: Iterable[frozenset[str]]) -> bool:
@@ -387,10 +405,11 @@ class ScoredModelSet(ModelSet):
         )
 
     def compute_missing_effect_p_value(self, model: FittedModel, larger: FittedModel) -> float:
-        """Return the p-value of the gain of a larger model.
+        """Return the p-value of the gain of a model with more effects.
 
-        The null hypothesis is that the smaller model lacks nothing. The surrogates have the
-        spectrum of the larger model's residual, which is closer to pure noise.
+        A small value means that the smaller model lacks an effect. The null hypothesis is that it
+        lacks none. The surrogates have the spectrum of the larger model's residual, which is closer
+        to pure noise.
 
         Args:
             model: model with fewer effects.
@@ -410,8 +429,9 @@ class ScoredModelSet(ModelSet):
     ) -> float:
         """Return the p-value of a gain in twice the log-likelihood.
 
-        The gain that the larger model's effects reach under the null hypothesis (90 % quantile over
-        the surrogates) is subtracted first.
+        An effect with many shapes gains more from pure noise. So the gain that the larger model's
+        effects reach under the null hypothesis (90 % quantile over the surrogates) is subtracted
+        first.
 
         Args:
             scores: scores about the smaller model.
@@ -426,10 +446,12 @@ class ScoredModelSet(ModelSet):
         return estimate_tail_p_value(scores.null_scores, excess)
 
     def is_complete(self, model: FittedModel, p_value_threshold: float) -> bool:
-        """Return whether neither scores nor residual suggest that the model lacks something.
+        """Return whether neither scores nor residual suggest that the model lacks an effect.
+
+        Then the search stops at this model.
 
         Args:
-            model: fitted model: its effects, parameters, initial states and likelihood.
+            model: fitted model to test.
             p_value_threshold: p-value threshold of the scores.
         """
         # The residual is tested first, because scores need thousands of simulations.
@@ -439,16 +461,22 @@ class ScoredModelSet(ModelSet):
         )
 
     def is_noise_like(self, model: FittedModel) -> bool:
-        """Return whether the residual of a model may be noise.
+        """Return whether the residual of a model may be noise, so that no effect can be missing.
 
-        It is at the noise floor, or it is above an estimated floor and AR(1) noise. The floor is
-        estimated for white noise, so AR(1) noise may exceed it, but not by any factor (see
-        `verdict_rules.exceeds_noise`).
+        It may be noise in two cases:
+
+        1. It is at the noise floor in all channels.
+        2. It is above a floor that was estimated, not stated, by no more than
+           `MAX_AUTOCORRELATED_NOISE_RATIO`, and the Ljung-Box test accepts it as AR(1) noise. The
+           floor is estimated for white noise, so AR(1) noise may exceed it (see
+           `verdict_rules.exceeds_noise`).
         """
         residual_sigma = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
+        # 1. At the noise floor.
         is_above_noise = residual_sigma >= NOISE_RATIO_THRESHOLD * self.noise.sigma
         if not is_above_noise.any():
             return True
+        # 2. Autocorrelated noise above an estimated floor.
         # Specified noise is known, so a larger residual is not noise, whatever its spectrum.
         if (is_above_noise & self.is_noise_stated).any():
             return False
@@ -472,14 +500,14 @@ def _scan_model(
     observed_mask: Mask,
     rng: np.random.Generator,
 ) -> ModelScan:
-    """Score all effects that one model lacks; runs in this process or in a worker.
+    """Simulate the directions of all effects that a model lacks, and score them; runs in a worker.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
-        missing_effects: names of the effects that it lacks.
+        evaluator: evaluator that simulates the recorded runs.
+        fit: fit of the model, about which the directions are derivatives.
+        missing_effects: names of the effects that the model lacks.
         weights: noise that weights the channels.
         residual: (R, T, C) residual of the model.
         observed_mask: (R, T, C) mask of available samples.
@@ -501,17 +529,17 @@ def _score_residual(
 ) -> CandidateScores:
     """Return the scores of a residual, with a p-value from surrogate residuals.
 
-    The surrogates are random noise with the spectrum of a residual; they show which scores such
-    noise reaches without any effect.
+    The surrogates are random noise with the spectrum of a residual. They contain no effect, so
+    their scores show which scores noise alone reaches.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        test: score test about the model.
+        test: score test of the candidate effects about the model.
         residual: (R, T, C) residual that effects may explain.
         noise_residual: (R, T, C) residual whose spectrum the surrogates have.
         observed_mask: (R, T, C) whether a sample is recorded.
-        rng: source of the surrogates.
+        rng: random generator of the surrogates.
     """
     return compute_calibrated_scores(
         test,

@@ -50,10 +50,11 @@ class LaggedSums(NamedTuple):
         return LaggedSums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     def combine(self, phi: float) -> Array:
-        """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1).
+        """Combine the three sums to the inner products (W a)'(W b) of whitened columns, eq. (1).
 
         It is ((1 + phi^2) sum a_t b_t - phi sum a_t (b_{t-1} + b_{t+1}) - phi^2 sum n_t a_t b_t) /
-        (1 - phi^2) (1), with n_t the number of missing neighbours of sample t.
+        (1 - phi^2), with the AR(1) correlation phi and n_t the number of missing neighbours of
+        sample t.
         """
         square = phi * phi
         scaled_products = (
@@ -99,7 +100,8 @@ class SegmentColumns(NamedTuple):
 def count_missing_neighbours(observed_mask: Mask) -> Array:
     """Count the missing neighbours in time of each available sample: n_t of eq. (1), (R, T, C).
 
-    The first and the last sample of a run lack one neighbour each.
+    The first and the last sample of a run lack one neighbour each. AR(1) whitening uses the
+    previous sample, so samples at the edges of gaps have other weights.
 
     Shapes: R runs, T samples, C channels.
 
@@ -114,41 +116,41 @@ def count_missing_neighbours(observed_mask: Mask) -> Array:
     return np.where(observed_mask, missing_counts, 0.0)
 
 
-def select_run(parts: LaggedSums, run: int) -> LaggedSums:
-    """Return one run's part of per-run sums, as views to which products can be added."""
-    return LaggedSums(*(values[run] for values in parts))
+def select_run(sums: LaggedSums, run: int) -> LaggedSums:
+    """Return the sums of one run, as views to which products can be added."""
+    return LaggedSums(*(values[run] for values in sums))
 
 
 def add_cross_products(
-    parts: LaggedSums, first: SegmentColumns, second: SegmentColumns, segment: RunSegment
+    sums: LaggedSums, first: SegmentColumns, second: SegmentColumns, segment: RunSegment
 ) -> None:
-    """Add the products of all columns of one set with all columns of another.
+    """Add the products of all columns of one set with all columns of another, over one segment.
 
     Args:
-        parts: sums to add to, in place.
+        sums: sums to add to, in place.
         first: columns of the first set.
         second: columns of the second set.
         segment: section of a run, with its samples that lack neighbours.
     """
-    parts.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
+    sums.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
     # Summed over a run, it does not matter to which of the two columns the neighbours belong.
-    parts.neighbours[...] += first.samples @ np.swapaxes(second.neighbour_sums, -1, -2)
-    parts.run_ends[...] += (first.edge_samples * segment.missing_neighbours) @ np.swapaxes(
+    sums.neighbours[...] += first.samples @ np.swapaxes(second.neighbour_sums, -1, -2)
+    sums.run_ends[...] += (first.edge_samples * segment.missing_neighbours) @ np.swapaxes(
         second.edge_samples, -1, -2
     )
 
 
-def add_self_products(parts: LaggedSums, columns: SegmentColumns, segment: RunSegment) -> None:
-    """Add the products of columns with themselves.
+def add_self_products(sums: LaggedSums, columns: SegmentColumns, segment: RunSegment) -> None:
+    """Add the product of each column with itself, over one segment.
 
     Args:
-        parts: sums to add to, in place.
-        columns: the columns.
+        sums: sums to add to, in place.
+        columns: columns whose squares are summed.
         segment: section of a run, with its samples that lack neighbours.
     """
-    parts.same_samples[...] += np.einsum("kn,kn->k", columns.samples, columns.samples)
-    parts.neighbours[...] += np.einsum("kn,kn->k", columns.neighbour_sums, columns.samples)
-    parts.run_ends[...] += np.einsum(
+    sums.same_samples[...] += np.einsum("kn,kn->k", columns.samples, columns.samples)
+    sums.neighbours[...] += np.einsum("kn,kn->k", columns.neighbour_sums, columns.samples)
+    sums.run_ends[...] += np.einsum(
         "km,km,m->k", columns.edge_samples, columns.edge_samples, segment.missing_neighbours
     )
 
@@ -242,11 +244,11 @@ class WhiteningDesign:
     def _iterate_sections(self) -> Iterator[RunSegment]:
         """Yield sections of the runs that are so short that their columns fit in the CPU cache.
 
-        Each section has the positions of its samples with missing neighbours, at which whitening
-        differs.
+        Sums over sections are several times faster than over whole runs. Each section has the
+        indices of its samples with missing neighbours, at which whitening differs.
         """
-        count, runs, length, channels = self._directions.shape
-        step = max(MAX_CHUNK_SIZE // (max(count, 1) * channels), MIN_CHUNK_SAMPLES)
+        direction_count, runs, length, channels = self._directions.shape
+        step = max(MAX_CHUNK_SIZE // (max(direction_count, 1) * channels), MIN_CHUNK_SAMPLES)
         for run in range(runs):
             for begin in range(0, length, step):
                 end = min(begin + step, length)
@@ -259,6 +261,9 @@ class WhiteningDesign:
     ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
 
+        These are the factors of the products in eq. (1). The weights are 1 / sigma of each channel,
+        and zero where no sample exists.
+
         Shapes: R runs, T samples, C channels.
 
         Args:
@@ -267,7 +272,7 @@ class WhiteningDesign:
             has_neighbours: whether neighbours are needed; otherwise they are zero.
         """
         run, begin, end = segment.run, segment.begin, segment.end
-        sample_count = len(values)
+        column_count = len(values)
         # Include one more sample on either side, as a neighbour of the outermost samples.
         first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
         extended_samples = values[:, run, first:last] * self._weights[run, first:last]
@@ -279,15 +284,18 @@ class WhiteningDesign:
             next_samples = extended_samples[:, begin - first + 1 :]
             neighbour_sums[:, : next_samples.shape[1]] += next_samples
         # The shape is written out, because -1 is ambiguous if there are no rows.
-        size = sample_count, samples.shape[1] * samples.shape[2]
-        flat = samples.reshape(size)
-        return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, segment.edge_samples])
+        flat_shape = column_count, samples.shape[1] * samples.shape[2]
+        flat = samples.reshape(flat_shape)
+        return SegmentColumns(
+            flat, neighbour_sums.reshape(flat_shape), flat[:, segment.edge_samples]
+        )
 
     def _add_section_products(self, segment: RunSegment) -> None:
         """Add the products of one section of a run to the sums of eq. (1).
 
-        The products are those of the Jacobian with itself and with the directions, the squares of
-        the directions, and the products of directions that act together.
+        1. The Jacobian with itself and with the directions, which the projection needs.
+        2. The squares of the directions.
+        3. The products of directions that act together (a block).
 
         Args:
             segment: Section of a run, with its samples that lack neighbours.
@@ -295,6 +303,7 @@ class WhiteningDesign:
         jacobian_columns = self._weight_columns(self._jacobian, segment)
         direction_columns = self._weight_columns(self._directions, segment)
         add_cross_products(
+            # 1. Jacobian.
             select_run(self._jacobian_products, segment.run),
             jacobian_columns,
             jacobian_columns,
@@ -306,8 +315,10 @@ class WhiteningDesign:
             direction_columns,
             segment,
         )
+        # 2. Squares.
         add_self_products(self._direction_squares, direction_columns, segment)
-        for block, parts in zip(self.blocks, self._block_products, strict=True):
+        # 3. Blocks.
+        for block, block_sums in zip(self.blocks, self._block_products, strict=True):
             # The square of a single column is already known.
             if block.shape[1] > 1:
                 members = SegmentColumns(
@@ -315,10 +326,12 @@ class WhiteningDesign:
                     direction_columns.neighbour_sums[block],
                     direction_columns.edge_samples[block],
                 )
-                add_cross_products(parts, members, members, segment)
+                add_cross_products(block_sums, members, members, segment)
 
     def compute_products(self, *residuals: Array) -> tuple[LaggedSums, LaggedSums, LaggedSums]:
         """Compute products of residuals with themselves, with the Jacobian, and with directions.
+
+        With the products of the design, they are all that scores need, for any correlation.
 
         Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
@@ -329,11 +342,11 @@ class WhiteningDesign:
             Products of residuals with themselves (S,), with the Jacobian per run (R, q + s, S), and
             of directions with residuals (K, S).
         """
-        size, runs, *_ = self._jacobian.shape
-        samples = sum(len(array) for array in residuals)
-        squares = LaggedSums.zeros(samples)
-        shared = LaggedSums.zeros(runs, size, samples)
-        cross = LaggedSums.zeros(len(self._directions), samples)
+        unknown_count, runs, *_ = self._jacobian.shape
+        residual_count = sum(len(array) for array in residuals)
+        squares = LaggedSums.zeros(residual_count)
+        shared = LaggedSums.zeros(runs, unknown_count, residual_count)
+        cross = LaggedSums.zeros(len(self._directions), residual_count)
         for segment in self._iterate_sections():
             # Concatenate section by section, because whole copies would double the memory.
             parts = [self._weight_columns(array, segment) for array in residuals]
@@ -354,13 +367,18 @@ class WhiteningDesign:
     def project_out(self, residuals: Array) -> Array:
         """Return the residuals of a least-squares fit of parameters and initial states.
 
+        1. Project the residuals on the derivatives by the initial states and the parameters.
+        2. Solve for the parameters, then for the initial states of each run (back substitution).
+        3. Subtract the fitted change from the residuals.
+
         Shapes: R runs, T samples, C channels.
 
         Args:
             residuals: (S, R, T, C) residuals before the fit.
         """
+        # 1. Projections.
         reduced_design = self.reduce(0.0)
-        q = self._parameter_count
+        parameter_count = self._parameter_count
         weighted = self._jacobian * self._weights
         shared = np.stack(
             [
@@ -369,12 +387,16 @@ class WhiteningDesign:
             ]
         )
         by_states, by_parameters = _project_residuals(reduced_design, shared)
+        # 2. Coefficients.
         # Back substitution: first coefficients of the parameters, then of the initial states of
         # each run.
         parameters = reduced_design.parameter_root @ by_parameters
-        state_products = by_states - reduced_design.state_projections[:, :q] @ parameters
+        state_products = (
+            by_states - reduced_design.state_projections[:, :parameter_count] @ parameters
+        )
         runs, size, _ = reduced_design.state_roots.shape
         states = reduced_design.state_roots @ state_products.reshape(runs, size, len(residuals))
+        # 3. Remaining residuals.
         result = np.empty_like(residuals)
         for run in range(runs):
             coefficients = np.concatenate([parameters, states[run]])
@@ -394,40 +416,57 @@ class WhiteningDesign:
         return self._reduced_designs[phi]
 
     def _whiten_and_project(self, phi: float) -> _ReducedDesign:
-        """Whiten the design with the correlation phi, and project it by eq. (2), without a cache.
+        """Whiten the design with the correlation phi, and project it by eq. (2).
 
-        First the initial states of each run are projected out, then the parameters of all runs.
+        The products of two columns become a'b - (L'J'a)'(L'J'b), eq. (2), with the Jacobian J and L
+        L' = (J'J)^-1. So only the part of a direction that parameters and initial states cannot
+        absorb remains.
 
-        The projected product is a'b - (L'J'a)'(L'J'b) (2), with the Jacobian J and L L' = (J'J)^-1.
+        1. Whiten all products with phi.
+        2. Project out the initial states of each run, then the parameters of all runs.
+        3. Mark the directions of which nothing remains.
+        4. Project the products of directions that act together.
         """
-        q = self._parameter_count
+        parameter_count = self._parameter_count
+        # 1. Whitening.
         normal = self._jacobian_products.combine(phi)
         mixed = self._direction_products.combine(phi)
         powers = self._direction_squares.combine(phi)
 
+        # 2. Projection.
         # Eq. (2) for the initial states of each run, then for the parameters.
-        state_root = _compute_matrix_root(normal[:, q:, q:])
-        other_products = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
+        state_root = _compute_matrix_root(normal[:, parameter_count:, parameter_count:])
+        other_products = np.concatenate(
+            [normal[:, parameter_count:, :parameter_count], mixed[:, parameter_count:]], axis=2
+        )
         by_states = _project_directions(state_root, other_products)
-        by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
-        schur_complement = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
+        by_parameters, by_directions = (
+            by_states[:, :parameter_count],
+            by_states[:, parameter_count:],
+        )
+        schur_complement = (
+            normal[:, :parameter_count, :parameter_count].sum(axis=0)
+            - by_parameters.T @ by_parameters
+        )
         parameter_root = _compute_matrix_root(schur_complement)
         by_own_parameters = parameter_root.T @ (
-            mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions
+            mixed[:, :parameter_count].sum(axis=0) - by_parameters.T @ by_directions
         )
 
+        # 3. Absorbed directions.
         # Only rounding remains of absorbed directions, which would explain residuals at random.
         absorbed = np.concatenate([by_directions, by_own_parameters])
         remaining = powers - np.einsum("ak,ak->k", absorbed, absorbed)
         acting = remaining > MIN_RESIDUAL_SHARE * powers
         remaining = np.where(acting, remaining, 0.0)
+        # 4. Blocks.
         grams = []
-        for block, parts in zip(self.blocks, self._block_products, strict=True):
+        for block, block_sums in zip(self.blocks, self._block_products, strict=True):
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
             columns = np.moveaxis(absorbed[:, block], 0, 2)
-            gram = parts.combine(phi) - columns @ columns.transpose(0, 2, 1)
+            gram = block_sums.combine(phi) - columns @ columns.transpose(0, 2, 1)
             # Rounding makes the two halves differ, and the eigensolver reads only one of them.
             symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
             is_pair_acting = acting[block][:, :, None] & acting[block][:, None, :]
@@ -450,25 +489,29 @@ class InnerProducts:
         self._squares, self._shared, self._cross = design.compute_products(*residuals)
 
     def project(self, phi: float) -> tuple[Array, list[Array], Array]:
-        """Return the products of eq. (2) after whitening with a correlation.
+        """Return the products of eq. (2) for noise with the AR(1) correlation phi.
 
-        The projected product is <a, b> = a'b - (L'J'a)'(L'J'b) (2), with the Jacobian J and L L' =
-        (J'J)^-1.
+        The residuals and directions are whitened with phi, and the part that parameters and initial
+        states absorb is removed: <a, b> = a'b - (L'J'a)'(L'J'b), eq. (2), with the Jacobian J and L
+        L' = (J'J)^-1.
 
         Args:
-            phi: the AR(1) correlation.
+            phi: AR(1) correlation of the noise.
 
         Returns:
             Sums of squares (S,) of the residuals, products (n, k, k) of the directions in each
             block, and products of directions with residuals (K, S).
         """
         reduced_design = self._design.reduce(phi)
-        q = len(reduced_design.parameter_root)
+        parameter_count = len(reduced_design.parameter_root)
         by_states, by_parameters = _project_residuals(reduced_design, self._shared.combine(phi))
         absorbed = np.concatenate([by_states, by_parameters])
         total = self._squares.combine(phi) - np.einsum("as,as->s", absorbed, absorbed)
         direction_products = np.concatenate(
-            [reduced_design.state_projections[:, q:], reduced_design.parameter_projections]
+            [
+                reduced_design.state_projections[:, parameter_count:],
+                reduced_design.parameter_projections,
+            ]
         )
         cross = self._cross.combine(phi) - direction_products.T @ absorbed
         return (
@@ -486,25 +529,30 @@ def _flatten(values: Array) -> Array:
 def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
     """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
 
+    The squares of these are the part of the residuals that initial states and parameters absorb.
+
     Shapes: R runs, q fitted parameters, s states of a run.
 
     The projection subtracts (L'J'a)'(L'J'b) from a'b (2).
 
     Args:
-        reduced_design: the whitened design.
-        shared: (R, q + s, S) products of the Jacobian with residuals.
+        reduced_design: Jacobian and directions after whitening and projection.
+        shared: (R, q + s, S) products J'e of the Jacobian with the residuals.
     """
-    q = len(reduced_design.parameter_root)
+    parameter_count = len(reduced_design.parameter_root)
     # First the initial states of each run, then the parameters.
-    by_states = _project_directions(reduced_design.state_roots, shared[:, q:])
+    by_states = _project_directions(reduced_design.state_roots, shared[:, parameter_count:])
     parameter_products = (
-        shared[:, :q].sum(axis=0) - reduced_design.state_projections[:, :q].T @ by_states
+        shared[:, :parameter_count].sum(axis=0)
+        - reduced_design.state_projections[:, :parameter_count].T @ by_states
     )
     return by_states, reduced_design.parameter_root.T @ parameter_products
 
 
 def _project_directions(roots: Array, products: Array) -> Array:
-    """Multiply the products J'a of each run by the root L', as in eq. (2).
+    """Multiply the products J'a of each run by the root L', as needed in eq. (2).
+
+    Eq. (2) subtracts (L'J'a)'(L'J'b), the part of a'b that the initial states absorb.
 
     Shapes: R runs, s states of a run.
 
@@ -522,11 +570,10 @@ def _project_directions(roots: Array, products: Array) -> Array:
 
 
 def _compute_matrix_root(normal: Array) -> Array:
-    """Return L of eq. (2) for positive semidefinite matrices (..., s, s).
+    """Return L with L L' = (J'J)^-1 of eq. (2), for positive semidefinite matrices (..., s, s).
 
-    Eigenvectors with very small eigenvalues are omitted.
-
-    L is the root of a pseudoinverse, L L' = (J'J)^-1.
+    It is the root of a pseudoinverse: eigenvectors with very small eigenvalues, which rounding
+    decides, are omitted.
 
     Args:
         normal: Matrices J'J of the normal equations.
