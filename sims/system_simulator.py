@@ -528,7 +528,7 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
     """Check that coefficients have plausible sizes.
 
     Args:
-        effect: effect: a force, friction, input, sensor or contact law.
+        effect: effect of the library: a force, friction, input, sensor or contact law.
         system: the system on which it acts.
         values: its coefficients in order.
 

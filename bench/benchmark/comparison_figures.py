@@ -75,7 +75,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     direction.
 
     Args:
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         table: Rows of identifiability.csv.
     """
     names = [c for c in table.columns if c not in IDENTIFIABILITY_COLUMNS]

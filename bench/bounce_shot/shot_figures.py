@@ -64,7 +64,7 @@ def draw_figures(
     """Draw the figures of the bounce-shot study.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         setups: all shots.
         stored: stored results by name of the shot.
@@ -109,7 +109,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     """Draw the hit rate of each method over all balls and by ball, as the chart of the page.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
     """
     panel, table = make_success_panel(lines)

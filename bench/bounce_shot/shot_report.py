@@ -45,7 +45,7 @@ def render_page(
     """Render the HTML report.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         folder: result folder.
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
         rows: one row per method and shot.

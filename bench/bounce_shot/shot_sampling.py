@@ -154,7 +154,7 @@ def draw_shots(experiment: Experiment, settings: ShotConfig, salt: str = "") -> 
     The kinds of balls alternate, so that an interrupted study has shots of each.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         salt: salt from which the shots are drawn.
     """
@@ -180,7 +180,7 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     """Record a drop of the ball on level ground, unless the recording exists already.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         setup: setup of the shot: its ball, drop, incline and hoop.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         path: CSV file of the recording.
@@ -218,7 +218,7 @@ def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Exper
     """Make the experiment for a ball in front of an unknown camera.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
     """
     radii = [get_ball_kind(name).radius for name in settings.balls]

@@ -107,7 +107,7 @@ def tune_and_plan(
     """Tune all methods to a recording, and plan a shot with each.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         inputs: input of the methods.
 
@@ -155,7 +155,7 @@ def _tune_model(
     as heights.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         entry: entry of the tuner: registered name, label and options.
         inputs: input of the methods.
@@ -207,7 +207,7 @@ def make_tuning_experiment(
     """Adapt the experiment to a tuner: to pixel rows if the tuner uses them.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         entry: entry of the tuner: registered name, label and options.
     """
@@ -224,7 +224,7 @@ def _make_observed_runs(recording: Recording, experiment: Experiment) -> Observe
 
     Args:
         recording: recording of the ball's drop.
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
     """
     (run,) = recording.runs
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)

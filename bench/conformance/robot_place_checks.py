@@ -247,7 +247,7 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     """Return what an effect at one place changes.
 
     Args:
-        effect: effect: a force, friction, input, sensor or contact law.
+        effect: effect of the library: a force, friction, input, sensor or contact law.
         c: coefficients, (K, 2, 1).
         kind: simulator class of the robot.
 

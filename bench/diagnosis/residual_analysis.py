@@ -286,7 +286,7 @@ def _find_largest_residual_channel(evaluator: RunEvaluator, before: Array, sigma
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         before: (R, T, C) channels simulated with the base model.
         sigma: (C,) standard deviation of the noise of each channel.
     """
@@ -319,7 +319,7 @@ def _iterate_variables(
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         simulated: (R, T, C) simulated channels, from which position and speed are taken.
     """
     times = _compute_run_times(evaluator)
@@ -354,7 +354,7 @@ def _iterate_inputs(
     Shapes: R runs, T samples.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         names: names of the inputs.
     """
     for channel in evaluator.kind.inputs:
@@ -377,7 +377,7 @@ def _iterate_joint_variables(
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator that simulates the recorded runs of a robot.
         simulated: (R, T, C) simulated channels.
         channel: name of the channel, such as ``q.elbow``.
     """

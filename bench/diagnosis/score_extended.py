@@ -220,7 +220,7 @@ def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         extended: extended simulator, with its parameters and coefficients.
         sigma: (C,) standard deviation of the noise, which weights the channels.
     """
@@ -236,7 +236,7 @@ def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         simulated: (R, T, C) simulated channels.
     """
     observed_mask = np.isfinite(evaluator.observed)

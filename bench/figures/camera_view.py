@@ -94,7 +94,7 @@ def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
     """Compute the robot's mujoco.MjData at a pose.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         positions: Positions by joint, rad or m; other joints keep the position of the model file.
     """
     import mujoco
@@ -118,7 +118,7 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     moving parts and of the static parts close to them.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         data: MuJoCo data at the pose.
     """
     azimuth, elevation = _choose_view_angles(robot, data)

@@ -43,7 +43,7 @@ def draw_skeleton(axis: Axes, robot: RobotModel, data: Any, view: Projection) ->
 
     Args:
         axis: Axes to draw on.
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         data: MuJoCo data at the pose.
         view: Camera view.
     """
@@ -71,7 +71,7 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
     to the end of the last body.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         data: MuJoCo data at the pose.
     """
     model = robot.compiled
@@ -327,7 +327,7 @@ def compute_joint_positions(
 
     Args:
         figure: Figure made by `draw_robot_figure`.
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         positions: Positions by joint of that figure.
 
     Returns:
@@ -560,7 +560,7 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
     """Return (3,) the position of a place of the robot in metres.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         data: MuJoCo data at the pose.
         kind: ``joint``, ``actuator``, ``body`` or ``channel``.
         name: Name of the place.

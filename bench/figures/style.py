@@ -328,7 +328,7 @@ def style_of(
     """Return the styles of a comparison's tuners, in the order of its ranking.
 
     Args:
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         statistics: Its statistics.
         references: Reference results drawn behind the curves.
         panels: Metric and range of each panel of curves against simulations; the legend says which

@@ -34,7 +34,7 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     ranges. The first runs are for fitting, the last ones are held out.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         salt: salt from which the recording is drawn.
         path: CSV file of the recording.
 
@@ -113,7 +113,7 @@ def run_explain(recording: Path, experiment: Experiment, jobs: int) -> ExtendedS
 
     Args:
         recording: CSV file of the calibration recording.
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         jobs: number of worker processes.
     """
     from bench.diagnosis.explain import explain  # a local import, because it imports all of explain
@@ -149,7 +149,7 @@ def make_extended_experiment(experiment: Experiment, effects: dict[str, list[flo
     fitted.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         effects: coefficients by name of the effect.
     """
     settings = dict(experiment.settings)

@@ -57,7 +57,7 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
     """Return the numbers of the two geoms of a pair.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         pair: names of both geoms, joined by `PAIR_SEPARATOR`.
 
     Raises:
@@ -138,7 +138,7 @@ def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
     """Return whether the model has an element `<pair>` of two geoms.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         geoms: numbers of the two geoms.
     """
     model = robot.compiled
@@ -150,7 +150,7 @@ def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]
     """Return the sliding friction coefficient and `solref` of a pair in the model file.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         pair: names of both geoms, joined by `PAIR_SEPARATOR`.
     """
     geoms = find_pair_geoms(robot, pair)

@@ -161,7 +161,7 @@ def _list_places(robot: RobotModel, effect: str) -> list[str]:
     """List the places of an effect family that has one number for all places.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         effect: name of the effect without its place.
     """
     if effect.startswith("input."):

@@ -116,7 +116,7 @@ def read_option(robot: RobotModel, name: str) -> float:
     """Return the number of an option in the robot's model file.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         name: name of the option, such as ``impratio``.
     """
     return cast(float, getattr(robot.compiled.opt, name))

@@ -39,7 +39,7 @@ def close_loops(
     velocities are v_u = -J_u^+ J_m v_m, with the measured joints m and J = dr/dq (1).
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         states: positions ``q.JOINT`` and velocities ``qd.JOINT`` of its joints.
         unmeasured: names of the joints to place; the others stay.
 

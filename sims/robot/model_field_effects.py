@@ -138,7 +138,7 @@ def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelFi
     """Return the three fields of a body's centre of mass.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the body.
     """
     body_id = robot.body(place).id
@@ -159,7 +159,7 @@ def _make_servo_gain_finder(term: int) -> Find:
         `term` is the index of the bias parameter: 1 for position, 2 for velocity.
 
         Args:
-            robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+            robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
             place: name of the actuator.
         """
         actuator_id = robot.actuator(place).id
@@ -175,7 +175,7 @@ def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelFi
     """Return both ends of an actuator's force range, which one positive limit determines.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the actuator.
     """
     actuator_id = robot.actuator(place).id
@@ -261,7 +261,7 @@ def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the body.
         c: (1, L) coefficient.
     """
@@ -354,7 +354,7 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the body.
         c: (1, L) coefficient.
     """
@@ -435,7 +435,7 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the pair.
         c: (1, L) coefficient.
     """
@@ -451,7 +451,7 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
     Args:
         fields: fields of L batch elements, changed in place.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the geom.
         c: (1, L) coefficient.
     """

@@ -164,7 +164,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     """Make one draw of a target; None if its simulation diverges.
 
     Args:
-        problem: problem: simulator, noise and ranges from which targets are drawn.
+        problem: simulator, noise and ranges from which targets are drawn.
         kind: range of the target: ``wide`` draws from all bounds, others from the training range.
         index: index of the target in its range.
         number: 0 for the first draw; counts the repeated draws, each from new streams.

@@ -251,7 +251,7 @@ def _run_isolated(
     """Execute a run whose tuner has an isolated process.
 
     Args:
-        experiment: experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         request: request of the run.
         task: task of the target.
         evaluate: function that simulates points and computes their losses.

@@ -265,7 +265,7 @@ def declare_run_columns(names: list[str], experiment: Experiment) -> list[Column
 
     Args:
         names: Names of the file's columns.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
     """
     parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
     channels = experiment.observe or list_channels(names)

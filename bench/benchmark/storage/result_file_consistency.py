@@ -54,7 +54,7 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
 
     Args:
         plan: The id of every run.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         path: Path of the plan.
         remedy: Advice for a damaged plan.
 
@@ -94,7 +94,7 @@ def check_complete(
 
     Args:
         executed_runs: Tuner, target and seed of each run; the index is the row in the file.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         make_error: Makes the error for a row, or for the file.
 
     Raises:
@@ -166,7 +166,7 @@ def check_files(
 
     Args:
         folder: Folder of the comparison.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         is_unfinished: Whether runs may be missing.
         plan: The id of every run; None if unknown.
 
@@ -279,7 +279,7 @@ def check_statuses(
 
     Args:
         statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`, cells checked.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         make_error: Makes the error for a row.
 
     Raises:
@@ -407,7 +407,7 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
     Args:
         runs: One line per run, as read from `file`.
         file: File of the rows.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
 
     Raises:
         InputError: A check fails.
@@ -443,7 +443,7 @@ def check_segment_statuses(
     Args:
         path: Path of the part or journal.
         statuses_by_index: Statuses by index in the plan.
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         plan: The id of every run; None if unknown.
         remedy: Advice for a damaged file.
 

@@ -62,7 +62,7 @@ def choose_free_folder(experiment: Experiment, out: Path | None) -> Path:
     """Choose the folder of a new study.
 
     Args:
-        experiment: Experiment: simulator, tuners, targets and budget, from its TOML file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         out: Wanted folder; None for a folder in results/ named after the experiment and the time.
 
     Raises:

@@ -558,7 +558,7 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
     """Return the joints and actuators of a robot to check; None for other systems: check all.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         shares: (C,) share of each channel in the squares of the residual.
     """
     if not evaluator.kind.has_model:

@@ -262,7 +262,7 @@ def _is_recorded(evaluator: RunEvaluator, effect: str) -> bool:
     """Return whether the signal that an effect acts on was recorded.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     run = evaluator.runs[0]

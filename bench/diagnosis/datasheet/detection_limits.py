@@ -205,7 +205,7 @@ def _add_small_gaps(
     Each size is half the previous one, `GAP_HALVINGS` times.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         fit: fit of the model.
         directions: directions of all candidates.
     """
@@ -247,7 +247,7 @@ def _linearise_extended(
     Only the initial states are fitted; parameters and coefficients keep their values.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         noise: noise of each channel.
     """

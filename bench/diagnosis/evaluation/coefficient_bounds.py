@@ -55,13 +55,16 @@ Bound = Literal["low", "high"]
 def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple[float, float]]:
     """Return the range in which a fit may move each coefficient of an effect.
 
-    A plausible range ranks causes, and values outside it are reported, but it does not override the
-    data. A fit is limited by physics (`Coefficient.least` and `most`: totals of friction, damping,
-    inertia and mass are not negative), or far outside the plausible range. A coefficient that is
-    nonnegative by definition stays so, and a shape parameter stays in its range.
+    The plausible range of a coefficient ranks causes, and values outside it are reported, but it
+    does not override the data. So a fit has wider limits:
+
+    * limits of physics (`Coefficient.least` and `most`): totals of friction, damping, inertia and
+      mass are not negative;
+    * otherwise, a multiple of the plausible range;
+    * zero for a coefficient that is nonnegative by definition, and the range of a shape parameter.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator, which has the coefficients of all effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     effect = evaluator.available_effects[name]
@@ -82,7 +85,7 @@ def get_bounds_by_index(
     """Return the ranges of `compute_coefficient_bounds` for some effects, by index in theta.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         names: names of the effects.
     """
     bounds: dict[int, tuple[float, float]] = {}
@@ -96,7 +99,7 @@ def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:
     """Clip the coefficients (k,) of an effect to the range in which a fit may move them.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) its coefficients.
     """
@@ -153,14 +156,14 @@ def _compute_fit_bounds(
 ) -> tuple[float, float]:
     """Return the range in which a fit may move a coefficient, without its physical limits.
 
-    It is the plausible range, widened by a factor; times and frequencies are adapted to the length
+    It is the plausible range, widened by a factor. Times and frequencies are adapted to the length
     of the runs, because the data cannot show slower changes.
 
     Args:
         parameter: the coefficient as a parameter, with its unit and plausible range.
-        coefficient: its declaration by the effect.
-        effect: effect: a force, friction, input, sensor or contact law.
-        evaluator: the runs, whose durations limit times and frequencies.
+        coefficient: declaration of the coefficient by its effect.
+        effect: effect of the coefficient: a force, friction, input, sensor or contact law.
+        evaluator: evaluator, whose longest run limits times and frequencies.
     """
     low, high = parameter.bounds
     longest_run = evaluator.longest_duration

@@ -128,6 +128,9 @@ class ForkedWorkerPool:
     ) -> Iterator[tuple[int, Result]]:
         """Run a task on each item, and yield item numbers and results as they arrive.
 
+        Items are distributed to workers once enough work was done to justify the cost of forking
+        them. Until then, and with one job, they are processed in this process.
+
         Args:
             evaluator: first argument of the task; workers have it as it was when they were started.
             task: a module-level function.
@@ -224,12 +227,14 @@ class ForkedWorkerPool:
     ) -> Iterator[tuple[int, Result]]:
         """Distribute the items of a task among the workers, and yield each result as it arrives.
 
-        An item is processed again if its worker dies; without any worker, the items are processed
-        in this process. `unprocessed` has the numbers of these items, `busy` the item number of
-        each working pipe, and `idle` the idle pipes. `evaluator_index` is the index by which the
-        workers know the run evaluator.
+        1. Send an item to each idle worker.
+        2. Without any worker, process the remaining items in this process.
+        3. Receive replies. If a worker has died, its item is processed again.
+        4. Raise the first error of a task, after all other items are finished.
 
-        An error in a task is raised after all other items are finished.
+        `unprocessed` has the numbers of these items, `busy` the item number of each working pipe,
+        and `idle` the idle pipes. `evaluator_index` is the index by which the workers know the run
+        evaluator.
         """
         errors: dict[int, tuple[Exception, str]] = {}
         unprocessed = list(range(len(items)))[::-1]
@@ -239,6 +244,7 @@ class ForkedWorkerPool:
             i for i, inherited in enumerate(self._inherited_evaluators) if inherited is evaluator
         )
         while unprocessed or busy:
+            # 1. Requests.
             while idle and unprocessed:
                 pipe = idle.pop()
                 item_index = unprocessed.pop()
@@ -247,12 +253,14 @@ class ForkedWorkerPool:
                 else:
                     self._kill_worker(pipe)
                     unprocessed.append(item_index)
+            # 2. No workers.
             # All workers are gone, so the remaining items are processed here.
             if not busy:
                 yield from (
                     (item_index, task(evaluator, *items[item_index])) for item_index in unprocessed
                 )
                 break
+            # 3. Replies.
             for pipe in self._wait_for_replies(list(busy), evaluator):
                 item_index = busy.pop(pipe)
                 reply = _receive(pipe)
@@ -268,6 +276,7 @@ class ForkedWorkerPool:
                     errors[item_index] = reply.error, reply.trace
                 else:
                     yield item_index, reply.result
+        # 4. Errors.
         # Raise the error of the first item in order, whichever error arrived first.
         for item_index in sorted(errors):
             error, trace = errors[item_index]
@@ -376,8 +385,10 @@ def _run_worker(
 ) -> None:
     """Process the requests of the parent until the pipe ends; main loop of a worker.
 
-    A request has the index of a run evaluator, a task (a function) and its arguments. The answer
-    has the result or the error, and the number of simulations.
+    1. Make sure that the worker ends with its parent, and that only the parent handles Ctrl-C.
+    2. Receive a request: the index of a run evaluator, a task (a function) and its arguments.
+    3. Run the task, with the deadline of the search.
+    4. Send the result or the error, and the number of simulations.
 
     Args:
         evaluators: objects that the worker inherits; a request names one by its index.
@@ -386,6 +397,7 @@ def _run_worker(
         stop_flag: one shared byte; a value other than zero asks all workers to stop.
         parent: process id of the parent.
     """
+    # 1. Signals.
     # Ctrl-C of a terminal reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):
@@ -397,6 +409,7 @@ def _run_worker(
         other_pipe.close()
     for evaluator in evaluators:
         evaluator.worker_pool = ForkedWorkerPool()
+    # 2. Requests.
     while True:
         try:
             evaluator_index, task, item = pickle.loads(pipe.recv_bytes())
@@ -408,12 +421,14 @@ def _run_worker(
         )
         evaluator.search_control = SearchControl(stop=lambda: stop_flag[0] != 0)
         evaluator.search_control.deadline = deadline
+        # 3. Task.
         count_before = evaluator.simulation_count
         result, error, trace = None, None, ""
         try:
             result = task(evaluator, *item)
         except Exception as raised:
             error, trace = raised, traceback.format_exc()
+        # 4. Answer.
         count = evaluator.simulation_count - count_before
         if not _send(
             pipe,

@@ -60,13 +60,14 @@ class NoiseFloor:
 
 
 def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseFloor:
-    """Return the specified noise of each channel, or estimate it from all runs.
+    """Return the standard deviation of the noise of each channel, stated or estimated.
 
-    Held-out runs are included, because they also show the sensor noise.
+    All errors are compared with it. Held-out runs are included, because they also show the sensor
+    noise.
 
     Args:
-        evaluator: the runs for fitting; its simulator defines the channels.
-        recording: the recording with all its runs.
+        evaluator: evaluator, whose simulator defines the channels.
+        recording: recording with all its runs.
     """
     sigmas, is_stated, steps, uncertainties = [], [], [], []
     for channel in evaluator.simulator.channels:

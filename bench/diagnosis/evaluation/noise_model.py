@@ -75,17 +75,18 @@ def _has_predecessor(observed_mask: Mask) -> Mask:
 
 
 def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
-    """Whiten values with AR(1) noise, by eq. (2) of the module docstring.
+    """Transform AR(1) noise to independent numbers of variance one (whitening).
 
-    With the residual e_t, w_t = (e_t - phi e_{t-1}) / (sigma sqrt(1 - phi^2)); a sample without a
-    predecessor has w_t = e_t / sigma (2).
+    Least squares of whitened residuals is generalised least squares. With the residual e_t, w_t =
+    (e_t - phi e_{t-1}) / (sigma sqrt(1 - phi^2)); a sample without a predecessor has w_t = e_t /
+    sigma.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
         values: (R, T, C, ...) noise, or derivatives of noisy signals, because whitening is linear.
         observed_mask: (R, T, C) mask of available samples; the others become zero.
-        noise: noise of each channel.
+        noise: standard deviation sigma and correlation phi of each channel.
 
     Returns:
         Values of the same shape; whitened noise is independent with variance one.
@@ -153,6 +154,8 @@ def maximise_likelihood(
 ) -> Likelihood:
     """Maximise the likelihood of a residual over the noise of each channel.
 
+    Models are compared by it, since their true noise is not known.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -161,12 +164,12 @@ def maximise_likelihood(
         fitted_freedom: degrees of freedom used by the fit, subtracted from the samples when sigma
             is estimated.
     """
-    total = 0.0
+    log_likelihood = 0.0
     sigmas: list[float] = []
     phis: list[float] = []
     # The degrees of freedom of the fit are distributed over the channels by their samples.
     samples = max(int(observed_mask.sum()), 1)
-    share = max(1.0 - fitted_freedom / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
+    degrees_of_freedom_ratio = max(1.0 - fitted_freedom / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
     for channel_index in range(residual.shape[2]):
         channel = slice(channel_index, channel_index + 1)
         channel_mask = observed_mask[:, :, channel]
@@ -176,12 +179,12 @@ def maximise_likelihood(
             phis.append(0.0)
             continue
         value, phi, variance = _maximise_channel_likelihood(
-            residual[:, :, channel], channel_mask, share
+            residual[:, :, channel], channel_mask, degrees_of_freedom_ratio
         )
-        total += value
+        log_likelihood += value
         sigmas.append(variance**0.5)
         phis.append(phi)
-    return Likelihood(total, np.array(sigmas), np.array(phis))
+    return Likelihood(log_likelihood, np.array(sigmas), np.array(phis))
 
 
 def _maximise_channel_likelihood(
@@ -189,39 +192,39 @@ def _maximise_channel_likelihood(
     observed_mask: Mask,
     share: float,
 ) -> tuple[float, float, float]:
-    """Return the maximum of eq. (4) for one channel (R, T, 1), with its correlation and variance.
-
-    The variance is estimated with the remaining degrees of freedom. The likelihood counts all
-    samples, because Schwarz's criterion has a separate penalty for fitted parameters.
+    """Return the maximum of eq. (4) for one channel, with its correlation and variance.
 
     With n samples, m of them with a predecessor, and the mean square v of the whitened values for
-    sigma = 1, 2 log L = -n log v - m log(1 - phi^2) - n (4).
+    sigma = 1, 2 log L = -n log v - m log(1 - phi^2) - n. It counts all samples, because Schwarz's
+    criterion has a separate penalty for fitted parameters. The variance is estimated with the
+    remaining degrees of freedom.
 
     Shapes: R runs, T samples.
 
     Args:
         residual: (R, T, 1) residual.
         observed_mask: (R, T, 1) mask of available samples.
-        share: share of the samples that remain as degrees of freedom.
+        share: remaining degrees of freedom, as a fraction of the samples.
     """
-    count = int(observed_mask.sum())
+    sample_count = int(observed_mask.sum())
     best = (-np.inf, 0.0, 0.0)
     for phi in _list_nearby_phis(residual, observed_mask):
         whitened = whiten(residual, observed_mask, _make_unit_noise(phi))
-        power = float((whitened * whitened).sum())
-        variance = max(power / count, MIN_VARIANCE)
+        sum_of_squares = float((whitened * whitened).sum())
+        variance = max(sum_of_squares / sample_count, MIN_VARIANCE)
         # Equation (4) with the determinant of whitening.
         determinant = 2.0 * compute_log_determinant(observed_mask, phi)
-        value = -count * np.log(variance) + determinant
+        value = -sample_count * np.log(variance) + determinant
         hypothesis = (value, phi, variance / share)
         best = max(best, hypothesis)
     return best
 
 
 def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
-    """Return AR(1) correlations to try for a channel, near the residual's sample correlation.
+    """Return the AR(1) correlations at which the likelihood of a channel is computed.
 
-    Zero (white noise) is always included.
+    They are near the sample correlation of the residual, where the maximum is. Zero (white noise)
+    is always included.
 
     Shapes: R runs, T samples.
 
@@ -232,9 +235,11 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     has_predecessor = _has_predecessor(observed_mask)
     previous_samples = residual[:, :-1][has_predecessor]
     next_samples = residual[:, 1:][has_predecessor]
-    power = float(previous_samples @ previous_samples)
+    sum_of_squares = float(previous_samples @ previous_samples)
     # The correlation of zeros is not defined.
-    sample_phi = float(previous_samples @ next_samples) / power if power > 0 else 0.0
+    sample_phi = (
+        float(previous_samples @ next_samples) / sum_of_squares if sum_of_squares > 0 else 0.0
+    )
     candidate_phis = sample_phi + np.array(PHI_OFFSETS)
     clipped_phis = np.clip(candidate_phis, MIN_PHI, MAX_PHI)
     # White noise is always one of the hypotheses.
@@ -245,11 +250,12 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
 def compute_portmanteau_p_value(
     residual: Array, observed_mask: Mask, likelihood: Likelihood
 ) -> float:
-    """Return the p-value of the hypothesis that a residual is AR(1) noise.
+    """Return the p-value of the hypothesis that a residual is AR(1) noise (Ljung-Box test).
 
-    Portmanteau test of the whitened residual: if its autocorrelations r_k at h lags are those of
-    independent numbers, Q has a chi-squared distribution with h - 1 degrees of freedom; φ has used
-    one (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297).
+    A small value means that the residual has structure. If the autocorrelations r_k of the whitened
+    residual at h lags are those of n independent numbers, Q has a chi-squared distribution with h -
+    1 degrees of freedom; φ has used one (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978,
+    doi:10.1093/biomet/65.2.297).
 
         Q = n (n + 2) Σ r_k² / (n - k)                                                           (5)
 
@@ -267,8 +273,12 @@ def compute_portmanteau_p_value(
         channel = slice(channel_index, channel_index + 1)
         channel_mask = observed_mask[:, :, channel]
         white = whiten(residual[:, :, channel], channel_mask, _make_unit_noise(phi))
-        count = max(int(channel_mask.sum()), 2)
-        statistic = count * (count + 2.0) * _compute_ljung_box_sum(white[:, :, 0], count)  # (5)
+        sample_count = max(int(channel_mask.sum()), 2)
+        statistic = (
+            sample_count
+            * (sample_count + 2.0)
+            * _compute_ljung_box_sum(white[:, :, 0], sample_count)
+        )  # (5)
         min_p_value = min(min_p_value, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
     return min(1.0, min_p_value * len(likelihood.phi))
 

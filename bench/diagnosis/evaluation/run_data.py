@@ -69,11 +69,11 @@ def prepare_run(
     simulator: SystemSimulator,
     states: Sequence[str],
 ) -> RunData:
-    """Prepare a run of a recording for a simulator.
+    """Prepare a run of a recording for a simulator: inputs, observations and initial states.
 
     Args:
         run: recorded run: times, channels and inputs.
-        recording: the recording that contains the run.
+        recording: recording that contains the run, with its constants.
         simulator: simulator that observes the recorded channels.
         states: names of the initial states.
     """
@@ -106,9 +106,10 @@ def prepare_run(
 
 
 def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, float]:
-    """Return a guess of each initial state, from which fits start, by name.
+    """Return a guess of each initial state by name, from which fits start.
 
-    It is the specified value, or an estimate from the first samples, or the default.
+    In order of preference it is the stated value, the value of a recorded rate, an estimate from
+    the first samples of a coordinate, or the default of the simulator.
 
     Args:
         run: recorded run: times, channels and inputs.
@@ -186,6 +187,8 @@ def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
 def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
     """Estimate value and slope at the first time from a parabola through the first samples.
 
+    They are guesses of the initial position and velocity.
+
     Args:
         times: (T,) times, s.
         values: (T,) samples, NaN where missing.
@@ -217,10 +220,13 @@ FREQUENCY_RANGE_RATIO = 100.0
 
 
 def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
-    """Return the coefficient with a plausible range for the time scale of a recording.
+    """Return a coefficient with a plausible range that fits the time scale of a recording.
+
+    The range of an effect is for typical recordings of seconds. A slow recording can show longer
+    delays and decays, and one with few samples shows only low frequencies.
 
     Args:
-        parameter: a coefficient, with the range that its effect specifies.
+        parameter: coefficient, with the range that its effect states.
         longest: duration of the longest run, s.
         spacing: shortest sample interval, s; 0 if unknown.
     """
@@ -276,7 +282,7 @@ class SimulationCache:
     def fill(
         self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
     ) -> None:
-        """Store new results, and write the results of all elements to an output array.
+        """Store new results, and write those of all elements to an output array.
 
         Shapes: T samples, C channels.
 

@@ -396,7 +396,10 @@ class RunEvaluator:
         states: Array,
         share: float = 1.0,
     ) -> Array:
-        """Simulate recorded runs with a batch of parameters.
+        """Simulate recorded runs with a batch of parameters and initial states, in one call.
+
+        Results of a robot are cached, because the search simulates some points repeatedly. The
+        correction of the discretisation error is added, if there is one.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 
@@ -404,7 +407,7 @@ class RunEvaluator:
             theta: (L, P) parameters.
             runs: (L,) index of the run of each batch element.
             states: (L, s) initial states.
-            share: initial share of each run that is simulated.
+            share: fraction of each run, from its beginning, that is simulated.
 
         Returns:
             Observations (L, T, C); NaN after the simulated share and after the end of a shorter
@@ -435,7 +438,10 @@ class RunEvaluator:
     def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
         """Simulate B batch elements in several engine calls, without cache and step correction.
 
-        Elements of different kinds are simulated separately, and large batches are split.
+        1. Group the elements that need the same time steps: the slowest element of a call sets its
+           steps.
+        2. Split large groups, so that a call fits in memory and workers share the work.
+        3. Simulate the calls, and collect their results.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 
@@ -443,7 +449,7 @@ class RunEvaluator:
             theta: (B, P) parameters of each element.
             runs: (B,) index of the run that each element simulates.
             states: (B, s) initial states.
-            share: initial share of the runs that is simulated, from 0 to 1.
+            share: fraction of each run, from its beginning, that is simulated.
 
         Returns:
             Simulated channels (B, T, C); NaN after the simulated share.
@@ -454,6 +460,7 @@ class RunEvaluator:
         if not len(theta):
             return simulated_runs
 
+        # 1. Groups.
         # The slowest element of a call sets its steps, so elements that need many steps are
         # simulated separately.
         groups = self.group_compatible(theta)
@@ -462,12 +469,22 @@ class RunEvaluator:
             max_batch_size = min(
                 max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
             )
+        # 2. Calls.
         element_indices, calls = [], []
         for group in np.unique(groups):
             elements = np.flatnonzero(groups == group)
-            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
-                element_indices.append(part)
-                calls.append((bool(group >= 2), theta[part], runs[part], states[part], share))
+            for elements_of_call in np.array_split(elements, -(-elements.size // max_batch_size)):
+                element_indices.append(elements_of_call)
+                calls.append(
+                    (
+                        bool(group >= 2),
+                        theta[elements_of_call],
+                        runs[elements_of_call],
+                        states[elements_of_call],
+                        share,
+                    )
+                )
+        # 3. Results.
         for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
             if len(calls) == 1 and sample_count == length:
@@ -589,6 +606,8 @@ class RunEvaluator:
     ) -> Array:
         """Simulate L batch elements in one engine call; all of them have the same time step.
 
+        The caller has grouped the elements. Constants that are fitted are set in the scenarios.
+
         Shapes: P parameters, s states of a run.
 
         Args:
@@ -613,13 +632,13 @@ class RunEvaluator:
     def simulate_scenarios(
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
     ) -> Array:
-        """Simulate batch elements in arbitrary scenarios.
+        """Simulate batch elements in scenarios that are not recorded, such as proposed experiments.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 
         Args:
             theta: (L, P) parameters.
-            scenarios: (L,) scenarios.
+            scenarios: (L,) scenario of each element.
             states: (L, s) initial states.
 
         Returns:
@@ -634,13 +653,15 @@ class RunEvaluator:
         for group in np.unique(groups):
             simulator = self._fine_step_simulator if group >= 2 else self.simulator
             elements = np.flatnonzero(groups == group)
-            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
-                part_scenarios = [self._set_freed_constants(scenarios[i], theta[i]) for i in part]
-                initial = dict(zip(self.state_names, states[part].T, strict=True))
+            for elements_of_call in np.array_split(elements, -(-elements.size // max_batch_size)):
+                part_scenarios = [
+                    self._set_freed_constants(scenarios[i], theta[i]) for i in elements_of_call
+                ]
+                initial = dict(zip(self.state_names, states[elements_of_call].T, strict=True))
                 observations = simulator.simulate_batch(
-                    np.delete(theta[part], freed_indices, 1), part_scenarios, initial
+                    np.delete(theta[elements_of_call], freed_indices, 1), part_scenarios, initial
                 )
-                simulated[part, : observations.shape[1]] = observations
+                simulated[elements_of_call, : observations.shape[1]] = observations
         return simulated
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
@@ -663,7 +684,7 @@ class RunEvaluator:
     def make_observing_simulator(
         self, observe: Sequence[str], effects: Sequence[str]
     ) -> SystemSimulator:
-        """Return a simulator with other channels and only the given effects.
+        """Return a simulator with other channels than the recorded ones, and given effects.
 
         The caller must close it.
 
@@ -733,19 +754,19 @@ def _simulate_engine_call(evaluator: RunEvaluator, *call: Any) -> Array:
     """Simulate one engine call; a module-level function, so that workers can run it.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         *call: arguments of `RunEvaluator.simulate_batch`.
     """
     return evaluator.simulate_batch(*call)
 
 
 def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Recording) -> Parameter:
-    """Return a constant as a parameter.
+    """Return a constant of the simulator as a parameter, so that it can be fitted.
 
     Args:
         name: name of the constant.
         simulator: simulator that has the constant.
-        recording: recording whose runs must not set the constant individually.
+        recording: recording, whose runs must not set the constant individually.
 
     Raises:
         InputError: the constant does not exist, is zero, or differs between runs.

@@ -91,25 +91,28 @@ class StepRefinement(NamedTuple):
 
 
 def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
-    """Yield settings that reproduce the converged motion of the robot, the cheapest first.
+    """Yield time steps and integrators that reproduce the converged motion, the cheapest first.
 
-    Nothing is generated if the settings of the model file are accurate, or if no reference
-    converges.
+    Nothing is generated if the settings of the model file are accurate, or if no motion converges
+    as a reference.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator of the recorded runs of a robot.
         noise: noise of each channel.
     """
     kind = evaluator.kind
     assert issubclass(kind, RobotSimulator)
+    # 1. Converged motion.
     motions = _ReferenceMotions(evaluator, noise)
     model_settings = kind.numerics
     reference = motions.reference(model_settings)
     if reference is None:
         return
+    # 2. Error of the settings of the model file.
     error = motions.compute_rms_difference(motions.of(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
+    # 3. Settings with a small error.
     for numerics in _iterate_settings(model_settings):
         corrected_error = motions.compute_rms_difference(motions.of(numerics), reference)
         if corrected_error < max(
@@ -146,12 +149,12 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
 def simulate_with_settings(
     evaluator: RunEvaluator, numerics: IntegratorSettings, theta: Array, initial_states: Array
 ) -> Array:
-    """Simulate the first runs of a robot with other settings, without effects.
+    """Simulate the first runs of a robot with other integrator or solver settings, without effects.
 
     Shapes: T samples, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator of the recorded runs of a robot.
         numerics: settings of the integrator and the solver.
         theta: (P,) parameters.
         initial_states: (R, s) initial states of the first R runs.
@@ -161,11 +164,11 @@ def simulate_with_settings(
     """
     kind = evaluator.kind
     assert issubclass(kind, RobotSimulator)
-    count = len(initial_states)
-    parameters = np.tile(theta[: evaluator.system_parameter_count], (count, 1))
+    run_count = len(initial_states)
+    parameters = np.tile(theta[: evaluator.system_parameter_count], (run_count, 1))
     states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
-    scenarios = [run.scenario for run in evaluator.prepared_runs[:count]]
-    evaluator.simulation_count += count
+    scenarios = [run.scenario for run in evaluator.prepared_runs[:run_count]]
+    evaluator.simulation_count += run_count
     other_kind = kind.with_integrator_settings(numerics)
     with closing(other_kind(evaluator.recording.constants, evaluator.channels)) as simulator:
         return simulator.simulate_batch(parameters, scenarios, states)
@@ -197,16 +200,18 @@ class _ReferenceMotions:
     def reference(self, model_settings: IntegratorSettings) -> Array | None:
         """Return the converged motion of the robot (R, T, C); None if no integrator converges.
 
-        A motion has converged if halving the time step hardly changes it. RK4 is tried first; for
-        stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
+        A motion has converged if halving the time step hardly changes it.
 
-        The extrapolation (Richardson) from step sizes h and h / 2 is q = 2 q(h / 2) - q(h) (1).
+        1. Try RK4 with smaller and smaller steps.
+        2. For stiff motions, extrapolate the step of an implicit integrator to zero (Richardson):
+           with step sizes h and h / 2, q = 2 q(h / 2) - q(h), eq. (1).
 
         Shapes: R runs, T samples, C channels.
 
         Args:
             model_settings: Time step, integrator and options of the model file.
         """
+        # 1. RK4.
         for division in (1, 2, 5):
             coarse, refined = (
                 self.of(
@@ -218,6 +223,7 @@ class _ReferenceMotions:
             )
             if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
                 return refined
+        # 2. Extrapolation.
         for division in (2, 5):
             extrapolated = []
             for divisor in (division, 2 * division):
@@ -293,18 +299,19 @@ class OptionAlternative(NamedTuple):
 def rank_option_alternatives(
     evaluator: RunEvaluator, noise: NoiseModel, theta: Array, initial_states: Array
 ) -> list[OptionAlternative]:
-    """Simulate the runs with alternative options, and rank those that explain them better.
+    """Simulate the runs with alternative solver options, and rank those that explain them better.
 
-    An alternative is left out if the sum of squares does not decrease clearly, or if a better one
-    makes the same motion. Another value of an option that has been changed already needs no large
-    decrease.
+    1. Compute the sum of squares that an alternative must not exceed. Another value of an option
+       that has been changed already needs no large decrease.
+    2. Simulate all alternatives.
+    3. Leave out those that make the same motion as a better one.
 
     Shapes: R runs, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator of the recorded runs of a robot.
         noise: noise of each channel.
-        theta: (P,) parameters of the model.
+        theta: (P,) parameters of the fitted model.
         initial_states: (R, s) initial states.
 
     Returns:
@@ -321,12 +328,14 @@ def rank_option_alternatives(
 
     observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma
     samples = max(int(is_recorded.sum()), 1)
+    # 1. Limits.
     present = float(np.square(simulate(kind.numerics) - observed).sum())
     limit = present - MIN_SQUARES_DECREASE
     limit_of_other_option = limit
     if present > MIN_CLEAR_MEAN_SQUARE * samples:
         limit_of_other_option = samples + MAX_EXCESS_RATIO * (present - samples)
     changed_options = list_changed_options(kind.robot, kind.numerics).keys()
+    # 2. Simulations.
     ranked: list[tuple[OptionAlternative, Array]] = []
     for numerics in _iterate_alternatives(kind):
         evaluator.search_control.check_not_stopped()
@@ -335,6 +344,7 @@ def rank_option_alternatives(
         options = list_changed_options(kind.robot, numerics).keys()
         if squares < (limit if options == changed_options else limit_of_other_option):
             ranked.append((OptionAlternative(numerics, squares), motion))
+    # 3. Distinct motions.
     ranked.sort(key=lambda pair: pair[0].squares)
     distinct: list[tuple[OptionAlternative, Array]] = []
     for alternative, motion in ranked:
@@ -345,12 +355,13 @@ def rank_option_alternatives(
 
 
 def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSettings]:
-    """Yield the settings with other values of one option, or of the solver and its iterations.
+    """Yield solver settings that differ from the present ones in one option.
 
-    Alternatives that differ less from common settings come first.
+    The solver and its iterations count as one option. Values that are closer to common settings
+    come first.
 
     Args:
-        kind: Simulator of the robot.
+        kind: Simulator class of the robot.
     """
     settings = kind.numerics
     present = settings.to_model_options()

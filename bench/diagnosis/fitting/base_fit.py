@@ -93,10 +93,15 @@ def fit_base_model(
     initial_base: Array | None = None,
     max_cost: float = np.inf,
 ) -> BaseFit:
-    """Fit base parameters and initial states.
+    """Fit the parameters and initial states of the model without effects.
+
+    1. List starts, and select those with the lowest costs by simulation.
+    2. Fit the beginnings of the runs, then longer parts of them, with the best starts.
+    3. For a linearised robot, fit again with derivatives at the fitted model.
+    4. Set parameters to which the runs are insensitive to their nominal values, and fit the others.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise that weights the channels.
         initial_base: (b,) base parameters to start from, for example from a tuner; None for a
             multi-start over the bounds.
@@ -107,6 +112,7 @@ def fit_base_model(
         The best fit, with insensitive parameters at their nominal values. If it exceeds `max_cost`
         at the beginning of the runs, it is simulated only there.
     """
+    # 1. Starts.
     thetas = _list_starts(evaluator, initial_base)
     starts = [FitStart((), theta, evaluator.initial_state_guesses) for theta in thetas]
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
@@ -115,6 +121,7 @@ def fit_base_model(
         order = np.argsort(compute_start_costs(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
+    # 2. Longer and longer parts of the runs.
     for horizon in FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS:
         evaluator.search_control.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
@@ -124,6 +131,7 @@ def fit_base_model(
         best = min(fits, key=lambda fit: fit.cost)
         if best.cost > max_cost and horizon.share < 1.0:
             return BaseFit(best, frozenset())
+    # 3. Own derivatives.
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
         # Derivatives about the first start are replaced by those about the fitted model for all
         # later fits. The import is local, because only robots need it.
@@ -134,6 +142,7 @@ def fit_base_model(
             0
         ]
 
+    # 4. Insensitive parameters.
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
     base_indices = evaluator.base_indices.tolist()
@@ -172,10 +181,12 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
 def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
 
+    They are spread over the bounds, because a fit finds the nearest local minimum only.
+
     Shapes: P parameters.
 
     Args:
-        evaluator: the runs, with the nominal parameters and their bounds.
+        evaluator: evaluator, which has the nominal parameters and their bounds.
         initial_base: (b,) base parameters to start from; None for the nominal ones and a regular
             grid over the bounds.
     """
@@ -215,7 +226,7 @@ def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share:
     """Return the lowest cost of the starts of a base fit, before any fit.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         noise: noise that weights the channels.
         share: initial share of each run that counts.
 
@@ -236,13 +247,15 @@ def compute_start_costs(
     share: float = FIT_HORIZONS[0].share,
     failed_residual: float = FAILED_SAMPLE_RESIDUAL,
 ) -> Array:
-    """Return the sum of squares of each start over the first samples of the runs.
+    """Return the sum of squares of each start over the first samples of the runs, without a fit.
+
+    It selects the starts that are worth a fit.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise that weights the channels.
         starts: parameters and initial states.
-        share: initial share of each run that counts.
+        share: fraction of each run, from its beginning, that counts.
         failed_residual: residual of a sample that could not be simulated.
     """
     start_count, run_count = len(starts), len(evaluator.prepared_runs)
@@ -265,12 +278,12 @@ def _is_sensitive(
 ) -> bool:
     """Return whether the simulated runs depend on a parameter enough to estimate it.
 
-    The test is the norm of the change of all samples, in units of the noise, if the parameter moves
-    over its whole range.
+    The criterion is the norm of the change of all samples, in units of the noise, if the parameter
+    moves over its whole range.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the base model, whose derivatives are used.
+        evaluator: evaluator with the recorded runs.
+        fit: fit of the base model, whose Jacobian is used.
         index: index of the parameter in theta.
         noise: noise of each channel.
     """
@@ -318,7 +331,10 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
 
 
 def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
-    """Widen the ranges of parameters at a bound, and fit the base model again.
+    """Widen the ranges of parameters that are at a bound, and fit the base model again.
+
+    A declared range is a guess. If the best value lies outside it, an effect would be fitted to the
+    difference. Return the base model unchanged if no parameter is at a bound.
 
     Args:
         evaluator: the runs for fitting; the ranges of its parameters are replaced.
@@ -329,11 +345,11 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
         The base model; the same if no parameter is at a bound.
     """
     for _ in range(MAX_WIDENING_ROUNDS):
-        places = list_parameters_at_bounds(evaluator, base)
-        if not places or evaluator.search_control.is_over():
+        parameters_at_bounds = list_parameters_at_bounds(evaluator, base)
+        if not parameters_at_bounds or evaluator.search_control.is_over():
             break
         new_bounds = {}
-        for i in places:
+        for i in parameters_at_bounds:
             parameter = evaluator.parameters[i]
             new_bounds[parameter.name] = widen_range(parameter, get_physical_limits(evaluator, i))
         use_bounds(evaluator, new_bounds)
@@ -450,11 +466,13 @@ def describe_unusual_values(
 ) -> list[str]:
     """Return a sentence for each fitted parameter that lies outside its declared range.
 
+    The report shows them, because such a value often means a wrong unit or constant.
+
     Shapes: P parameters.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
-        theta: (P,) the fitted parameters.
+        theta: (P,) fitted parameters.
         wider: by parameter name, the declared range and the wider range that was used.
     """
     sentences = []
@@ -483,13 +501,13 @@ TIME_LIMIT_SECONDS = 300.0
 def find_start_with_tuner(
     name: str, evaluator: RunEvaluator, noise: NoiseModel, seed: int
 ) -> Array:
-    """Run a tuner, and return the base parameters (b,) that it recommends.
+    """Let a tuner search base parameters (b,) from which the base model is fitted.
 
     Initial states are fixed at their guesses from the first samples.
 
     Args:
         name: name of the tuner.
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
         seed: seed of the tuner's random numbers.
 
@@ -519,32 +537,32 @@ def _evaluate_base(
     observed: Array,
     base: Array,
 ) -> tuple[Array, Array]:
-    """Simulate base parameters, and compute their losses.
+    """Simulate all runs with n sets of base parameters, and return their losses for a tuner.
 
-    The loss is the root mean square of scaled residuals, as in a comparison; it is infinite if the
-    simulation fails.
+    The loss is the root mean square of the residuals in units of the noise, as in a comparison of
+    tuners; it is infinite if the simulation fails.
 
     Shapes: T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
         observed: (T, C) observations of all runs, concatenated.
-        base: (n, b) base parameters.
+        base: (n, b) sets of base parameters.
 
     Returns:
         Observations (n, T, C) and losses (n,).
     """
-    count = len(base)
-    runs = len(evaluator.prepared_runs)
+    set_count = len(base)
+    run_count = len(evaluator.prepared_runs)
     # No effect is active, because the coefficients after the base parameters are zero.
-    theta = np.tile(evaluator.get_nominal_theta(), (count, 1))
+    theta = np.tile(evaluator.get_nominal_theta(), (set_count, 1))
     theta[:, evaluator.base_indices] = base
     simulated = evaluator.simulate(
-        np.repeat(theta, runs, axis=0),
-        np.tile(np.arange(runs), count),
-        np.tile(evaluator.initial_state_guesses, (count, 1)),
-    ).reshape(count, -1, observed.shape[1])
+        np.repeat(theta, run_count, axis=0),
+        np.tile(np.arange(run_count), set_count),
+        np.tile(evaluator.initial_state_guesses, (set_count, 1)),
+    ).reshape(set_count, -1, observed.shape[1])
 
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)
     # An abandoned simulation is NaN, which is expected here.

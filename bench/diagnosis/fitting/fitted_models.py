@@ -220,7 +220,11 @@ class ModelSet:
         is_racing: bool = True,
         iterations: int = MAX_ITERATIONS,
     ) -> None:
-        """Fit models from their starts and store them.
+        """Fit models from their starts, and store those that are better than known fits.
+
+        1. With `is_staged`, reduce the starts by fits to the beginnings of the runs.
+        2. Fit all of them in parallel; with `is_racing`, fits that fall far behind are stopped.
+        3. Store the fits.
 
         Args:
             starts: starts of the fits.
@@ -234,8 +238,10 @@ class ModelSet:
         control.report_and_check(f"refit of {_format_starts(starts)}")
         noise = noise or self.noise
         starts = [self.with_sensitivities(start) for start in starts]
+        # 1. Stages.
         if is_staged:
             starts = self._select_promising_starts(starts, noise)
+        # 2. Fits.
         # Sums of squares with different weights are not comparable.
         is_race = is_racing and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
@@ -244,6 +250,7 @@ class ModelSet:
         for fit in fitter.fit_models(
             starts, iterations, is_racing=is_race, lowest_cost=lowest_cost, finished=control.advance
         ):
+            # 3. Storage.
             self.add_fit(fit)
         # A fit that was stopped early is stored, but not evaluated.
         control.check_not_stopped()
@@ -313,9 +320,14 @@ class ModelSet:
         """Return the model fitted to final convergence, weighted by the noise of its own residual.
 
         With AR(1) noise, confidence intervals require generalised least squares. Far from the data,
-        the different weights also lead out of local minima, so the fit is repeated until it changes
-        nothing. A fit that leaves clearly larger residuals is rejected: with structured residuals,
-        this method prefers smooth residuals to small ones.
+        the different weights also lead out of local minima, so the fit is repeated until nothing
+        changes:
+
+        1. Estimate the noise from the residual.
+        2. Fit the model with this noise.
+        3. Reject a fit with clearly larger residuals: with structured residuals, this method
+           prefers smooth residuals to small ones.
+        4. Stop if the penalised log-likelihood hardly increases.
         """
         self.evaluator.search_control.begin_stage("refining the model")
         # Costs of fits with different noise weights are compared by those of the present noise.
@@ -324,21 +336,25 @@ class ModelSet:
             likelihood = model.likelihood
             if not np.isfinite(model.fit.cost):
                 break
+            # 1. Noise.
             # A channel without samples has no noise, and a channel without noise would have
             # infinite weight.
             sigma = np.where(np.isfinite(likelihood.sigma), likelihood.sigma, self.noise.sigma)
             noise = NoiseModel(
                 np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
             )
+            # 2. Fit.
             fitter = TrajectoryFitter(
                 self.evaluator, noise, self.fixed_parameters, is_final_fit=True
             )
             (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
             if self.evaluator.search_control.is_over():
                 break
+            # 3. Comparison of the residuals.
             refitted = self._rate_fit(replace(fit, cost=compute_cost(fit)))
             if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * compute_cost(model.fit):
                 break
+            # 4. Convergence.
             gain = refitted.penalised_log_likelihood - model.penalised_log_likelihood
             if gain < MIN_GAIN_FOR_REWEIGHTING:
                 if gain > 0:
@@ -428,24 +444,27 @@ def count_identified_states(
 ) -> float:
     """Return the number of initial states that the data determine, summed over all runs.
 
-    These are the effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J.
-    Friedman, The Elements of Statistical Learning, 2nd ed., section 3.4.1); a state without
-    influence does not count. With the derivatives B_i of run i by its initial state in units of the
-    noise, the prior π, and the eigenvalues λ_ij of π B_iᵀ B_i π:
+    They count as fitted parameters when the noise is estimated; a state without influence on the
+    data does not. These are the effective degrees of freedom of ridge regression (T. Hastie, R.
+    Tibshirani, J. Friedman, The Elements of Statistical Learning, 2nd ed., section 3.4.1). With the
+    derivatives B_i of run i by its initial state in units of the noise, the prior π, and the
+    eigenvalues λ_ij of π B_iᵀ B_i π:
 
         f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+        evaluator: evaluator with the recorded runs.
+        fit: fit of the model, with its Jacobian.
         noise: noise of each channel.
     """
     observed_mask = np.isfinite(evaluator.observed)
     state_jacobian = np.where(observed_mask[..., None], fit.state_jacobian, 0.0)
     scaled = state_jacobian / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
-    runs, length, channels, size = scaled.shape
-    columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(evaluator)
+    run_count, length, channels, state_count = scaled.shape
+    columns = scaled.reshape(run_count, length * channels, state_count) * compute_state_prior(
+        evaluator
+    )
     # A known state is not a degree of freedom.
     columns = np.where(evaluator.known_state_mask[:, None, :], 0.0, columns)
     normal = np.matmul(columns.transpose(0, 2, 1), columns)

@@ -321,17 +321,15 @@ class FitState:
         return steps
 
     def update_jacobian(self, new_point: FitPoint) -> Array:
-        """Return derivatives (R, T, C, q + s) at a new point by Broyden's update of each run.
-
-        The update is eq. (4) of the module docstring.
+        """Return the Jacobian (R, T, C, q + s) at a new point by Broyden's update.
 
         For a step delta with scales D, J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 /
-        (delta' D^-2 delta) (4).
+        (delta' D^-2 delta), eq. (4) of the module docstring. Each run is updated separately.
 
         Shapes: R runs, T samples, C channels, q fitted parameters.
 
         Args:
-            new_point: the point that the step has reached.
+            new_point: point that the step has reached, with its simulation.
         """
         point = self.point
         # Samples after the end of a shorter run are NaN, and count as unchanged.
@@ -346,9 +344,11 @@ class FitState:
             axis=1,
         )
         scaled_displacement = displacement / np.square(self.steps)
-        length = np.sum(scaled_displacement * displacement, axis=1)
+        squared_length = np.sum(scaled_displacement * displacement, axis=1)
         # A run in which nothing was moved gives no information.
-        broyden_weights = scaled_displacement / np.where(length > 0, length, np.inf)[:, None]
+        broyden_weights = (
+            scaled_displacement / np.where(squared_length > 0, squared_length, np.inf)[:, None]
+        )
         prediction_error = observed_change - np.einsum("rtcq,rq->rtc", point.jacobian, displacement)
         updated_jacobian: Array = (
             point.jacobian + prediction_error[..., None] * broyden_weights[:, None, None, :]
@@ -366,14 +366,15 @@ class FitState:
             self.is_jacobian_stale = self.is_waiting = True
 
     def accept_step(self, decrease: float, cost: float, is_own_jacobian: bool) -> None:
-        """Update the damping and the convergence state after an accepted step.
+        """Update the damping and the convergence state after a step that has decreased the cost.
 
         With the gain ratio rho, the damping becomes lambda max(0.1, 1 - (2 rho - 1)^3), and its
-        growth factor nu = 2 (2).
+        growth factor nu = 2, eq. (2). The fit ends if it has converged, stagnates far from the
+        data, or if the cost is too rough to predict.
 
         Args:
-            decrease: decrease of the cost.
-            cost: new cost.
+            decrease: decrease of the cost by this step.
+            cost: cost after the step.
             is_own_jacobian: whether the derivatives were computed at the point where the step
                 began.
         """

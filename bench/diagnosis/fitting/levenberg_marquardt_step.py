@@ -79,10 +79,12 @@ class _ArrowheadEquations:
     pull: Array
 
     def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
-        """Solve the normal equations by the Schur complement, eqs. (4) and (5).
+        """Solve the normal equations for one damped step, by the Schur complement.
 
-        Parameters follow from the Schur complement (U - sum W_i V_i^-1 W_i') dx = a - sum W_i
-        V_i^-1 b_i (4), the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx (5).
+        The initial states of a run influence only this run, so they are eliminated first. The step
+        of the parameters follows from (U - sum W_i V_i^-1 W_i') dx = a - sum W_i V_i^-1 b_i, eq.
+        (4), and that of the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx, eq.
+        (5).
 
         Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -173,19 +175,23 @@ def compute_gauss_newton_step(
     damping: float,
     blocked_mask: Mask,
 ) -> GaussNewtonStep:
-    """Compute one damped Gauss-Newton step.
+    """Compute one damped Gauss-Newton step of parameters and initial states.
+
+    1. Assemble the normal equations, and add the damping.
+    2. Solve them.
+    3. Predict the decrease of the cost, with which the damping is adapted later.
 
     Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
     Args:
         residual: (R, T, C) whitened residual, observed minus simulated.
         jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
-        q: number of shared parameters.
-        drift: (R, s) the d of eq. (1): deviations of initial states from their guesses, in sigmas.
-        prior: (s,) the π of eq. (1).
-        known_mask: (R, s) initial states that do not move.
+        q: number q of shared parameters.
+        drift: (R, s) deviations d of the initial states from their guesses, in units of the prior.
+        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
+        known_mask: (R, s) mask of initial states that do not move, because they are known.
         damping: Levenberg-Marquardt damping λ.
-        blocked_mask: (q,) parameters that do not move.
+        blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
     """
     runs, size = len(residual), jacobian.shape[3]
     run_jacobians = jacobian.reshape(runs, -1, size)
@@ -204,31 +210,31 @@ def compute_gauss_newton_step(
 
 
 def _assemble_normal_equations(
-    j: Array,
-    r: Array,
+    jacobian: Array,
+    residual: Array,
     q: int,
     drift: Array,
     prior: Array,
 ) -> _ArrowheadEquations:
-    """Build the normal equations, eqs. (2) and (3), of all runs, without damping.
+    """Assemble the normal equations, eqs. (2) and (3), of all runs, without damping.
 
-    They are U dx + sum_i W_i dz_i = a (2) and W_i' dx + V_i dz_i = b_i (3), for parameters x and
-    the initial state z_i of each run.
+    They are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the step dx of the
+    parameters and the step dz_i of the initial state of each run.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
-        j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
-        r: (R, n) whitened residuals.
-        q: number of shared parameters.
-        drift: (R, s) d of eq. (1).
-        prior: (s,) π of eq. (1).
+        jacobian: (R, n, q + s) whitened derivatives, those by initial states last; n samples.
+        residual: (R, n) whitened residuals.
+        q: number q of shared parameters.
+        drift: (R, s) deviations d of the initial states from their guesses, eq. (1).
+        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
     """
-    state_columns = slice(q, j.shape[2])
+    state_columns = slice(q, jacobian.shape[2])
     # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
-    transposed = j.transpose(0, 2, 1)
-    normal = np.matmul(transposed, j)
-    residuals = r[:, :, None]
+    transposed = jacobian.transpose(0, 2, 1)
+    normal = np.matmul(transposed, jacobian)
+    residuals = residual[:, :, None]
     right_hand_side = np.matmul(transposed, residuals)[:, :, 0]
     return _ArrowheadEquations(
         shared=normal[:, :q, :q].sum(axis=0),  # U
@@ -242,10 +248,10 @@ def _assemble_normal_equations(
 def _apply_damping(
     equations: _ArrowheadEquations, damping: float, known_mask: Mask
 ) -> _ArrowheadEquations:
-    """Add the damping times their own diagonals to U and V, and hold known initial states fixed.
+    """Add the damping to the normal equations, and hold known initial states fixed.
 
-    A small ridge is always added to U, so that it can be inverted if parameters have the same
-    response.
+    The damping λ adds λ times their own diagonals to U and V. A small ridge is always added to U,
+    so that it can be inverted if two parameters have the same response.
 
     Shapes: R runs, s states of a run.
 
@@ -265,36 +271,37 @@ def _apply_damping(
 
 
 def _predict_decrease(
-    j: Array,
-    r: Array,
+    jacobian: Array,
+    residual: Array,
     drift: Array,
     prior: Array,
     parameter_step: Array,
     state_steps: Array,
 ) -> float:
-    """Return the decrease of the cost by a step if the residual were linear, eq. (6).
+    """Return by how much a step would decrease the cost if the residual were linear, eq. (6).
 
-    The damping is adapted to how well the actual decrease agrees with it.
-
-    It is sum |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 + sum |d_i|^2 - |d_i + dz_i / pi|^2 (6), with
-    residuals r_i and normalised deviations d_i of the initial states from their prior.
+    The damping is adapted to how well the actual decrease agrees with it. It is sum |r_i|^2 - |r_i
+    - A_i dx - B_i dz_i|^2 + sum |d_i|^2 - |d_i + dz_i / pi|^2, with residuals r_i and deviations
+    d_i of the initial states in units of the prior pi.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
-        j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
-        r: (R, n) whitened residuals.
-        drift: (R, s) d of eq. (1).
-        prior: (s,) π of eq. (1).
+        jacobian: (R, n, q + s) whitened derivatives, those by initial states last; n samples.
+        residual: (R, n) whitened residuals.
+        drift: (R, s) deviations d of the initial states from their guesses, eq. (1).
+        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
         parameter_step: (q,) step of the shared parameters.
         state_steps: (R, s) steps of the initial states.
     """
-    repeated = np.tile(parameter_step, (len(r), 1))
+    repeated = np.tile(parameter_step, (len(residual), 1))
     steps = np.concatenate([repeated, state_steps], axis=1)
-    changes = np.matmul(j, steps[:, :, None])[:, :, 0]
-    remaining_residual = r - changes
+    changes = np.matmul(jacobian, steps[:, :, None])[:, :, 0]
+    remaining_residual = residual - changes
     remaining_drift = drift + state_steps / prior
-    predicted_decrease = float((r * r).sum() - (remaining_residual * remaining_residual).sum())
+    predicted_decrease = float(
+        (residual * residual).sum() - (remaining_residual * remaining_residual).sum()
+    )
     predicted_decrease += float((drift**2).sum() - (remaining_drift**2).sum())
     return predicted_decrease
 
@@ -326,15 +333,15 @@ def is_finite_response(changes: Array) -> Mask:
 def build_displaced_inputs(
     start: FitStart, free: Indices, steps: Array, state_indices: Indices
 ) -> tuple[Array, Array]:
-    """Build the inputs of a finite-difference Jacobian.
+    """Return the parameters and initial states to simulate for a finite-difference Jacobian.
 
-    The first entry is not displaced. Each further entry has one unknown displaced by its step; an
-    initial state is displaced in all runs at once.
+    The first entry is not displaced. Each further entry has one unknown displaced by its step. An
+    initial state is displaced in all runs at once, because it influences only its own run.
 
     Shapes: R runs, P parameters, q fitted parameters, s states of a run.
 
     Args:
-        start: point of the derivatives.
+        start: point at which the Jacobian is computed.
         free: (q,) indices of the fitted parameters.
         steps: (q + s,) displacements.
         state_indices: (n,) indices of the initial states to displace.
@@ -342,9 +349,9 @@ def build_displaced_inputs(
     Returns:
         Parameters (1 + q + n, P) and initial states (1 + q + n, R, s).
     """
-    q, count = free.size, state_indices.size
-    theta = np.tile(start.theta, (1 + q + count, 1))
-    states = np.tile(start.initial_states, (1 + q + count, 1, 1))
+    q, state_count = free.size, state_indices.size
+    theta = np.tile(start.theta, (1 + q + state_count, 1))
+    states = np.tile(start.initial_states, (1 + q + state_count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
     # An initial state influences only its own run, so one batch element per run gives all

@@ -21,15 +21,15 @@ MAX_CORRECTABLE_ERROR = 1.0
 def compute_effect_responses(
     evaluator: RunEvaluator, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """Compute the first-order responses of the runs to one additional effect each.
+    """Compute how the runs of a robot change to first order if one effect is added, for K effects.
 
-    The result has single precision, because it is by far the largest array of an explanation and
-    only a derivative.
+    Linearised dynamics cost much less than a simulation for each effect. The result has single
+    precision, because it is by far the largest array of an explanation and only a derivative.
 
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator of the recorded runs of a robot.
         theta: (P,) parameters, without the added effects.
         states: (R, s) initial states.
         added: K effects with their coefficients.
@@ -42,9 +42,11 @@ def compute_effect_responses(
     cached_responses = evaluator.cached_responses
     keys = [(name, c.tobytes()) for name, c in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
-    calls = [(run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)]
+    worker_arguments = [
+        (run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)
+    ]
     for run, (values, simulation_count) in evaluator.worker_pool.map_unordered(
-        evaluator, _compute_responses, calls
+        evaluator, _compute_responses, worker_arguments
     ):
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
@@ -70,14 +72,15 @@ def _compute_responses(
 ) -> tuple[Array, int]:
     """Compute how one run changes by each of K added effects (K, T, C); runs in a worker.
 
-    The second result is the number of simulations that were needed.
+    Also return the number of simulations that were needed, since not all effects have a
+    linearisation.
 
     Shapes: T samples, C channels, P parameters, s states of a run.
 
     Args:
         evaluator: run evaluator of all runs.
         run: index of the run.
-        theta: (P,) parameters of the present model.
+        theta: (P,) parameters of the model without the added effects.
         states: (s,) initial state of the run.
         added: name and coefficients of each added effect.
     """
@@ -99,7 +102,7 @@ def compute_state_jacobian(
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator that simulates the recorded runs of a robot.
         theta: (P,) parameters.
         states: (R, s) initial states.
         is_recomputed: whether to recompute the derivatives about this model and store them.
@@ -117,7 +120,7 @@ def compute_initial_state_derivatives(
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator that simulates the recorded runs of a robot.
         theta: (P,) parameters of the model.
         states: (R, s) initial states of the model.
     """
@@ -140,7 +143,7 @@ def _compute_initial_state_derivatives(
     Shapes: T samples, C channels, P parameters, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         run: index of the run.
         theta: (P,) parameters.
         states: (s,) initial state about which the run is linearised.
@@ -151,9 +154,9 @@ def _compute_initial_state_derivatives(
 def _get_linearisation(
     evaluator: RunEvaluator, run: int, theta: Array, states: Array
 ) -> RunLinearisation:
-    """Return the linearised dynamics along one run of a robot, about given parameters.
+    """Return the dynamics of a robot linearised along one run, at given parameters.
 
-    The latest ones are cached, one per run on average, because most are used more than once.
+    The latest linearisations are cached, one for each run, because most are used more than once.
 
     Shapes: P parameters, s states of a run.
 
@@ -186,21 +189,21 @@ def _get_linearisation(
 def correct_discretisation(
     evaluator: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
 ) -> None:
-    """Correct all later simulations for the discretisation error of a model's motion.
+    """Correct all later simulations for the discretisation error at a model near the data.
 
-    With the motion q(h) at step size h, the discretisation error is
+    An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate
+    it: for example dry friction that stops within a step and not at its end, or a servo that is
+    nearly too fast for the step. With the motion q(h) at step size h, the discretisation error is
 
         2 q(h / 4) - q(h / 2) - q(h)                                                           (1)
 
     to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
-    any higher order. An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but could
-    be mistaken for one: for example dry friction that stops within a step and not at its end, or a
-    servo that is nearly too fast for the step.
+    any higher order.
 
     Shapes: R runs, P parameters.
 
     Args:
-        evaluator: run evaluator: the recorded runs of a robot, and its simulator.
+        evaluator: evaluator of the recorded runs of a robot.
         noise: noise of each channel.
         theta: (P,) parameters of a model near the data.
         states: (R, s) initial states of the model.
@@ -209,9 +212,9 @@ def correct_discretisation(
         return
     assert issubclass(evaluator.kind, RobotSimulator)
     effects = [*evaluator.library, *evaluator.extra_effects]
-    runs = len(evaluator.prepared_runs)
+    run_count = len(evaluator.prepared_runs)
     scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
-    lanes = np.tile(theta, (runs, 1))
+    lanes = np.tile(theta, (run_count, 1))
     initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
     half_step_kind = evaluator.kind.with_half_step()
     simulated = [evaluator.simulator.simulate_batch(lanes, scenarios, initial_states)]
@@ -219,9 +222,9 @@ def correct_discretisation(
         finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
         simulated.append(finer.simulate_batch(lanes, scenarios, initial_states))
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
-    evaluator.simulation_count += 7 * runs
+    evaluator.simulation_count += 7 * run_count
     correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)
-    sizes = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
+    squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
     # A large error cannot be removed by this correction.
-    if float(np.sqrt(sizes.mean())) < MAX_CORRECTABLE_ERROR:
+    if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
         evaluator.discretisation_correction = np.nan_to_num(correction)

@@ -105,19 +105,22 @@ def join_segment_fits(evaluator: RunEvaluator, segment_fit: TrajectoryFit) -> Fi
 def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:
     """Return whether initial states hardly influence the last samples of each run.
 
-    In that case a fit of whole runs has no more local minima than a fit of their segments.
+    Then a fit of whole runs has no more local minima than a fit of their segments, and multiple
+    shooting is not needed.
 
     Shapes: R runs, T samples, C channels, s states of a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator with the recorded runs.
         noise: noise of each channel.
         derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
             for known states.
     """
     observed_mask = np.isfinite(evaluator.observed)[..., None]
-    sizes = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
-    for run, length in zip(sizes, evaluator.lengths, strict=True):
+    state_influence = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(
+        axis=2
+    )
+    for run, length in zip(state_influence, evaluator.lengths, strict=True):
         last_samples = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
         # If all initial states of a run are known, the decay of their influence cannot be measured.
         if (

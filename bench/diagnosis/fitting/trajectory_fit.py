@@ -143,14 +143,16 @@ class TrajectoryFitter:
     ) -> list[TrajectoryFit]:
         """Fit each model from its start.
 
-        All fits advance together in racing rounds of several Levenberg-Marquardt steps. Between
-        rounds, fits that have fallen far behind are ended, if racing. Groups of fits run in
-        parallel workers.
+        All fits advance together in racing rounds of several Levenberg-Marquardt steps:
+
+        1. Stop if all fits have ended, or the search has to end.
+        2. Split the unfinished fits into groups, and advance each group in a worker.
+        3. Pass the lowest cost to the next round, in which fits that are far behind end.
 
         Args:
             starts: starts of the fits; one or more.
             iterations: maximum number of steps of each fit.
-            is_racing: whether to stop fits that are far behind the best fit or behind
+            is_racing: whether to stop fits that are far behind the best one or behind
                 `lowest_cost`.
             lowest_cost: lowest cost of other models.
             finished: called once for each model whose fit has ended.
@@ -160,6 +162,7 @@ class TrajectoryFitter:
         """
         fit_states = [self._create_fit_state(start) for start in starts]
         for racing_round in iterate_rounds(iterations, is_racing):
+            # 1. Unfinished fits.
             # Unfinished fits continue in groups, which exchange nothing within a round.
             unfinished = [i for i, fit_state in enumerate(fit_states) if not fit_state.is_finished]
             if not unfinished or (
@@ -170,8 +173,9 @@ class TrajectoryFitter:
             ):
                 break
             best = min(lowest_cost, *(fit_state.point.cost for fit_state in fit_states))
+            # 2. Groups.
             groups = self._group_fits(fit_states, unfinished)
-            calls = [
+            worker_arguments = [
                 (
                     self._list_worker_arguments(),
                     [fit_states[i] for i in g],
@@ -182,7 +186,7 @@ class TrajectoryFitter:
                 for g in groups
             ]
             for number, members in self.evaluator.worker_pool.map_unordered(
-                self.evaluator, _advance_group, calls
+                self.evaluator, _advance_group, worker_arguments
             ):
                 for i, fit_state in zip(groups[number], members, strict=True):
                     fit_states[i] = fit_state
@@ -206,32 +210,33 @@ class TrajectoryFitter:
     def _group_fits(
         self, fit_states: Sequence[FitState], unfinished: Sequence[int]
     ) -> list[list[int]]:
-        """Split unfinished fits into groups of about `GROUP_COST_SAMPLES` simulated samples.
+        """Split unfinished fits into groups that workers advance in parallel.
 
-        Each group has models of one kind as far as possible. There is only one group if large
-        engine calls cost less per batch element.
+        A group simulates about `GROUP_COST_SAMPLES` samples in a step, and has models of one kind
+        as far as possible. There is only one group if large engine calls cost less per batch
+        element.
 
         Args:
             fit_states: states of all fits.
-            unfinished: indices of the unfinished ones.
+            unfinished: indices of the fits that have not ended.
         """
         evaluator = self.evaluator
         if not evaluator.is_cheap_to_split:
             return [list(unfinished)]
-        runs, length, _ = evaluator.observed.shape
+        run_count, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
         element_count = (
-            sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * runs
+            sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * run_count
         )
         cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
-        count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
+        group_count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
         element_kinds = evaluator.group_compatible(
             np.stack([fit_states[i].point.start.theta for i in unfinished])
         )
         order = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
-        parts = np.array_split(order, min(count, len(order)))
-        return [part.tolist() for part in parts]
+        groups = np.array_split(order, min(group_count, len(order)))
+        return [part.tolist() for part in groups]
 
     def advance_round(
         self,
@@ -240,11 +245,16 @@ class TrajectoryFitter:
         is_racing: bool,
         lowest_cost: float,
     ) -> list[FitState]:
-        """Advance fits by one racing round.
+        """Advance a group of fits by the Levenberg-Marquardt steps of one racing round.
+
+        1. In the first round, simulate the starts.
+        2. End fits that are far behind, if racing.
+        3. Compute derivatives where they are not accurate enough.
+        4. Propose a step for each fit, simulate all of them together, and accept or reject each.
 
         Args:
             fit_states: states of the fits.
-            racing_round: the steps to make.
+            racing_round: first and last step of this round.
             is_racing: whether to stop fits that are far behind the best fit or behind
                 `lowest_cost`.
             lowest_cost: lowest cost of other models, including those of other groups.
@@ -252,19 +262,23 @@ class TrajectoryFitter:
         Returns:
             The fits after the round.
         """
+        # 1. Starts.
         # Mask of the samples that count, (R, T, C).
         sample_mask = self.evaluator.get_sample_mask(self.share)
         if not racing_round.first:
             self._simulate_starts(fit_states, sample_mask)
         for iteration in range(racing_round.first, racing_round.last):
+            # 2. Fits that are far behind.
             # In the first steps even the correct model may be far behind.
             if is_racing and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
                 eliminate_losing_fits(fit_states, lowest_cost)
+            # 3. Derivatives.
             self._renew_derivatives(
                 fit_states,
                 sample_mask,
                 includes_waiting=not is_racing or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
+            # 4. Steps.
             trials = list(self._propose_trials(fit_states, sample_mask))
             if not trials and any(p.is_waiting and not p.is_finished for p in fit_states):
                 continue
@@ -285,10 +299,13 @@ class TrajectoryFitter:
     def _simulate_starts(self, fit_states: Sequence[FitState], sample_mask: Mask) -> None:
         """Simulate the start of each fit, and compute its derivatives unless they are known.
 
+        All starts without known derivatives are simulated in one engine call, all others in a
+        second one.
+
         Shapes: R runs, T samples, C channels.
 
         Args:
-            fit_states: states of the fits; they are moved to their starts in place.
+            fit_states: states of the fits, changed in place.
             sample_mask: (R, T, C) samples that count in the cost.
         """
         known_states = [p for p in fit_states if self._has_derivatives(p)]
@@ -344,12 +361,14 @@ class TrajectoryFitter:
     def _renew_derivatives(
         self, fit_states: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
     ) -> None:
-        """Recompute the derivatives of fits whose present ones are not good enough.
+        """Compute new derivatives for the fits whose present ones predict steps poorly.
+
+        Others continue with Broyden's updates, which need no simulations.
 
         Shapes: R runs, T samples, C channels.
 
         Args:
-            fit_states: states of the fits, updated in place.
+            fit_states: states of the fits, changed in place.
             sample_mask: (R, T, C) samples that count in the cost.
             includes_waiting: whether fits that wait for new derivatives are included.
         """
@@ -388,23 +407,23 @@ class TrajectoryFitter:
             base = [i for i in evaluator.base_indices.tolist() if i not in self.fixed_parameters]
             bounds = {i: evaluator.parameters[i].bounds for i in base}
             bounds |= get_bounds_by_index(evaluator, start.effects)
-        free = list(bounds)
+        fitted_indices = list(bounds)
         # The shape has two columns even if nothing is fitted.
-        table = np.array(list(bounds.values()), dtype=np.float64).reshape(-1, 2)
-        low, high = table.T
+        bounds_table = np.array(list(bounds.values()), dtype=np.float64).reshape(-1, 2)
+        low, high = bounds_table.T
 
         # Plausible ranges scale the finite differences; a fit may go far beyond them.
-        plausible_ranges = [evaluator.parameters[i].bounds for i in free]
+        plausible_ranges = [evaluator.parameters[i].bounds for i in fitted_indices]
         widths = np.array([b - a for a, b in plausible_ranges], dtype=np.float64)
         state_steps = np.full(len(evaluator.state_names), INITIAL_STATE_STEP)
 
         # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
-        theta[free] = np.clip(theta[free], low, high)
+        theta[fitted_indices] = np.clip(theta[fitted_indices], low, high)
         clipped_start = replace(start, theta=theta, initial_states=start.initial_states.copy())
         return FitState(
             point=FitPoint(clipped_start, np.empty(0), np.empty(0), np.inf),
-            free_indices=np.array(free, dtype=np.intp),
+            free_indices=np.array(fitted_indices, dtype=np.intp),
             low=low,
             high=high,
             widths=widths,
@@ -416,7 +435,7 @@ class TrajectoryFitter:
         )
 
     def _simulate_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
-        """Simulate trial points together with their derivatives and cost.
+        """Simulate trial points of several fits together with their derivatives and costs.
 
         One engine call contains every run of every model with every unknown displaced, so it
         integrates over time only once. An initial state that is known in every run is not an
@@ -425,37 +444,44 @@ class TrajectoryFitter:
         Shapes: R runs, T samples, C channels.
 
         Args:
-            trials: each fit with the point to simulate.
+            trials: each fit with its trial point.
             sample_mask: (R, T, C) samples that count in the cost.
         """
-        runs, size = self.evaluator.initial_state_guesses.shape
+        # 1. Displace each unknown of each trial point.
+        run_count, state_count = self.evaluator.initial_state_guesses.shape
         state_indices = self._list_displaced_states()
         steps = [fit_state.compute_inward_steps(start.theta) for fit_state, start in trials]
         displaced_inputs = [
             build_displaced_inputs(start, fit_state.free_indices, step, state_indices)
             for (fit_state, start), step in zip(trials, steps, strict=True)
         ]
+        # 2. Simulate all of them.
         # Batch elements are ordered by model, then by unknown, then by run.
-        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in displaced_inputs])
-        states = np.concatenate([begin.reshape(-1, size) for _, begin in displaced_inputs])
-        lanes = np.tile(np.arange(runs), len(thetas) // runs)
+        thetas = np.concatenate(
+            [np.repeat(theta, run_count, axis=0) for theta, _ in displaced_inputs]
+        )
+        states = np.concatenate([begin.reshape(-1, state_count) for _, begin in displaced_inputs])
+        lanes = np.tile(np.arange(run_count), len(thetas) // run_count)
         simulated = self.evaluator.simulate(thetas, lanes, states, self.share)
-        simulated = simulated.reshape(-1, runs, *simulated.shape[1:])
+        simulated = simulated.reshape(-1, run_count, *simulated.shape[1:])
 
+        # 3. Compute differences and costs.
         points = []
         first = 0
         for (fit_state, start), step in zip(trials, steps, strict=True):
             # The first element is not displaced; each other one has one unknown displaced.
             end = first + 1 + fit_state.free_indices.size + state_indices.size
-            part = simulated[first:end]
+            point_simulations = simulated[first:end]
             first = end
-            jacobian = self._compute_derivatives(part, step, state_indices)
+            jacobian = self._compute_derivatives(point_simulations, step, state_indices)
             if self.evaluator.has_linearisation:
                 jacobian[..., fit_state.free_indices.size :] = (
-                    self._compute_initial_state_derivatives(fit_state, start, part.shape[2])
+                    self._compute_initial_state_derivatives(
+                        fit_state, start, point_simulations.shape[2]
+                    )
                 )
-            cost = self._compute_cost(part[0], start.initial_states, sample_mask)
-            points.append(FitPoint(start, part[0], jacobian, cost))
+            cost = self._compute_cost(point_simulations[0], start.initial_states, sample_mask)
+            points.append(FitPoint(start, point_simulations[0], jacobian, cost))
         return points
 
     def _simulate_without_derivatives(
@@ -463,29 +489,30 @@ class TrajectoryFitter:
     ) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
-        `_accept_or_reject_trial` updates these derivatives if the point is accepted.
+        This costs one simulation for each point. If the point is accepted,
+        `_accept_or_reject_trial` updates these derivatives.
 
         Shapes: R runs, T samples, C channels.
 
         Args:
-            trials: each fit with the point to simulate.
+            trials: each fit with its trial point.
             sample_mask: (R, T, C) samples that count in the cost.
         """
-        runs = len(self.evaluator.initial_state_guesses)
+        run_count = len(self.evaluator.initial_state_guesses)
         simulated = self.evaluator.simulate(
-            np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
-            np.tile(np.arange(runs), len(trials)),
+            np.concatenate([np.tile(start.theta, (run_count, 1)) for _, start in trials]),
+            np.tile(np.arange(run_count), len(trials)),
             np.concatenate([start.initial_states for _, start in trials]),
             self.share,
-        ).reshape(len(trials), runs, *self.evaluator.observed.shape[1:])
+        ).reshape(len(trials), run_count, *self.evaluator.observed.shape[1:])
         return [
             FitPoint(
                 start,
-                part,
+                point_simulation,
                 fit_state.point.jacobian,
-                self._compute_cost(part, start.initial_states, sample_mask),
+                self._compute_cost(point_simulation, start.initial_states, sample_mask),
             )
-            for (fit_state, start), part in zip(trials, simulated, strict=True)
+            for (fit_state, start), point_simulation in zip(trials, simulated, strict=True)
         ]
 
     def _list_displaced_states(self) -> Indices:
@@ -500,9 +527,10 @@ class TrajectoryFitter:
     def _compute_initial_state_derivatives(
         self, fit_state: FitState, start: FitStart, samples: int
     ) -> Array:
-        """Return derivatives (R, T, C, s) by initial states, zero where a state is known.
+        """Return the derivatives (R, T, C, s) of the runs by their initial states.
 
-        They are those of the fit itself, if it has any, or those that all models share.
+        They are zero where a state is known. The derivatives of the fit itself are used, if it has
+        any; otherwise those that all models share, because they differ little near the data.
 
         Shapes: R runs, C channels, s states of a run.
 
@@ -515,17 +543,17 @@ class TrajectoryFitter:
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        shared = fit_state.own_state_jacobian
-        if shared is None:
-            shared = compute_state_jacobian(evaluator, start.theta, start.initial_states)
-        derivatives = shared[:, :samples]
+        state_jacobian = fit_state.own_state_jacobian
+        if state_jacobian is None:
+            state_jacobian = compute_state_jacobian(evaluator, start.theta, start.initial_states)
+        derivatives = state_jacobian[:, :samples]
         masked_derivatives: Array = derivatives * ~evaluator.known_state_mask[:, None, None, :]
         return masked_derivatives
 
     def _compute_derivatives(self, simulated: Array, steps: Array, state_indices: Indices) -> Array:
-        """Compute finite-difference derivatives (R, T, C, q + s).
+        """Compute the Jacobian (R, T, C, q + s) of a fit by finite differences.
 
-        They are zero for known initial states, which therefore absorb nothing of the residual.
+        It is zero for known initial states, which therefore absorb nothing of the residual.
 
         Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
@@ -722,7 +750,7 @@ def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) 
     """Advance one group of fits by one racing round; runs in this process or in a worker.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         terms: further fields of `TrajectoryFitter`.
         *call: arguments of `TrajectoryFitter.advance_round`.
     """

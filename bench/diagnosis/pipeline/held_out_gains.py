@@ -146,7 +146,7 @@ def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         simulated: (R, T, C) simulated channels.
         channels: indices of the channels that count.
     """

@@ -37,25 +37,36 @@ MAX_COMPETITOR_EXCESS_RATIO = 1.5
 
 
 def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
-    """Refit a model and its promising competing models of the same size to convergence.
+    """Refit a model and its promising competitors of the same size, and return the best.
+
+    The search stops fits early and tests few candidates, so another model may be better at its
+    optimum.
+
+    1. Replace single effects of the model by others that fit better.
+    2. Fit neighbouring frequencies and event times, which have dozens of local minima.
+    3. Select the competing models that are close enough to matter.
+    4. Refit all of these to convergence.
 
     If the residual is noise, generalised least squares is used. If it has structure, ordinary least
     squares is used, because the structure is not noise and would distort the fit.
 
     Args:
-        search: the search, with all fitted models.
-        model: the model that the search found.
+        search: search with all models fitted so far.
+        model: best model of the search.
 
     Returns:
         The best of these models.
     """
-    size = len(model.effects)
+    effect_count = len(model.effects)
+    # 1. Replaced effects.
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
+    # 2. Neighbouring frequencies.
     neighbour_starts = list(generate_frequency_neighbours(search.evaluator, model.fit))
     # Periodic effects have dozens of local minima.
     if neighbour_starts:
-        search.refit_from_segments(size)
+        search.refit_from_segments(effect_count)
+    # 3. Competing models.
     submodels = list_submodels(search, model)
     noise = _estimate_model_noise(search, model)
     competing_models = list_competing_models(search, model)
@@ -71,6 +82,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
             if abs(model.penalised_log_likelihood - candidate.penalised_log_likelihood)
             < MAX_COMPETITOR_DISTANCE
         ] or [model]
+    # 4. Refits.
     starts = [candidate.fit.make_start() for candidate in competing_models]
     starts += [candidate.fit.make_start() for candidate in submodels]
     starts += [
@@ -265,10 +277,11 @@ class AlternativeFinder:
         return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
 
     def _measure_evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
-        """Return p-value, gain and indistinguishable alternatives of one effect of the model.
+        """Return the p-value, the gain and the equally good alternatives of an effect.
 
         The gain is the increase of twice the log-likelihood over the model without the effect
-        (`reduced_model`). `competing_effects` has pairs of distance and name, the effect itself
+        (`reduced_model`). An alternative is an effect that, in place of this one, explains the data
+        equally well. `competing_effects` has pairs of distance and name, the effect itself
         included.
         """
         reduced_model = self._get_model_without(model, effect)
@@ -304,12 +317,13 @@ class AlternativeFinder:
         return self.search.models.get(remaining_effects, self.search.base_model)
 
     def _compute_p_value(self, reduced_model: FittedModel, effect: str, gain: float) -> float:
-        """Return the p-value of a gain about the model without the effect.
+        """Return the p-value of an effect: how probable its gain is if the effect does not act.
 
-        It is the smaller one of the p-values of the gain and of the best score.
+        The p-value of the gain of the fit and that of the linear score are computed; the smaller
+        one is returned, as either test may be more sensitive.
 
         Args:
-            reduced_model: the model without the effect.
+            reduced_model: model without the effect.
             effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             gain: gain of the model with the effect over the model without it, in twice the
                 log-likelihood.
@@ -332,9 +346,10 @@ class AlternativeFinder:
     def _list_competing_effects(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
         """List the effects that explain the data as well as the given one, with their distance.
 
-        A competing effect is tested by the fitted models in which it replaces the effect and
-        everything else is equal. The distance is how far such a model is behind, in twice the
-        log-likelihood; the effect itself has the distance 0.
+        The report names them, because the data do not tell which of them acts. A competing effect
+        is tested by the fitted models in which it replaces the effect and everything else is equal.
+        The distance is how far such a model is behind, in twice the log-likelihood; the effect
+        itself has the distance 0.
         """
         shared = set(model.effects) - {effect}
         competing_effects = [(0.0, effect)]
@@ -413,17 +428,18 @@ class AlternativeFinder:
     def _compute_distance(
         self, model: FittedModel, other_model: FittedModel, is_in_one_loop: bool
     ) -> float:
-        """Return the distance of another model in twice the log-likelihood.
+        """Return how far another model is behind, in twice the log-likelihood.
 
-        It is negative if the other model is better. If the residual has structure that neither
-        model explains, likelihoods only compare how each model mimics it. The distance then depends
-        on the excesses. So it does for models that differ in the joint of a loop at which an effect
-        acts: likelihoods would compare how the constraint that closes the loop gives way, which is
-        a number of the simulation.
+        1. If the residual has structure that neither model explains, likelihoods only compare how
+           each model mimics it. Then the distance depends on the excess residuals of the models.
+        2. The same holds for effects at joints of one kinematic loop: likelihoods would compare the
+           compliance of the loop's constraint, which is a setting of the simulator.
+        3. Otherwise the distance is the difference of penalised log-likelihoods. Held-out runs are
+           further data, so their log-likelihoods are added.
 
         Args:
-            model: fitted model: its effects, parameters, initial states and likelihood.
-            other_model: the model that it is compared with.
+            model: fitted model.
+            other_model: fitted model in which another effect replaces one of the model.
             is_in_one_loop: whether the differing effects act in one kinematic loop.
         """
         validation = self.held_out_validation
@@ -433,6 +449,7 @@ class AlternativeFinder:
             and not {model.effects, other_model.effects} <= validation.held_out_fits.keys()
         ):
             validation = None
+        # 1 and 2. Excess residuals.
         if self.structure or is_in_one_loop:
             other_excess = self.search.compute_excess_residual(other_model)
             ratios = [
@@ -446,6 +463,7 @@ class AlternativeFinder:
                     )
                 )
             return convert_excess_ratio(ratios)
+        # 3. Likelihoods.
         distance = self._compute_comparable_likelihood(model) - self._compute_comparable_likelihood(
             other_model
         )

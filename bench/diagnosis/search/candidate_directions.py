@@ -96,20 +96,30 @@ class DirectionSet:
 def compute_directions(
     evaluator: RunEvaluator, fit: TrajectoryFit, names: Sequence[str]
 ) -> DirectionSet:
-    """Compute the sensitivity directions of effects about a fitted model.
+    """Compute how the simulated runs respond to each effect that a fitted model lacks.
+
+    The score test compares these responses with the residual of the model.
+
+    1. Compute the responses to scaling coefficients, and to limits of several sizes.
+    2. Combine those that change the runs with modifiers: coefficients that act only together with
+       another one.
+    3. Discard the responses that change nothing.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+        evaluator: evaluator that simulates the recorded runs.
+        fit: fit of the model, at which the responses are computed.
         names: names of effects that the model does not contain.
     """
     probes = [
         probe for name in names for probe in iterate_first_probes(evaluator, fit.effects, name)
     ]
+    # 1. Responses.
     responses = _compute_directions(evaluator, fit, probes)
     is_acting = _find_observable_probes(evaluator, probes, responses)
+    # 2. Modifiers.
     # The first responses show which coefficients only modify, for effects that act at all.
     modifier_probes = list(_make_modifier_probes(evaluator, probes, is_acting))
+    # 3. Responses that change something.
     active_indices = np.flatnonzero(is_acting)
     probes = [probes[i] for i in active_indices] + modifier_probes
     # This is the largest array of an explanation, so active rows are moved up within it.
@@ -127,15 +137,17 @@ def compute_directions(
 def iterate_first_probes(
     evaluator: RunEvaluator, model_effects: Collection[str], name: str
 ) -> Iterator[CandidateDirection]:
-    """Yield the coefficients at which the directions of an effect are computed.
+    """Yield the coefficients at which the responses of an effect are computed.
 
-    A scaling coefficient is the strength of an effect, and zero switches the effect off; each gets
-    a small value. A shape parameter, such as a frequency, cannot be zero; all its values on a grid
-    are tried. Effects that do not act in proportion to their coefficients, such as limits and end
-    stops, get several full sizes instead.
+    1. If the effect names its own points, these are used.
+    2. A scaling coefficient is the strength of an effect, and zero switches the effect off; each
+       gets a small value. A shape parameter, such as a frequency, cannot be zero; all its values on
+       a grid are combined with it.
+    3. Effects that do not respond in proportion to their coefficients, such as end stops and
+       limits, get several full sizes instead.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         model_effects: names of the effects that the model contains.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
@@ -143,6 +155,7 @@ def iterate_first_probes(
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     effect = evaluator.available_effects[name]
     coefficients = effect.coefficients
+    # 1. Points of the effect.
     for values in effect.probe_points():
         # Changes at several points add up to that at a point between them (`Effect.combine`).
         yield CandidateDirection(name, 0, 0, values, can_be_negative=True)
@@ -156,8 +169,9 @@ def iterate_first_probes(
         else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
         for i in shape_indices
     ]
-    group = 0
+    grid_point = 0
     first_coefficient = coefficients[0]
+    # 2. Small values at each grid point of the shape.
     # Scaling coefficients at one grid point act together, such as a sine and a cosine.
     for point in product(*grids):
         # A small limit of a force or a rate would remove all of it.
@@ -171,14 +185,15 @@ def iterate_first_probes(
             values[index] = INITIAL_PROBE_SHARE * high
             yield CandidateDirection(
                 effect=name,
-                grid_point=group,
+                grid_point=grid_point,
                 coefficient_index=index,
                 coefficients=values,
                 can_be_negative=low < 0,
             )
-        group += 1
+        grid_point += 1
+    # 3. Full sizes.
     if first_coefficient.of == "stop":
-        yield from _make_end_stop_candidates(evaluator, name, group)
+        yield from _make_end_stop_candidates(evaluator, name, grid_point)
         return
     lowest, _ = parameters[0].bounds
     # A small limit does not act like a large one, so limits are tried at values that the input
@@ -187,7 +202,9 @@ def iterate_first_probes(
         first_coefficient.of in ("input", "error") and lowest == 0
     ):
         shapes = np.array(list(product(*grids)))
-        yield from _make_limit_probes(evaluator, name, group, shapes if shape_indices else None)
+        yield from _make_limit_probes(
+            evaluator, name, grid_point, shapes if shape_indices else None
+        )
 
 
 def _is_contained_in_model(
@@ -242,14 +259,17 @@ def _make_end_stop_candidates(
 
 
 def _make_limit_probes(
-    evaluator: RunEvaluator, name: str, first_group: int, shapes: Array | None
+    evaluator: RunEvaluator, name: str, first_grid_point: int, shapes: Array | None
 ) -> Iterator[CandidateDirection]:
-    """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
+    """Yield limits, dead bands and backlash of several sizes that the motion or the input reaches.
+
+    A smaller or a larger size would change nothing or everything, so the sizes are fractions of the
+    largest value that occurs in the recording.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        first_group: number of the first grid point.
+        first_grid_point: number of the first candidate; the following ones count up from it.
         shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
     """
     largest = compute_reachable_levels(evaluator, name)
@@ -271,12 +291,12 @@ def _make_limit_probes(
     sizes = [share * largest for share in shares]
     if shapes is not None:
         sizes = [np.append(size, shape) for shape in shapes for size in sizes]
-    for number, c in enumerate(sizes, start=first_group):
+    for grid_point, size_and_shape in enumerate(sizes, start=first_grid_point):
         yield CandidateDirection(
             effect=name,
-            grid_point=number,
+            grid_point=grid_point,
             coefficient_index=0,
-            coefficients=c,
+            coefficients=size_and_shape,
             can_be_negative=False,
             is_single_size=True,
         )
@@ -288,11 +308,14 @@ def _make_shape_grid(
     specified_values: tuple[float, ...],
     travel: float,
 ) -> Array:
-    """Return the values to try of a shape parameter.
+    """Return the values of a shape parameter at which the response to an effect is computed.
+
+    Frequencies and periods have a grid fine enough to find any of them, event times are spread over
+    the recording, and all other parameters have a geometric grid.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        parameter: the shape parameter.
+        evaluator: evaluator with the recorded runs.
+        parameter: shape parameter, with its unit and bounds.
         specified_values: values that the coefficient specifies itself, if any.
         travel: largest range of the position in one run.
     """
@@ -373,15 +396,15 @@ def _compute_probe_sizes(probes: Sequence[CandidateDirection]) -> Array:
 def _make_modifier_probes(
     evaluator: RunEvaluator, probes: Sequence[CandidateDirection], acting: Mask
 ) -> Iterator[CandidateDirection]:
-    """Yield combinations of modifiers: coefficients that act only together with an active one.
+    """Yield combinations with modifiers: coefficients that act only together with another one.
 
     An example is a wind speed, which only matters if there is drag. A coefficient counts as a
-    modifier if its probe changes nothing although another coefficient of its effect does.
+    modifier if its response is zero although another coefficient of its effect has one.
 
     Args:
-        evaluator: run evaluator, which has the coefficients of the effects.
-        probes: the K probes of single coefficients.
-        acting: (K,) mask of the probes that change the runs.
+        evaluator: evaluator, which has the coefficients of the effects.
+        probes: K single coefficients whose responses were computed.
+        acting: (K,) mask of the coefficients that change the runs.
     """
     leading: dict[str, CandidateDirection] = {}
     idle_probes: list[CandidateDirection] = []
@@ -408,26 +431,26 @@ def _make_modifier_probes(
 def _iterate_grid_points(
     evaluator: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
 ) -> Iterator[CandidateDirection]:
-    """Yield the first active probe of an effect with all combinations of modifier values.
+    """Yield an active coefficient of an effect together with all combinations of modifier values.
 
     Args:
-        evaluator: run evaluator, which has the bounds of the coefficients.
-        first: the first active probe.
-        modifiers: probes of coefficients that act only together with it.
+        evaluator: evaluator, which has the bounds of the coefficients.
+        first: the first coefficient of the effect with a response.
+        modifiers: coefficients that act only together with it.
     """
     parameters = list_coefficients(evaluator, first.effect)
     points = product(MODIFIER_SHARES, repeat=len(modifiers))
-    for group, point in enumerate(points, start=1):
+    for grid_point, modifier_shares in enumerate(points, start=1):
         # All modifiers at zero give the effect that was already tried.
-        if not any(point):
+        if not any(modifier_shares):
             continue
         grid_coefficients = first.coefficients.copy()
-        for modifier, share in zip(modifiers, point, strict=True):
+        for modifier, share in zip(modifiers, modifier_shares, strict=True):
             _, high = parameters[modifier.coefficient_index].bounds
             grid_coefficients[modifier.coefficient_index] = share * high
         yield CandidateDirection(
             effect=first.effect,
-            grid_point=group,
+            grid_point=grid_point,
             coefficient_index=first.coefficient_index,
             coefficients=grid_coefficients,
             can_be_negative=first.can_be_negative,
@@ -439,16 +462,15 @@ def _compute_directions(
 ) -> Array:
     """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
 
-    For a fixed probe it is the whole change.
-
-    A direction is d = (y(c) - y(0)) / c (1), with the simulated runs y(c) at a small coefficient c.
+    A direction is d = (y(c) - y(0)) / c, with the simulated runs y(c) at a small coefficient c. For
+    a candidate that is valid at one size only, it is the whole change y(c) - y(0).
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         fit: fit of the model without the candidates.
-        probes: the K candidates.
+        probes: K coefficients at which to compute the response.
     """
     added = [(probe.effect, probe.coefficients) for probe in probes]
     # These are the largest arrays of a search, so all operations are in place.
@@ -464,15 +486,15 @@ def _compute_directions(
 def compute_responses(
     evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """Compute the changes of a fitted model's runs by one additional effect each.
+    """Compute how the runs of a fitted model change if one effect is added, for each of K effects.
 
     Linearised responses are used if the simulator provides them, because they cost less.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+        evaluator: evaluator that simulates the recorded runs.
+        fit: fit of the model without these effects.
         added: K effects with their coefficients.
 
     Returns:
@@ -491,27 +513,27 @@ def compute_responses(
 def simulate_with_effect(
     evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """Simulate the runs of a fitted model with one additional effect each.
+    """Simulate the runs of a fitted model with one added effect, for each of K effects.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+        evaluator: evaluator that simulates the recorded runs.
+        fit: fit of the model without these effects.
         added: K effects with their coefficients.
 
     Returns:
         Observations (K, R, T, C).
     """
-    runs = len(evaluator.prepared_runs)
+    run_count = len(evaluator.prepared_runs)
     theta = np.tile(fit.theta, (len(added), 1))
-    for row, (name, c) in zip(theta, added, strict=True):
-        row[evaluator.coefficient_slices[name]] = c
+    for row, (name, coefficients) in zip(theta, added, strict=True):
+        row[evaluator.coefficient_slices[name]] = coefficients
     # All candidates and runs are simulated in one engine call, as one batch.
-    count = len(added)
+    effect_count = len(added)
     simulated = evaluator.simulate(
-        theta=np.repeat(theta, runs, axis=0),
-        runs=np.tile(np.arange(runs), count),
-        states=np.tile(fit.initial_states, (count, 1)),
+        theta=np.repeat(theta, run_count, axis=0),
+        runs=np.tile(np.arange(run_count), effect_count),
+        states=np.tile(fit.initial_states, (effect_count, 1)),
     )
-    return simulated.reshape(count, runs, *simulated.shape[1:])
+    return simulated.reshape(effect_count, run_count, *simulated.shape[1:])

@@ -40,17 +40,20 @@ def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]
     """Return the coefficients of an effect as parameters, with units and plausible ranges.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     return evaluator.parameters[evaluator.coefficient_slices[name]]
 
 
 def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
-    """Return the largest values (k,) that the limited quantity of an effect reaches in the runs.
+    """Return the largest values that the limited quantity of an effect reaches in the runs.
+
+    A limit above such a value changes nothing, so the search tries fractions of it. The quantity
+    is, for example, the input, its rate, or the error of a servo.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator with the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
 
     Returns:
@@ -144,7 +147,7 @@ def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
     It is empty if the quantity is not recorded.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         effect: effect that limits a stored quantity.
     """
     name = effect.place or evaluator.simulator.system.levels[0]
@@ -155,7 +158,7 @@ def _compute_max_level(evaluator: RunEvaluator, run_data: RunData, effect: Effec
     """Return the maximum of the stored quantity, such as a tank's level, recorded in a run.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect that limits the quantity.
     """
@@ -169,7 +172,7 @@ def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect:
     It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on the command of the servo.
     """
@@ -190,16 +193,17 @@ def generate_end_stops(
     stiffness_shares: Sequence[float],
     depth_shares: Sequence[float],
 ) -> Iterator[Array]:
-    """Yield coefficients (k,) of end stops on one side, for every stiffness and depth.
+    """Yield coefficients (k,) of end stops at one end of a coordinate's range.
 
-    There are none if the range of the coordinate is not recorded.
+    All combinations of stiffness and depth are tried, because the response to an end stop is not
+    linear. There are none if the range of the coordinate is not recorded.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator with the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         side: 1 for the upper end, -1 for the lower end.
-        stiffness_shares: stiffnesses, as shares of the largest plausible one.
-        depth_shares: depths within the range of the coordinate, as shares of the range.
+        stiffness_shares: stiffnesses, as fractions of the largest plausible one.
+        depth_shares: depths within the range of the coordinate, as fractions of the range.
     """
     low, high = evaluator.get_coordinate_range(name)
     parameters = list_coefficients(evaluator, name)
@@ -221,7 +225,7 @@ def generate_neighbouring_end_stops(
     All depths are tried, because the stiffness determines the depth of contact.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the given end stop.
     """
@@ -247,7 +251,7 @@ def generate_equal_travel_end_stops(
     `sims.effects.state_limits`.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the given end stop.
     """
@@ -263,13 +267,14 @@ def generate_equal_travel_end_stops(
 
 
 def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
-    """Yield coefficients (k,) with event times between time stamps, near a given event time.
+    """Yield coefficients (k,) with other event times near a given one, between the time stamps.
 
-    The times cover the interval to the next tried event times. Nothing is generated for effects
-    without an event time.
+    A fit cannot move an event time over a sample, because the cost has a step there. The times
+    cover the interval to the next event times that scores have tried. Nothing is generated for
+    effects without an event time.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator with the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) given coefficients.
     """
@@ -295,27 +300,28 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
 def generate_frequency_neighbours(
     evaluator: RunEvaluator, fit: TrajectoryFit
 ) -> Iterator[FitStart]:
-    """Yield starts with shifted periodic effects, event times and end stops.
+    """Yield starts with shifted frequencies, event times and end stops.
 
-    Least squares stops at the nearest of the many local minima that such effects have.
+    Least squares stops at the nearest of the many local minima that such effects have, so fits
+    start from several of them.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        fit: fit of the runs: parameters, initial states, simulated runs and derivatives.
+        evaluator: evaluator with the recorded runs.
+        fit: fit whose effects are shifted.
     """
     for name in fit.effects:
-        for c in generate_equal_travel_end_stops(
+        for coefficients in generate_equal_travel_end_stops(
             evaluator, name, fit.theta[evaluator.coefficient_slices[name]]
         ):
             theta = fit.theta.copy()
-            theta[evaluator.coefficient_slices[name]] = c
+            theta[evaluator.coefficient_slices[name]] = coefficients
             yield FitStart(fit.effects, theta, fit.initial_states)
         bounds = compute_coefficient_bounds(evaluator, name)
         for i, index in enumerate(evaluator.get_coefficient_indices(name)):
             parameter = evaluator.parameters[index]
-            value = float(fit.theta[index])
+            fitted_value = float(fit.theta[index])
             for shifted_value in _shift_frequency_or_time(
-                evaluator, parameter, value, evaluator.get_effect_travel(name)
+                evaluator, parameter, fitted_value, evaluator.get_effect_travel(name)
             ):
                 theta = fit.theta.copy()
                 theta[index] = np.clip(shifted_value, *bounds[i])
@@ -325,14 +331,15 @@ def generate_frequency_neighbours(
 def _shift_frequency_or_time(
     evaluator: RunEvaluator, parameter: Parameter, value: float, travel: float
 ) -> Iterator[float]:
-    """Yield shifted values of a frequency, a period or an event time; nothing for others.
+    """Yield shifted values of a frequency, a period or an event time.
 
-    Frequencies and periods are shifted by parts of a cycle, event times by samples.
+    Frequencies and periods are shifted by fractions of a cycle over the recording, and event times
+    by samples: about the distance of neighbouring local minima.
 
     Args:
-        evaluator: the runs, whose duration determines the length of a cycle's part.
-        parameter: the coefficient, with its unit and plausible range.
-        value: the value to shift, in the unit of the coefficient.
+        evaluator: evaluator, whose longest run determines how far a frequency is shifted.
+        parameter: coefficient, with its unit and plausible range.
+        value: value to shift, in the unit of the coefficient.
         travel: largest range of the position within one run, in m or rad, for periods over
             position.
     """

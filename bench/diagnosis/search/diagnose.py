@@ -123,29 +123,38 @@ class Inquiry:
     def answered(self) -> DiagnosisResult:
         """Return the result of the complete diagnosis.
 
-        Effects are added to the base model while they explain more of the recording. The best model
-        is then compared with competing models of the same size, checked on held-out runs, and
-        tested for structure that it leaves in the residual. At last, its causes get those
-        alternatives that explain the data equally well.
+        1. Stop if nothing moves, or the data do not determine the base model.
+        2. Add effects to the base model while they explain more of the recording.
+        3. Compare the best model with competing models of the same size.
+        4. Drop effects that held-out runs do not confirm.
+        5. Test the residual for structure. A thorough search may then accept a larger model.
+        6. Find, for each cause, the alternatives that explain the data equally well.
+        7. Select the verdict from these answers.
 
         Raises:
             SearchStoppedError: the search had to end early.
         """
+        # 1. Base model.
         early_result = self.classify_unfit_base()
         if early_result is not None:
             return early_result
         search, base = self._search, self._search.base_model
+        # 2. Search.
         self._search_control.begin_question("search")
         self._model = search_with_subsampling(search)
+        # 3. Competing models.
         self._search_control.begin_question("rivals")
         self._model = search.simplify_laws(refine_best_model(search, self._model))
         self._model = search.fit_to_convergence(self._model)
         validated_effects = self._model.effects
+        # 4. Held-out runs.
         self._evaluate_on_held_out_runs()
+        # 5. Structure.
         self._search_control.begin_question("structure")
         lack_of_fit = assess_lack_of_fit(search, self._model)
         if search.thorough and self._accept_larger_model(lack_of_fit):
             lack_of_fit = assess_lack_of_fit(search, self._model)
+        # 6. Alternatives.
         self._search_control.begin_question("alternatives")
         model, causes = select_preferred_model(
             AlternativeFinder(search, self._trial, lack_of_fit.has_structure), self._model
@@ -155,6 +164,7 @@ class Inquiry:
             model = search.fit_to_convergence(model)
             if validation is not None:
                 validation.evaluate_models([model])
+        # 7. Verdict.
         self._search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(causes),
@@ -167,9 +177,10 @@ class Inquiry:
         return self._make_result(decide_verdict(state), base, model, causes, lack_of_fit)
 
     def classify_unfit_base(self) -> DiagnosisResult | None:
-        """Return the result if causes cannot be searched, else None.
+        """Return the result of the diagnosis if causes cannot be searched; None if they can.
 
-        This is the case if nothing moves, or if the data do not determine the base model.
+        They cannot be searched if nothing moves, or if the data do not determine the base model:
+        effects would then only compensate for parameters with arbitrary values.
 
         Raises:
             SearchStoppedError: the search had to end before the base model was fitted.
@@ -237,8 +248,8 @@ class Inquiry:
     def build_early_result(self) -> DiagnosisResult:
         """Return the result of a search that had to end early, which claims only what was tested.
 
-        Only existing fits and scores are used; nothing is simulated here but held-out runs, for
-        which a part of the time limit was kept.
+        Only existing fits and scores are used. Nothing is simulated except held-out runs, for which
+        a part of the time limit was reserved.
         """
         search = self._search
         early_stop = self._search_control.make_early_stop(self._held_out is not None)
@@ -339,14 +350,14 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
 def _validate_on_held_out(
     search: EffectSearch, model: FittedModel, held_out: Validation
 ) -> HeldOutValidation:
-    """Evaluate the models that matter for the verdict on held-out runs.
+    """Predict held-out runs with all models that matter for the verdict.
 
-    They are the base model, the result, models with a part of its effects, models that explain the
-    data nearly as well, and the best models of a single effect.
+    These are the base model, the result, models with a subset of its effects, models that explain
+    the data nearly as well, and the best models with a single effect.
 
     Args:
-        search: the search, with all fitted models.
-        model: the result of the search.
+        search: search with all fitted models.
+        model: best model of the search.
         held_out: predicts held-out runs.
     """
     models = search.models.values()

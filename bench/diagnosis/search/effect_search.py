@@ -78,20 +78,27 @@ class EffectSearch(ModelMoves):
     _segment_search: EffectSearch | None = None
 
     def run(self) -> FittedModel:
-        """Return the model of all effects that the data show.
+        """Return the model of all effects that the data show (beam search).
 
-        While the excess is large, the search continues although no single step pays off: if two
-        effects explain the data only together, neither has much merit alone.
+        For each number of effects:
+
+        1. Stop if neither scores nor residual suggest a further effect.
+        2. Fit models with one more effect.
+        3. Accept the best of them if its gain is significant.
+        4. Otherwise continue only far from the noise: if two effects explain the data only
+           together, neither has much merit alone.
         """
         best = self.base_model
-        for size in range(1, MAX_EFFECTS + 1):
+        for effect_count in range(1, MAX_EFFECTS + 1):
             self.best_supported_model = best
+            # 1. Completeness.
             # A further effect requires stronger evidence than the first one.
             if self.is_complete(
                 best, MAX_P_VALUE_FURTHER_EFFECT if best.effects else MAX_P_VALUE_FIRST_EFFECT
             ):
                 break
-            larger = self._search_size(best, size)
+            # 2. One more effect.
+            larger = self._search_size(best, effect_count)
             if larger is None:
                 break
             if (
@@ -99,18 +106,22 @@ class EffectSearch(ModelMoves):
                 and self.compute_missing_effect_p_value(best, larger) <= EFFECT_P_VALUE_THRESHOLD
             ):
                 best = self.correct_step_errors(larger)
+            # 4. No significant gain.
             # Near the noise, or if the residual may be noise, adding two effects at once would fit
             # noise.
             elif self.compute_excess_residual(best) < FAR_EXCESS or self.is_noise_like(best):
                 break
             # The missing effect is then not in the library, and three effects would only mimic it.
-            if size > 1 and is_hopeless(self, larger):
+            if effect_count > 1 and is_hopeless(self, larger):
                 break
         self.best_supported_model = best
         return best
 
     def correct_step_errors(self, model: FittedModel) -> FittedModel:
         """Correct the discretisation error about a model, and refit its close competing models.
+
+        A coarse time step of a robot's simulator causes an error that an effect may imitate. After
+        the correction, another model may be better, possibly a simpler one; it is returned.
 
         Returns:
             The best model of the same size after the correction, which may be a simpler one.
@@ -125,16 +136,16 @@ class EffectSearch(ModelMoves):
         correct_discretisation(
             self.evaluator, self.noise, model.fit.theta, model.fit.initial_states
         )
-        size = len(model.effects)
+        effect_count = len(model.effects)
         # A richer effect may have fitted only the discretisation error.
         close_models = [
             m
-            for m in select_by_size(self, size)
+            for m in select_by_size(self, effect_count)
             if m.penalised_log_likelihood
             > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
         ]
         self.refit_models([m.fit.make_start() for m in close_models], is_racing=False)
-        return select_by_size(self, size)[0]
+        return select_by_size(self, effect_count)[0]
 
     def get_best_so_far(self) -> FittedModel:
         """Return the best supported model of a search that has to end now, without any simulation.
@@ -230,9 +241,9 @@ class EffectSearch(ModelMoves):
     def refit_from_segments(self, size: int) -> None:
         """Search on short segments of the runs, and refit the best models to whole runs.
 
-        Models of `size` effects are searched. Each segment has its own initial state, so errors
-        accumulate less and fits have fewer local minima (multiple shooting). The search is skipped
-        if segments are no easier to fit than whole runs.
+        Each segment has its own initial state, so errors accumulate less and fits have fewer local
+        minima (multiple shooting). Models of `size` effects are searched. The search is skipped if
+        segments are no easier to fit than whole runs.
         """
         if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets_initial_state:
             return
@@ -368,15 +379,15 @@ def _list_excess_residuals(search: EffectSearch, size: int) -> list[float]:
 def select_conservative_model(
     search: EffectSearch, best: FittedModel, larger: FittedModel
 ) -> FittedModel:
-    """Return the larger model, or one that extends the best smaller model.
+    """Return the larger model only if it replaces effects of the smaller one for a good reason.
 
-    Two effects can mimic many a third one. A larger model that replaces effects of the best smaller
-    one must reduce the excess clearly. Otherwise the best one-effect extension of the smaller model
-    is returned, or the smaller model itself.
+    Two effects can mimic a third one. So a larger model that replaces effects of the best smaller
+    model must reduce the excess clearly. Otherwise the best extension of the smaller model by one
+    effect is returned, or the smaller model itself.
 
     Args:
-        search: the search, with all fitted models.
-        best: the best smaller model.
+        search: search with all fitted models.
+        best: best model with fewer effects.
         larger: model with more effects.
     """
     # A model that contains the effects of the best one replaces none of them.

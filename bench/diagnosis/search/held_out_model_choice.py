@@ -76,14 +76,14 @@ class HeldOutValidation:
         return float(np.sqrt(squares.mean())) - 1.0
 
     def drop_unhelpful_effects(self, search: EffectSearch, model: FittedModel) -> FittedModel:
-        """Return the model without idle effects.
+        """Return the model without the effects that held-out runs do not confirm.
 
-        An effect is idle if it makes held-out predictions worse, or hardly better while the excess
-        is large.
+        An effect is not confirmed if it makes held-out predictions worse, or hardly better while
+        the excess is large. Effects are dropped one at a time.
 
         Args:
-            search: the search, with every fitted model.
-            model: fitted model: its effects, parameters, initial states and likelihood.
+            search: search with all fitted models.
+            model: fitted model whose effects are tested.
         """
         while model.effects and model.effects in self.held_out_fits:
             submodels = self._list_smaller_models(search, model)
@@ -107,25 +107,24 @@ class HeldOutValidation:
     def find_better_extension(self, search: EffectSearch, model: FittedModel) -> FittedModel:
         """Return the extension of a model that held-out runs confirm best, or the model itself.
 
-        If the residual has structure, merits on fitted runs are unreliable, because each model
-        mimics what is missing. A clearly lower residual on runs that were not fitted is not
-        mimicry.
+        If the residual has structure, likelihoods on fitted runs are unreliable, because each model
+        mimics what is missing. A clearly lower residual on runs that were not fitted is reliable.
 
         Args:
-            search: the search, with every fitted model.
-            model: the model that was found; it has been evaluated.
+            search: search with all fitted models.
+            model: best model of the search, which has been evaluated on held-out runs.
         """
         names = set(model.effects)
         extensions = [m for m in search.models.values() if names < set(m.effects)]
         extensions = sorted(extensions, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
         fitted_models = search.models.values()
-        parts = [
+        submodels = [
             m
             for m in fitted_models
             if any(set(m.effects) < set(extension.effects) for extension in extensions)
         ]
         # The model is included again, so that all initial states start from the same values.
-        self.evaluate_models([model, *extensions, *parts])
+        self.evaluate_models([model, *extensions, *submodels])
         excess_shares = {
             m.effects: self._compute_relative_excess(search, model, m) for m in extensions
         }
@@ -183,15 +182,20 @@ class HeldOutValidation:
     ) -> bool:
         """Return whether the effect by which two models differ improves held-out predictions.
 
-        It is also accepted if it explains the fitted runs, and held-out runs hardly show it.
+        One of these criteria must hold:
+
+        1. Likelihood and excess residual of held-out runs improve.
+        2. They improve a little, and the effect closes most of the gap on the fitted runs.
+        3. Held-out runs hardly show the effect, and it explains the gap on the fitted runs.
 
         Args:
-            search: the search, whose models are fitted to the fitted runs.
-            reduced_model: the model without the effect.
-            full_model: the model with the effect.
+            search: search that fitted the models to the fitted runs.
+            reduced_model: model without the effect.
+            full_model: model with the effect.
         """
         before = self.held_out_fits[reduced_model.effects].penalised_log_likelihood
         after = self.held_out_fits[full_model.effects].penalised_log_likelihood
+        # 1. Clear improvement.
         # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
         excesses = (
             self.compute_excess_residual(reduced_model.effects),
@@ -203,12 +207,14 @@ class HeldOutValidation:
             search.compute_excess_residual(reduced_model),
             search.compute_excess_residual(full_model),
         )
+        # 2. Small improvement.
         # Errors of a motion without feedback accumulate, whatever their cause.
         is_better = (
             after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excesses[1] < excesses[0]
         )
         if is_better and excess_with < CLEARLY_CLOSED * excess_without:
             return True
+        # 3. Not visible on held-out runs.
         # A limit that no held-out run approaches cannot be tested there; the result would be
         # random.
         is_hardly_visible = max(excesses) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(

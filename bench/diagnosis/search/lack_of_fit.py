@@ -71,8 +71,9 @@ class JointHatForce(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return strength times a triangle around the centre.
+        """Return the hat force on one joint: its strength times a triangle around the centre.
 
+        It acts while time, position or speed is near the centre, eq. (1) of the module docstring.
         All batch elements of a call have the same joint, variable and direction.
 
         Args:
@@ -97,9 +98,9 @@ class JointHatForce(Force):
         force_direction = (np.ones_like(v), -v, dry_direction)[
             int(direction[active_elements[0], 0])
         ]
-        result = np.zeros_like(moment.x)
-        result[:, j] = (strength * height * force_direction)[:, 0]
-        return result
+        forces = np.zeros_like(moment.x)
+        forces[:, j] = (strength * height * force_direction)[:, 0]
+        return forces
 
 
 HAT_COUNT = 7
@@ -143,10 +144,10 @@ class HatForce(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return strength c times a triangle of half-width w around the centre m, eq. (1).
+        """Return the hat force f(z) = c max(1 - |z - m| / w, 0) d, eq. (1) of the module docstring.
 
-        The force is f(z) = c max(1 - |z - m| / w, 0) d (1), with the variable z, centre m, width w
-        and direction d.
+        It acts while the variable z (time, position or speed) is near the centre m, with the
+        strength c, the half-width w and the direction d.
 
         Args:
             c: The six coefficients: strength, variable, centre, width, direction, slow (the speed
@@ -209,21 +210,24 @@ def list_hat_effects(kind: type[SystemSimulator]) -> list[type[Effect]]:
 
 
 def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
-    """Test a fitted model for lack of fit.
+    """Test whether the residual of a fitted model has structure that no effect explains.
 
-    The size of the residual is tested first. Then a linear test for an unmodelled force of any
-    shape follows, which decides if it finds none; otherwise hat-shaped forces over time, position
-    and speed are simulated and scored, calibrated by surrogate residuals.
+    1. Compare the size of the residual with the noise.
+    2. Test for an unmodelled force with a filter. If it finds none, this decides.
+    3. Otherwise simulate hat-shaped forces over time, position and speed, and score them against
+       the residual, calibrated by surrogate residuals.
 
     Args:
-        models: the models of the recording.
-        model: the fitted model.
+        models: fitted models of the recording.
+        model: fitted model to test.
     """
     evaluator, is_noise_stated = models.evaluator, models.is_noise_stated
+    # 1. Size.
     size_result = assess_residual_size(models, model)
     if not any(probe.name in evaluator.coefficient_slices for probe in (HatForce, JointHatForce)):
         return size_result
     evaluator.search_control.report_and_check("an unmodelled force")
+    # 2. Filter.
     force_test = models.score_unmodelled_force(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
@@ -235,6 +239,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
             size_result.channels_above_noise,
             level,
         )
+    # 3. Hat forces.
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(evaluator, model)
     if not directions.candidates:
@@ -378,12 +383,16 @@ def _iterate_joint_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
 
 
 def _iterate_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
-    """Yield every family of hat forces, eq. (1), whose variable the recording shows.
+    """Yield every family of hat forces whose variable the recording shows.
 
-    A hat is a triangular basis function max(1 - |z - m| / w, 0) of time, position or speed z (1).
-    Over time they act along each coordinate and against the motion. Over a position they act along
-    the last coordinate, against the motion, or as dry friction; over the speed against the motion,
-    or as dry friction. A bouncing body flies freely and slides on nothing.
+    A hat is a triangular basis function max(1 - |z - m| / w, 0) of a variable z, eq. (1). The
+    families together can represent any force that depends on one variable:
+
+    * over time, along each coordinate or against the motion;
+    * over a position, along the last coordinate, against the motion, or as dry friction;
+    * over the speed, against the motion, or as dry friction.
+
+    A bouncing body flies freely and slides on nothing, so some families are left out for it.
     """
     system = evaluator.simulator.system
     speed = _compute_high_speed(evaluator)

@@ -94,61 +94,78 @@ class RandomSearch:
     def run(
         self, theta: Array, indices: Sequence[int], widths: Array, bounds: Array
     ) -> FoundValues:
-        """Return the best sample of all rounds.
+        """Search coefficients and initial states at random, and return the best sample.
 
-        It minimises J(c) = sum over runs r of min_x J_r(c, x) (1), with the coefficients c and the
-        initial state x of each run.
+        It minimises J(c) = sum over runs r of min_x J_r(c, x), eq. (1), with the coefficients c and
+        the initial state x of each run, by the cross-entropy method. Each round has these steps:
+
+        1. Sample coefficients about the best ones.
+        2. Sample initial states of each run for each sample of the coefficients.
+        3. Keep the best sample.
+        4. Stop if the cost hardly decreases, or the runs are explained.
+        5. Adapt the widths of the next samples to the best samples of this round.
 
         Shapes: P parameters.
 
         Args:
             theta: (P,) parameters.
-            indices: indices of the K coefficients that are searched.
-            widths: (K,) their standard deviations in the first round.
-            bounds: (K, 2) their lower and upper bounds.
+            indices: indices of the K coefficients that are varied.
+            widths: (K,) standard deviations of these coefficients in the first round.
+            bounds: (K, 2) lower and upper bounds of these coefficients.
         """
-        count = int(self._is_recorded.sum())
+        sample_count = int(self._is_recorded.sum())
         best, centre, lowest = theta.copy(), theta[list(indices)], np.inf
         spread = widths.astype(np.float64)
         for _ in range(MAX_ROUNDS):
             self._evaluator.search_control.check_not_stopped()
+            # 1. Coefficients.
             deviates = self._rng.standard_normal((COEFFICIENT_SAMPLES, len(indices)))
             deviates[0] = 0.0
             values = np.clip(centre + spread * deviates, bounds[:, 0], bounds[:, 1])
             samples = np.repeat(theta[None], COEFFICIENT_SAMPLES, axis=0)
             samples[:, list(indices)] = values
-            tried = [self._sample_states(run, samples) for run in range(len(self._means))]
-            totals = np.sum([costs.min(axis=1) for _, costs in tried], axis=0)  # (1)
-            index, former = int(np.argmin(totals)), lowest
+            # 2. Initial states.
+            sampled_states = [self._sample_states(run, samples) for run in range(len(self._means))]
+            totals = np.sum([costs.min(axis=1) for _, costs in sampled_states], axis=0)  # (1)
+            # 3. Best sample.
+            index, previous_lowest = int(np.argmin(totals)), lowest
             if totals[index] < lowest:
                 lowest, best, centre = float(totals[index]), samples[index], values[index]
-                for run, (states, costs) in enumerate(tried):
+                for run, (states, costs) in enumerate(sampled_states):
                     self._deviates[run] = states[index, np.argmin(costs[index])]
-            if not lowest < (1.0 - MIN_COST_DECREASE) * former:
+            # 4. Convergence.
+            if not lowest < (1.0 - MIN_COST_DECREASE) * previous_lowest:
                 break
-            if not lowest > EXPLAINED_SQUARES * count:
+            if not lowest > EXPLAINED_SQUARES * sample_count:
                 break
+            # 5. Widths of the next round.
             order = np.argsort(totals)[:BEST_COEFFICIENTS]
             deviation = np.sqrt(np.square(values[order] - centre).mean(axis=0))
             spread = np.minimum(spread, SPREAD_FACTOR * deviation)
-            for run, (states, costs) in enumerate(tried):
+            for run, (states, costs) in enumerate(sampled_states):
                 self._move_covariance(run, states, costs)
-        found = [
+        sampled_initial_states = [
             mean + root @ deviate
             for mean, root, deviate in zip(self._means, self._roots, self._deviates, strict=True)
         ]
         evaluator = self._evaluator
-        states = np.where(evaluator.known_state_mask, evaluator.initial_state_guesses, found)
-        return FoundValues(best, states, lowest / max(count, 1))
+        states = np.where(
+            evaluator.known_state_mask, evaluator.initial_state_guesses, sampled_initial_states
+        )
+        return FoundValues(best, states, lowest / max(sample_count, 1))
 
     def _sample_states(self, run: int, samples: Array) -> tuple[Array, Array]:
-        """Simulate one run from random initial states with each sample of the parameters (N, P).
+        """Simulate one run from random initial states, with each of N samples of the parameters.
+
+        A cost is the sum of squares of the residual plus that of the deviates, which penalises
+        initial states far from the smoothed ones. Returned are the deviates (N, M, s) of M initial
+        states, and their costs (N, M).
 
         Shapes: P parameters, s states of a run.
 
         Args:
             run: Index of the run.
-            samples: (N, P) parameter vectors.
+            samples: (N, P) samples of the parameters.
 
         Returns:
             Deviates (N, M, s) of the initial states, and costs (N, M): sums of squares of the

@@ -58,14 +58,18 @@ def select_refit_starts(
     max_count: int,
     fits_all: bool,
 ) -> list[FitStart]:
-    """Return starts for fits with the most promising candidates.
+    """Return starts of fits with one more effect, for the effects with the best scores.
+
+    1. Rank the effects by their scores.
+    2. Make starts with several values of the coefficients for each peak of an effect's score.
+    3. Simulate all starts, and keep the nearest to the data for each peak.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
-        model: the model to extend.
+        model: fitted model to extend by one effect.
         direction_set: sensitivity directions of the candidates.
-        scores: their scores.
+        scores: scores of the candidates about this model.
         max_count: maximum number of candidates.
         fits_all: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
     """
@@ -78,6 +82,7 @@ def select_refit_starts(
         max_count, min_relative_score = MAX_REFITS_THOROUGH, 0.0
     # If scores are less reliable, they only order the fits, and exclude no candidate.
     is_all_wanted = fits_all and not evaluator.has_linearisation
+    # 1. Ranked effects.
     for i in _rank_candidates(
         scores,
         max_count,
@@ -86,6 +91,7 @@ def select_refit_starts(
         _find_simulated_scores(evaluator, scores),
     ):
         name = scores.effects[i]
+        # 2. Starting values.
         # The score peaks of an effect are fitted separately, because each may lead to its own
         # minimum.
         for peak_number, (group, predicted_coefficients) in enumerate(scores.peaks[i]):
@@ -98,6 +104,7 @@ def select_refit_starts(
                     known_jacobian=known_jacobian,
                 )
                 numbered_starts.append((peak_number, start))
+    # 3. The nearest start of each peak.
     # Fits of all candidates begin with the first part of the runs, so starts are compared there.
     run_share = FIT_HORIZONS[0].share if fits_all else 1.0
     return _select_nearest_start(evaluator, noise, numbered_starts, run_share)
@@ -132,12 +139,17 @@ def _rank_candidates(
     is_all_wanted: bool,
     simulated: frozenset[int],
 ) -> list[int]:
-    """Return the indices of the candidates to refit, the most promising first.
+    """Return the indices of the effects to refit, the most promising first.
+
+    1. Effects with the best scores above their null-hypothesis level.
+    2. Effects with the best scores for white noise, if they are not among these.
+    3. Effects scored by full simulation that exceed all linear scores. They are added to the others
+       and replace none.
 
     Args:
         scores: scores of all candidates.
         max_count: maximum number of candidates by their score.
-        share: minimum score above the null level, as a share of the best one.
+        share: minimum score above the null level, as a fraction of the best one.
         is_all_wanted: whether to return all candidates.
         simulated: candidates scored by full simulation, which are selected separately.
     """
@@ -147,12 +159,15 @@ def _rank_candidates(
         return ranked
     # Far from the data, the score of a full simulation may exceed the first-order score of the true
     # effect, so such candidates are added to the others and displace none.
+    # 1. Best scores.
     order = [i for i in ranked if i not in simulated]
     selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:max_count]
+    # 2. White noise.
     by_squares = [
         int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in simulated
     ]
     selected_by_squares = by_squares[:MAX_REFITS_BY_SQUARES]
+    # 3. Full simulations.
     best_excess = score_excess[order[0]] if order else -np.inf
     selected_by_simulation = [
         i for i in ranked if i in simulated and score_excess[i] >= best_excess
@@ -165,7 +180,7 @@ def add_effect_to_start(evaluator: RunEvaluator, start: FitStart, name: str, c: 
     """Add an effect to a model, in place of the effects that it contains.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         start: the model.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the effect.
@@ -189,14 +204,15 @@ def _predict_jacobian(
     group: DirectionGroup,
     name: str,
 ) -> KnownJacobian | None:
-    """Return approximate derivatives of the model with one more effect of small size.
+    """Return the approximate Jacobian of a model with one more effect, from known derivatives.
 
-    They consist of the derivatives of the model and the directions; None if these do not contain
-    all coefficients.
+    A fit that starts with it needs no simulations for its first Jacobian. It consists of the
+    Jacobian of the model and the directions of the effect. Return None if these do not contain all
+    coefficients.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        model: the model without the effect.
+        evaluator: evaluator that simulates the recorded runs.
+        model: fitted model without the effect.
         direction_set: directions of all candidates about this model.
         group: directions of the effect at one grid point.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
@@ -209,12 +225,12 @@ def _predict_jacobian(
         if not direction_set.candidates[i].is_single_size
     }
     coefficient_indices = evaluator.get_coefficient_indices(name)
-    shaping = [
+    shape_indices = [
         i
         for i in range(len(coefficient_indices))
         if evaluator.parameters[coefficient_indices[i]].bounds[0] > 0
     ]
-    if not columns or shaping:
+    if not columns or shape_indices:
         return None
     jacobian = np.zeros((*direction_set.responses.shape[:3], len(coefficient_indices)))
     for index, column in columns.items():
@@ -224,10 +240,10 @@ def _predict_jacobian(
         for n in evaluator.available_effects[name].contains
         if n in model.effects
     ]
-    replaced_places = {index for span in contained for index in span}
+    replaced_indices = {index for span in contained for index in span}
     return (
         model.fit.get_known_jacobian()
-        .drop_parameters(replaced_places)
+        .drop_parameters(replaced_indices)
         .add_parameters(coefficient_indices, jacobian)
     )
 
@@ -239,24 +255,28 @@ def _list_start_sizes(
     estimate: Array,
     name: str,
 ) -> Iterator[Array]:
-    """Yield initial coefficients of an effect, from which its fit may reach different local minima.
+    """Yield coefficients of an effect from which its fit may reach different local minima.
 
-    They are the linear estimate, smaller shares of it, and shares of the plausible range.
+    1. A direction that is valid at one size gives this size, and neighbouring ones for an end stop.
+    2. Otherwise the linear estimate and fractions of it.
+    3. For a single coefficient, also fractions of its plausible range.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
-        direction_set: directions of all candidates.
+        evaluator: evaluator, which has the bounds of the coefficients.
+        direction_set: directions of all candidates about the model.
         group: directions of the effect at one grid point.
         estimate: linear estimate of the coefficient of each direction of the group.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     bounds = compute_coefficient_bounds(evaluator, name)
     first_probe = direction_set.candidates[group.column_indices[0]]
+    # 1. One size.
     # A direction for one full size says nothing about other sizes.
     if first_probe.is_single_size:
         yield first_probe.coefficients
         yield from generate_neighbouring_end_stops(evaluator, name, first_probe.coefficients)
         return
+    # 2. Linear estimate.
     for share in SIZE_SHARES:
         coefficients = first_probe.coefficients.copy()
         for column, size in zip(group.column_indices, estimate, strict=True):
@@ -264,6 +284,7 @@ def _list_start_sizes(
             coefficients[index] = share * float(np.clip(size, *bounds[index]))
         yield coefficients
         yield from generate_event_times(evaluator, name, coefficients)
+    # 3. Plausible range.
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
@@ -284,25 +305,27 @@ def _select_nearest_start(
     numbered_starts: Sequence[tuple[int, FitStart]],
     run_share: float,
 ) -> list[FitStart]:
-    """Return the start with the lowest cost for each score peak of each set of effects.
+    """Simulate all starts, and return the nearest to the data for each score peak.
+
+    Simulating a start costs much less than fitting it.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
         numbered_starts: starts with the number of their score peak.
-        run_share: initial share of the runs on which the cost is computed.
+        run_share: fraction of each run, from its beginning, on which the cost is computed.
     """
     if not numbered_starts:
         return []
     starts = [start for _, start in numbered_starts]
-    runs = len(evaluator.prepared_runs)
-    count = len(starts)
-    theta = np.repeat([s.theta for s in starts], runs, axis=0)
+    run_count = len(evaluator.prepared_runs)
+    start_count = len(starts)
+    theta = np.repeat([s.theta for s in starts], run_count, axis=0)
     states = np.concatenate([s.initial_states for s in starts])
-    run_indices = np.tile(np.arange(runs), count)
+    run_indices = np.tile(np.arange(run_count), start_count)
     # All starts are simulated in one engine call, as one batch.
     predictions = evaluator.simulate(theta, run_indices, states, run_share)
-    predictions = predictions.reshape(count, runs, *predictions.shape[1:])
+    predictions = predictions.reshape(start_count, run_count, *predictions.shape[1:])
     sample_mask = evaluator.get_sample_mask(run_share)
     best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
     for (number, start), simulated in zip(numbered_starts, predictions, strict=True):

@@ -46,7 +46,7 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
     """Return a `RunEvaluator` with thinned runs and the same parameters.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
 
     Returns:
         The thinned runs, or None if there are few samples, if the sample interval is already as
@@ -159,14 +159,19 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
 
 
 def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> FittedModel:
-    """Search on thinned runs, which is faster, then confirm the result on all samples.
+    """Search on runs with fewer samples, which is faster, then confirm the result on all samples.
 
-    If all samples show more effects than the thinned runs did, the search is repeated on them.
+    1. If scores on all samples show no effect, a search is not needed.
+    2. Search on the subsampled runs.
+    3. Fit the models that matter to all samples, and select the best.
+    4. If all samples show more effects, repeat the search on them.
     """
+    # 1. No effect.
     # If the scores of the base model, which all merits need anyway, show nothing, no search is
     # needed.
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
+    # 2. Subsampled runs.
     rng = search.make_rng("fewer samples")
     search_arguments = (
         thinned_runs,
@@ -182,10 +187,12 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     except SearchStoppedError:
         _adopt_subsampled_models(search, subsampled_search.get_best_so_far())
         raise
+    # 3. All samples.
     starts = _collect_full_fit_starts(subsampled_search, subsampled_model)
     if starts:
         search.refit_models(starts)
     model = _select_full_model(search, subsampled_model)
+    # 4. Confirmation.
     if not _is_confirmed_by_all_samples(search, model):
         return search.run()
     search.settled_effects = frozenset(model.effects)
@@ -206,14 +213,14 @@ def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
 def _collect_full_fit_starts(
     subsampled_search: EffectSearch, subsampled_model: FittedModel
 ) -> list[FitStart]:
-    """Collect the models of the search on thinned runs from which fits to all samples start.
+    """Return starts of fits to all samples, from the best models of the search on subsampled runs.
 
-    They are the result, models that explain the data nearly as well, models without one of its
-    effects, and the best models of a single effect.
+    The models are the result, models that explain the data nearly as well, models without one of
+    its effects, and the best models with a single effect.
 
     Args:
-        subsampled_search: the finished search on thinned runs.
-        subsampled_model: its result.
+        subsampled_search: finished search on subsampled runs.
+        subsampled_model: best model of this search.
     """
     competing_models = list_competing_models(subsampled_search, subsampled_model)
     selected_models = [

@@ -144,7 +144,7 @@ def _compute_motion_covariates(
     and the mean position.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         model: model that simulates them.
         number: name of the parameter, ``NAME@JOINT`` for that of a joint.
     """
@@ -343,7 +343,7 @@ def _find_trend_covariate(
     None if no trend is significant.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         model: fitted model: its effects, parameters, initial states and likelihood.
         grouping: the groups of runs, such as logs.
         consistency: estimates of the parameter from each group.

@@ -61,7 +61,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
     that the prompt stays short.
 
     Args:
-        case: case: recording, simulator and library of effects, without the hidden causes.
+        case: task of a diagnoser: recording, simulator and effects, without the hidden causes.
     """
     evidence = RegressionEvidence(case)
     try:

@@ -119,7 +119,7 @@ class RegressionEvidence:
         are first used.
 
         Args:
-            case: case: recording, simulator and library of effects, without the hidden causes.
+            case: task of a diagnoser: recording, simulator and effects, without the hidden causes.
             has_held_out: whether held-out runs are fitted too.
         """
         recording = case.recording
@@ -439,7 +439,7 @@ def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: run evaluator: the recorded runs, and the simulator that is compared with them.
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         fit: a fitted model with its Jacobian.
 
     Returns:

@@ -76,7 +76,7 @@ def find_order_by_model(
     """Find the order of columns with which a model explains a motion best.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         driven: Joints with their actuators, in the model's order.
         times: (T,) seconds.
         commands: (T,) command of each actuator, SI units.
@@ -151,7 +151,7 @@ def _compute_order_residual(
     mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order, about 1 otherwise.
 
     Args:
-        robot: Robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         driven: Joints with their actuators.
         commands: (J, T) their commands.
         motion: (3, J, T) their positions, velocities and accelerations.

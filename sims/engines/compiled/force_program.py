@@ -487,7 +487,7 @@ def _is_traceable(
 
     Args:
         tracer: tracer of the system.
-        effect: effect: a force, friction, input, sensor or contact law.
+        effect: effect of the library: a force, friction, input, sensor or contact law.
         batch: batch in which the effect acts, from which states for the check are taken.
         elements: indices of the elements on which it acts.
         names: names and sizes of the inputs.

@@ -388,7 +388,7 @@ def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> boo
     Args:
         tracing: traced state of the robot.
         forces: effects of the batch, evaluated by NumPy.
-        effect: effect: a force, friction, input, sensor or contact law.
+        effect: effect of the library: a force, friction, input, sensor or contact law.
     """
     if not effect.is_traceable:
         return False

@@ -337,7 +337,7 @@ class RunLinearisation:
 
         Args:
             owner: number of the candidate.
-            effect: effect: a force, friction, input, sensor or contact law.
+            effect: effect of the library: a force, friction, input, sensor or contact law.
             c: (K, 1, 1) its coefficients.
         """
         name = effect.of or effect.name

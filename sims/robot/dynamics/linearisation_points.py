@@ -581,7 +581,7 @@ class LinearisationPoints:
         Shapes: S steps.
 
         Args:
-            effect: effect: a force, friction, input, sensor or contact law.
+            effect: effect of the library: a force, friction, input, sensor or contact law.
             c: (K, 1, 1) its coefficients.
         """
         if not isinstance(effect, HiddenStateEffect):

@@ -167,7 +167,7 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
 
     Args:
         model: batch model, to which the sensors were added.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
     """
     one_coordinate_joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     file_joints = [name for name in one_coordinate_joints if name not in robot.series]

@@ -237,7 +237,7 @@ def _write_cause(
 
     Args:
         target_values: fields of the model, changed in place.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         cause: effect at a place with its fitted numbers.
         series: elements in series, by place, that are not yet written.
     """
@@ -283,7 +283,7 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
     Several rounds are needed, because a change may also modify values that should stay.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         target_values: wanted fields of the compiled model.
 
     Returns:

@@ -54,7 +54,7 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
 
     Args:
         f: fields of the model with the effects.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the actuator.
     """
     actuator_id = robot.actuator(place).id
@@ -76,7 +76,7 @@ def _make_solref_reader(index: int) -> Read:
 
         Args:
             f: fields of the model with the effects.
-            robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+            robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
             place: name of the contact.
         """
         values = f["pair_solref"][0, find_pair(robot, place)]
@@ -156,7 +156,7 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
 
     Args:
         fields: fields of the model.
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         effect: class of the effect at its place.
     """
     name, place = _get_effect_name(effect), effect.place
@@ -203,7 +203,7 @@ def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:
     """Return whether an effect acts at an actuator of a slide joint.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         effect: class of the effect at its place.
     """
     if effect.at != "actuator":

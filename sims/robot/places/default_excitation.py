@@ -103,7 +103,7 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     Each command oscillates about a holding value that balances gravity in the reference pose.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         joints: joints to excite.
     """
     holding, forces = _compute_reference_forces(robot, joints)
@@ -128,7 +128,7 @@ def _compute_reference_forces(
     """Return the holding force of each joint in the reference pose, and a force amplitude.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         joints: joints to excite.
 
     Returns:
@@ -176,7 +176,7 @@ def _make_command(
     Position and velocity servos receive a motion instead of a force.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         actuator: the actuator.
         joint: joint of the actuator.
         holding: force that holds the reference pose, N or N m.

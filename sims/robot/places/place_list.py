@@ -308,7 +308,7 @@ def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     """Return the servo gains of an actuator in the model file; zero if it is not a servo.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         actuator: number of the actuator.
     """
     bias = robot.compiled.actuator_biasprm[actuator]
@@ -332,7 +332,7 @@ def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float
     """Return the numbers that the model file specifies at a joint, by effect.
 
     Args:
-        robot: robot: its joints, bodies and actuators, and its compiled MuJoCo model.
+        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         dof: address of the joint's velocity.
         joint: number of the joint in the compiled model.
     """
