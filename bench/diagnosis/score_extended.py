@@ -17,7 +17,7 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
-from bench.logs.importing.sample_selection import leave_out_settling
+from bench.logs.importing.sample_selection import fill_lost_commands, leave_out_settling
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size, check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error
@@ -86,17 +86,25 @@ def score_model(
     check_value_sizes(recording_used)
     check_recording_plausible(recording_used, kind, force)
     check_recording_size(recording_used, kind(engine=engine), force)
-    # Only the effects in the file are needed; the others are not part of the model.
-    evaluator = RunEvaluator(
-        kind,
-        recording_used,
-        runs,
-        engine,
-        candidates=list(extended.effects),
-    )
-    sigma = compute_noise_floor(evaluator, recording_used).sigma
-    squares = _compute_squared_errors(evaluator, _simulate_runs(evaluator, extended, sigma))
-    evaluator.close()
+
+    def score(recording: Recording) -> tuple[RunEvaluator, Array, Array]:
+        """Return the evaluator of the runs, the squared errors, and the noise."""
+        counted = recording.held_out() if held_out else recording.runs
+        # Only the effects in the file are needed; the others are not part of the model.
+        evaluator = RunEvaluator(
+            kind, recording, counted, engine, candidates=list(extended.effects)
+        )
+        sigma = compute_noise_floor(evaluator, recording).sigma
+        squares = _compute_squared_errors(evaluator, _simulate_runs(evaluator, extended, sigma))
+        evaluator.close()
+        return evaluator, squares, sigma
+
+    scores = [score(recording_used)]
+    filled, note = fill_lost_commands(recording_used)
+    if note and kind.has_model:
+        # Commands of lost rows were held or sent; the smaller error tells.
+        scores.append(score(filled))
+    evaluator, squares, sigma = min(scores, key=lambda one: float(one[1].sum()))
     if not np.isfinite(squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
     return _summarise_errors(evaluator, squares, sigma)

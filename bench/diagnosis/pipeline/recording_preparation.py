@@ -16,7 +16,11 @@ from bench.diagnosis.pipeline.simulated_runs import (
     SimulatedRuns,
     choose_engine,
 )
-from bench.logs.importing.sample_selection import leave_out_settling, thin_recording
+from bench.logs.importing.sample_selection import (
+    fill_lost_commands,
+    leave_out_settling,
+    thin_recording,
+)
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size, load_joined
 from bench.logs.segmentation import segment_recording
@@ -33,6 +37,12 @@ MIN_EXTRA_SAMPLES = 4
 MAX_CHANNEL_SIZE_FACTOR = 1e9
 """Recorded values of at least this multiple of a channel's typical size are refused."""
 RecordingSource: TypeAlias = str | Path | Recording
+
+MIN_HELD_LOG_LIKELIHOOD = 1.0
+"""Minimum gain in log-likelihood for each lost row if its command counts as held.
+
+A model with a wrong number may prefer either kind of command by less.
+"""
 
 
 def prepare_runs(sources: Sequence[RecordingSource], context: DiagnosisContext) -> SimulatedRuns:
@@ -67,7 +77,7 @@ def prepare_runs(sources: Sequence[RecordingSource], context: DiagnosisContext) 
         options.say(f"{recording.path}: {anomaly}")
     recording = _prepare_recording(recording, kind, context)
     check_recording_size(recording, kind(engine=choose_engine(kind, options)), options.force)
-    runs = SimulatedRuns.build(context, kind, recording)
+    runs = _fill_lost_commands(SimulatedRuns.build(context, kind, recording))
     if runs.contacts.is_on_ground:
         runs = leave_out_unpredictable_segments(runs)
     context.add_notes(
@@ -130,6 +140,27 @@ def _prepare_recording(
     notes = thinning_note, settling_note, segment_note, noise_note
     context.add_notes(note for note in notes if note)
     return recording
+
+
+def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
+    """Interpolate the commands of lost rows of a robot unless they were clearly held.
+
+    A logger may have lost a row whose command was sent, or the controller may have sent none, so
+    that the previous command was held. The innovations of the filter tell them apart.
+    """
+    filled, note = fill_lost_commands(runs.recording)
+    if not note or not runs.kind.has_model:
+        return runs
+    count = sum(
+        new.times.size - old.times.size
+        for new, old in zip(filled.runs, runs.recording.runs, strict=True)
+    )
+    filled_runs = SimulatedRuns.build(runs.context, runs.kind, filled)
+    before, after = runs.nominal_filter.log_likelihood, filled_runs.nominal_filter.log_likelihood
+    if before > after + MIN_HELD_LOG_LIKELIHOOD * count:
+        return runs
+    runs.context.add_notes([note])
+    return filled_runs
 
 
 def _format_added_noise(channels: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Leave out samples of robots: those between slow motions, and first ones before filters settle.
+"""Select samples: thin out slow motion, leave out unsettled filters, fill in lost commands.
 
 Neighbouring samples of a slow motion share the rounding errors of an encoder and vibrations that no
 model of the robot contains: at 500 Hz and more they, and not the motion, decide a likelihood. Each
@@ -9,15 +9,22 @@ well as from one through every second sample.
 The activation of a filter at the start of a run is not recorded. For a robot at rest it equals the
 first command, MuJoCo starts it at zero, and in a log that was cut out of a motion it can have any
 value. After a few time constants nothing depends on it, and the commands up to then are known.
+
+A row that a logger has lost lacks a command, too. To hold the previous command in its place would
+be an error of the first order in the interval, which resembles a delay; cubic interpolation between
+its neighbours (H. Akima, J. ACM 17(4), 589, 1970) leaves one of a higher order.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 
@@ -31,6 +38,16 @@ NEGLIGIBLE_ERROR_SHARE = 1e-4
 """Negligible interpolation error as a fraction of a channel's range: a simulation's accuracy."""
 MIN_AVAILABLE_SHARE = 0.9
 """Minimum share of available samples of each channel."""
+INTEGER_INTERVAL_TOLERANCE = 0.3
+"""Tolerance for lost samples, as a fraction of the sampling interval.
+
+An interval that is so close to a whole multiple of the median interval has lost the samples
+between.
+"""
+MAX_FILLED_SAMPLES = 5
+"""Maximum number of successive lost samples whose commands are interpolated."""
+MAX_FILLED_JITTER = 0.05
+"""Maximum jitter, as a share of the sampling interval, at which lost commands are interpolated."""
 MIN_RUN_SAMPLES = 40
 """Minimum number of samples that each run must keep."""
 
@@ -66,6 +83,101 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
         "used, and the mean of the inputs between them"
     )
     return replace(recording, runs=runs), note
+
+
+class LostSamples(NamedTuple):
+    """Samples that are lost between those of a run.
+
+    Attributes:
+        counts: (T - 1,) number of lost samples in each interval.
+        jitter: standard deviation of the intervals, as a share of the median interval.
+    """
+
+    counts: NDArray[np.intp]
+    jitter: float
+
+    @property
+    def total(self) -> int:
+        """Number of lost samples."""
+        return int(self.counts.sum())
+
+
+def find_lost_samples(times: Array) -> LostSamples:
+    """Find lost samples: intervals that are a multiple of the median interval.
+
+    Args:
+        times: (T,) sample times, s; at least three.
+    """
+    steps = np.diff(times)
+    ratios = steps / np.median(steps)
+    multiples = np.maximum(np.round(ratios), 1.0)
+    deviations = ratios - multiples
+    jitter = SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
+    is_multiple = np.abs(deviations) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)
+    return LostSamples(np.where(is_multiple, multiples - 1, 0).astype(np.intp), jitter)
+
+
+def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
+    """Insert a sample with interpolated commands and empty channels where a row was lost.
+
+    Runs without inputs, or with uneven sampling intervals, and longer gaps stay as they are.
+
+    Args:
+        recording: Recording as it was read.
+
+    Returns:
+        The recording, and a message for the user, which is empty if nothing was lost.
+    """
+    count, runs = 0, []
+    for run in recording.runs:
+        if run.inputs and run.times.size > 2:
+            lost = find_lost_samples(run.times)
+            filled = np.where(lost.counts <= MAX_FILLED_SAMPLES, lost.counts, 0)
+            if lost.jitter <= MAX_FILLED_JITTER and filled.sum() > 0:
+                count += int(filled.sum())
+                run = _insert_samples(run, filled)
+        runs.append(run)
+    if not count:
+        return recording, ""
+    note = (
+        f"{count} commands of rows that are lost are interpolated: log commands in a separate file "
+        "if they jump"
+    )
+    return replace(recording, runs=tuple(runs)), note
+
+
+def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
+    """Insert evenly spaced samples without readings into a run.
+
+    Args:
+        run: the run.
+        counts: (T - 1,) number of samples to insert into each interval.
+    """
+    first = np.repeat(np.arange(counts.size), counts)
+    before = np.cumsum(counts) - counts
+    shares = (np.arange(first.size) - before[first] + 1.0) / (counts[first] + 1.0)
+    times = run.times[first] + shares * np.diff(run.times)[first]
+    places = first + 1
+
+    def interpolate(values: Array) -> Any:
+        """Return a local cubic interpolation, which does not overshoot where commands jump."""
+        # Imported here, because few recordings need it.
+        from scipy.interpolate import Akima1DInterpolator
+
+        return Akima1DInterpolator(run.times, values, method="makima")
+
+    def insert(signals: Mapping[str, Any], values: Callable[[Any], Any]) -> dict[str, Any]:
+        """Insert the values that a function gives for each signal."""
+        return {name: np.insert(old, places, values(old)) for name, old in signals.items()}
+
+    return replace(
+        run,
+        times=np.insert(run.times, places, times),
+        channels=insert(run.channels, lambda _: np.nan),
+        inputs=insert(run.inputs, lambda old: interpolate(old)(times)),
+        extra=insert(run.extra, lambda old: old[first]),
+        off=insert(run.off, lambda old: old[first]),
+    )
 
 
 def _compute_sampling_rate(run: Run) -> float:

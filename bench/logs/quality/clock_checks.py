@@ -39,8 +39,8 @@ import numpy as np
 
 from bench.core.resource_estimates import FORCE_HINT
 from bench.logs.importing.normalised_positions import check_normalised_positions
+from bench.logs.importing.sample_selection import MAX_FILLED_SAMPLES, find_lost_samples
 from bench.logs.quality import pose_check
-from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
 from bench.logs.quality.pose_check import find_missing_base_poses
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding, format_names
 from sims.core.simulator import Array, InputError, Simulator
@@ -52,12 +52,6 @@ JITTER_THRESHOLD = 0.02
 """Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
 LOST_SAMPLE_SHARE_THRESHOLD = 0.002
 """Smallest share of lost or repeated samples that is reported."""
-INTEGER_INTERVAL_TOLERANCE = 0.3
-"""Tolerance for lost samples, as a fraction of the sampling interval.
-
-An interval that is so close to a whole multiple of the median interval has lost the samples
-between.
-"""
 FAST_SIGNAL_STEPS = 5.0
 """Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
 
@@ -80,22 +74,18 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
     """
     jittered, jitters, lost_count, sample_count, lossy = [], [], 0, 0, []
     for run in recording.runs:
-        steps = np.diff(_select_timestamps(run))
-        if steps.size < 2:
+        times = _select_timestamps(run)
+        if times.size < 3:
             continue
-        ratios = steps / np.median(steps)
-        counts = np.maximum(np.round(ratios), 1.0)
-        deviations = ratios - counts
-        jitter = SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
+        steps, lost = np.diff(times), find_lost_samples(times)
+        jitter, run_lost_count = lost.jitter, lost.total
         jitters.append(jitter)
         if jitter > JITTER_THRESHOLD:
             jittered.append(run.name)
-        run_lost_count = int(
-            (counts - 1)[np.abs(deviations) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)].sum()
-        )
         # If the clock jitters strongly, a long interval means a lost sample only if no short
         # interval compensates for it.
-        run_lost_count = min(run_lost_count, max(int(ratios.sum()) - steps.size, 0))
+        expected_count = int(steps.sum() / np.median(steps))
+        run_lost_count = min(run_lost_count, max(expected_count - steps.size, 0))
         if run_lost_count < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
             run_lost_count = 0
         lost_count, sample_count = (
@@ -116,8 +106,9 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
             "clock",
             f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
             f"{format_names(lossy)}",
-            "nothing is interpolated, but commands in the gaps are not known: log commands "
-            "in a separate file, or at a lower rate",
+            "readings are not interpolated; commands of a robot of up to "
+            f"{MAX_FILLED_SAMPLES} lost samples are, unless they were held: log commands in a "
+            "separate file if they jump",
         )
 
 
