@@ -138,27 +138,34 @@ class DetectionLimits:
 def compute_detection_limits(
     evaluator: RunEvaluator, extended: ExtendedSimulator, names: Sequence[str]
 ) -> DetectionLimits:
-    """Compute the detection limits of effects that an extended simulator does not contain.
+    """Compute how large each absent effect would have to be for the recording to reveal it.
+
+    1. Simulate the runs with the extended simulator, which lacks these effects.
+    2. Take its residual as the noise.
+    3. Compute the directions of the absent effects, and the limits.
 
     Args:
-        evaluator: Run evaluator of the runs, with the effects of the simulator and the absent ones.
-        extended: Extended simulator.
-        names: Absent effects.
+        evaluator: Evaluator of the runs, with the effects of the simulator and the absent ones.
+        extended: Extended simulator of a diagnosis.
+        names: Names of the absent effects.
 
     Raises:
         InputError: The simulation fails on the runs.
     """
+    # 1. Simulation.
     noise_floor = compute_noise_floor(evaluator, evaluator.recording)
     white_noise = NoiseModel(noise_floor.sigma, np.zeros(len(noise_floor.sigma)))
     fit = _linearise_extended(evaluator, extended, white_noise)
     if not np.isfinite(fit.simulated[np.isfinite(evaluator.observed)]).all():
         raise InputError(f"{evaluator.recording.path}: the simulation of it fails")
+    # 2. Noise.
     # The random stream is not used, because there is no search.
     models = ModelSet(evaluator, white_noise, frozenset(), make_rng("sheet"), noise_floor.is_stated)
     model = models.add_fit(fit)
     likelihood = model.likelihood
     # The residual of the model is taken as the noise, whatever the recording specifies.
     noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
+    # 3. Directions and limits.
     directions = _add_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
     calculator = _DetectionLimitCalculator(
         evaluator,
@@ -201,12 +208,12 @@ def _add_small_gaps(
 ) -> DirectionSet:
     """Add directions of backlash that is smaller than the search tries.
 
-    Otherwise the smallest direction may already be detectable, and the limit is not known.
-    Each size is half the previous one, `GAP_HALVINGS` times.
+    Otherwise the smallest direction may already be detectable, and the detection limit would be
+    unknown. Each size is half the previous one, `GAP_HALVINGS` times.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        fit: fit of the model.
+        fit: fit of the model, at which the directions are computed.
         directions: directions of all candidates.
     """
     smallest_probes: dict[str, CandidateDirection] = {}
@@ -242,7 +249,7 @@ def _add_small_gaps(
 def _linearise_extended(
     evaluator: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel
 ) -> TrajectoryFit:
-    """Simulate the runs with the extended simulator, and compute its derivatives at this point.
+    """Simulate the runs with the extended simulator, and compute its Jacobian at this point.
 
     Only the initial states are fitted; parameters and coefficients keep their values.
 
@@ -323,11 +330,11 @@ class _DetectionLimitCalculator:
         self.newton_steps = gradients / np.maximum(self.powers, 1e-300)  # (2)
 
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
-        """Compute the detection limit of each coefficient, at the shape that is detected best.
+        """Compute the detection limit of each coefficient, for the shape that is detected best.
 
-        A shape is a probe of the coefficient with certain values of the effect's other
-        coefficients. A limit or backlash does not change the runs in proportion to its size, so its
-        limit is the smallest detectable size that was tried.
+        A shape is a choice of the effect's other coefficients, such as a frequency. A limit or
+        backlash does not change the runs in proportion to its size, so its detection limit is the
+        smallest detectable size that was tried.
 
         Args:
             prediction_half_widths: half the 95 % interval of each parameter in a run that is not
@@ -453,11 +460,11 @@ class _DetectionLimitCalculator:
         return False
 
     def _compute_switching_limit(self, name: str) -> DetectionLimit:
-        """Return the detection limit of a limit or backlash, which is not proportional to its size.
+        """Return the detection limit of a limit or backlash, whose response is not linear.
 
-        The search contains directions of several fixed sizes of the effect (`probes`). A size is
-        detectable if it changes the runs by at least `MIN_DETECTABLE_LIMIT_SIGMAS`, after the
-        parameters of the model have absorbed what they can.
+        Directions of several fixed sizes of the effect were computed. A size is detectable if it
+        changes the runs by at least `MIN_DETECTABLE_LIMIT_SIGMAS`, after the parameters of the
+        model have absorbed what they can.
 
         Args:
             name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.

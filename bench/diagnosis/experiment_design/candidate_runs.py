@@ -61,10 +61,10 @@ class StatedLimits:
 def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
     """Read the limits of commands, positions, velocities and forces from a robot's model file.
 
-    A system without a model file has none.
+    Proposed runs must stay within them. A system without a model file has none.
 
     Args:
-        evaluator: Run evaluator of the recording.
+        evaluator: Evaluator of the recorded runs.
     """
     if not evaluator.kind.has_model:
         return StatedLimits()
@@ -92,13 +92,13 @@ def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
 
 
 def _compute_command_range(robot: Any, actuator: Any) -> Interval:
-    """Compute the range of an actuator's control that respects all limits of actuator and joint.
+    """Compute the range of an actuator's command that respects all limits of actuator and joint.
 
-    It is in the unit of the control: a force for a motor, a position or velocity for a servo.
+    It is in the unit of the command: a force for a motor, a position or velocity for a servo.
 
     Args:
         robot: model of the robot.
-        actuator: the actuator.
+        actuator: actuator whose command is limited.
     """
     interval = actuator.range or UNLIMITED
     if actuator.joint is None:
@@ -321,10 +321,10 @@ class RigModel:
                 yield replace(plan, hold_factor=hold_factor)
 
     def _iterate_initial_states(self) -> Iterator[tuple[str, float]]:
-        """Yield other initial states, each as a name and a value.
+        """Yield other initial states for a proposed run, each as the name of a state and its value.
 
-        They are shares of the usual initial coordinates, and, except for robots, the largest
-        initial rates that were recorded, in both directions.
+        They are multiples of the usual initial coordinates. Except for robots, which start at rest,
+        they are also the largest initial rates that were recorded, in both directions.
         """
         system, evaluator = self.evaluator.simulator.system, self.evaluator
         unobserved_states = {
@@ -371,18 +371,23 @@ class RigModel:
     def make_run(self, plan: RunPlan) -> CandidateRun:
         """Turn a plan into a run that can be simulated: commands, constants and initial state.
 
-        Commands that exceed the limits of an input are clipped, and the description says so.
+        1. Hold each input at its recorded median.
+        2. Add the planned signal to the driven inputs, within their limits. The description of the
+           run says which inputs were limited.
+        3. Set the planned initial states and constants.
 
         Args:
             plan: Plan of the run: form, size and offset of the commands, held time, constants and
                 initial states.
         """
+        # 1. Medians.
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
             name: self._limit_command(name, np.full(times.size, self.median_commands[name]))
             for name in self.recorded_scenario.inputs
         }
         initial_state = self.initial_state.copy()
+        # 2. Signals of the driven inputs.
         limited_inputs = []
         for number, name in enumerate(plan.driven_inputs):
             signal = plan.size * _compute_command(
@@ -393,6 +398,7 @@ class RigModel:
             )
             inputs[name] = self._limit_command(name, command)
             limited_inputs += [name] if (inputs[name] != command).any() else []
+        # 3. Initial states and constants.
         for name, value in plan.states:
             initial_state[self.evaluator.state_names.index(name)] = value
         constants = {**self.recorded_scenario.constants, **dict(plan.constants)}
@@ -414,6 +420,8 @@ class RigModel:
         self, plan: RunPlan, inputs: Mapping[str, Array], limited_inputs: Sequence[str]
     ) -> str:
         """Describe a plan in words that tell the user how to record the run.
+
+        For example "u.elbow: chirp, 2 times the recorded amplitude, from q.elbow = 0.3".
 
         Args:
             plan: Plan of the run.
@@ -464,23 +472,25 @@ An empty one is computed by `_compute_command`.
 def _compute_command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
     """Compute the command signal (T,) of a form, such as a chirp or steps, with magnitude one.
 
-    It is scaled to the size of the recorded commands later.
+    The caller scales it to the size of the recorded commands.
 
     Args:
-        form: name of the form.
+        form: name of the form, a key of `COMMAND_FORMS`, or one of those that are computed here.
         times: (T,) sample times from zero, s.
         step: sampling interval, s.
         rng: random numbers of forms with random phases or levels.
     """
-    share = times / (times[-1] or 1.0)
+    run_fraction = times / (times[-1] or 1.0)
     if form == "ramps up and down":
-        return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * share)))
+        return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * run_fraction)))
     if form == "holds":
         # Levels alternate with a large change each time, so that friction becomes visible.
         levels = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 0.25])
-        return levels[np.minimum((share * HOLD_LEVEL_COUNT).astype(np.intp), HOLD_LEVEL_COUNT - 1)]
+        return levels[
+            np.minimum((run_fraction * HOLD_LEVEL_COUNT).astype(np.intp), HOLD_LEVEL_COUNT - 1)
+        ]
     if form == "a push, then zero input":
-        return np.where(share < RELEASE_SHARE, 1.0, 0.0)
+        return np.where(run_fraction < RELEASE_SHARE, 1.0, 0.0)
     seconds = float(times[-1])
     # In Hz. The slow frequency has one cycle in the run, but is 0.1 to 0.5 Hz. The fast one has at
     # least ten samples in a cycle, but is at most 8 Hz.

@@ -85,18 +85,20 @@ class _Run(NamedTuple):
 def propose_discriminating_run(
     models: ModelSet, model: FittedModel, competing_model: FittedModel
 ) -> DiscriminatingRun:
-    """Propose a run or measurement that distinguishes a model from a competing model.
+    """Propose a run or measurement that shows which of two models is right.
 
-    Present runs are changed in a few ways that an experimenter can make. Of these, the run within
-    the limits of the robot on which both models differ most is proposed, if they differ by at least
-    `MIN_DISCRIMINATION_SIGMAS`.
+    1. Change the present runs in a few ways that an experimenter can make, and simulate each with
+       both models.
+    2. Select the run within the limits of the robot on which the models differ most.
+    3. Describe it, or, if they differ by less than `MIN_DISCRIMINATION_SIGMAS`, explain why.
 
     Args:
-        models: Collection that contains both models.
+        models: Fitted models, which include both.
         model: Model of the present diagnosis.
         competing_model: Competing model that explains the data as well.
     """
     evaluator = models.evaluator
+    # 1. Changed runs.
     description = ""
     change: dict[str, float] = {}
     largest_discrimination = 0.0
@@ -109,6 +111,7 @@ def propose_discriminating_run(
         (size, run) for size, run in runs_by_discrimination if np.isfinite(size) and size > 0.0
     ]
     runs_by_discrimination.sort(key=lambda entry: -entry[0])
+    # 2. The most different run within the limits.
     is_limited = False
     if first_run := _find_first_within_limits(
         evaluator, (model, competing_model), runs_by_discrimination
@@ -117,6 +120,7 @@ def propose_discriminating_run(
         is_limited = (
             largest_discrimination < MIN_DISCRIMINATION_SIGMAS <= runs_by_discrimination[0][0]
         )
+    # 3. Description.
     # Effects that both models have are not in question.
     effects = set(model.effects)
     competing_names = set(competing_model.effects)
@@ -139,13 +143,13 @@ def propose_discriminating_run(
 def _find_first_within_limits(
     evaluator: RunEvaluator, models: Sequence[FittedModel], runs: Sequence[tuple[float, _Run]]
 ) -> tuple[float, _Run] | None:
-    """Return the first run that stays within the limits of a robot, whichever model is true.
+    """Return the first run that stays within the limits of a robot, whichever model is right.
 
-    For a system without a model file it is the first of all runs.
+    A proposed run must not damage the robot. For a system without a model file it is the first run.
 
     Args:
-        evaluator: Run evaluator of the present runs.
-        models: Models that may be true.
+        evaluator: Evaluator of the recorded runs.
+        models: Models, either of which may be right.
         runs: Candidate runs with the RMS difference of the two models, largest first.
 
     Returns:
@@ -172,10 +176,10 @@ def _find_first_within_limits(
 def _explain_no_run(
     evaluator: RunEvaluator, model_effects: str, competing_effects: str, is_limited: bool
 ) -> str:
-    """Write what to do if no such run would discriminate, or none within the limits of a robot.
+    """Write what the user can do if no run distinguishes the two models.
 
     Args:
-        evaluator: the present runs, whose channels are recorded.
+        evaluator: evaluator, whose channels are recorded.
         model_effects: effects of the model in words.
         competing_effects: effects of the competing model in words.
         is_limited: whether only the limits of the model file exclude such a run.
@@ -267,13 +271,13 @@ def _lengthen_run(first: _Run) -> _Run:
 def _change_initial_states(
     evaluator: RunEvaluator, first: _Run, limits: StatedLimits
 ) -> Iterator[_Run]:
-    """Yield runs that differ from the first one in one initial state.
+    """Yield runs that differ from a recorded run in one initial state.
 
     The initial velocities of a robot are not changed, because it starts at rest.
 
     Args:
-        evaluator: run evaluator of the runs to which models are fitted.
-        first: the first fitted run.
+        evaluator: evaluator of the recorded runs.
+        first: recorded run that is changed.
         limits: limits of the model file; empty for a system.
     """
     system = evaluator.simulator.system
@@ -300,13 +304,13 @@ def _change_initial_states(
 
 
 def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
-    """Yield runs that differ from the first one in the size of one input.
+    """Yield runs that differ from a recorded run in the amplitude of one input.
 
     An input is never scaled beyond the limits of its command.
 
     Args:
-        evaluator: run evaluator with the recorded runs.
-        first: the recorded run to be changed.
+        evaluator: evaluator of the recorded runs.
+        first: recorded run that is changed.
         limits: limits of commands that the model file states.
     """
     factors = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
@@ -324,9 +328,9 @@ def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) ->
             ):
                 continue
             inputs = {**first.scenario.inputs, name: scaled_signal}
-            size = "smaller" if factor < 1 else "larger"
+            comparison = "smaller" if factor < 1 else "larger"
             description = (
-                f"Make the input {name} {size}, {factor:.3g} times what it was{first.says}"
+                f"Make the input {name} {comparison}, {factor:.3g} times what it was{first.says}"
             )
             scenario = replace(first.scenario, inputs=inputs)
             yield _Run(description, {name: factor}, scenario, first.states)
@@ -367,16 +371,14 @@ def _compute_discrimination(
     competing_model: FittedModel,
     sigma: Array,
 ) -> float:
-    """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
+    """Simulate a run with two models, and return the RMS difference of their predictions, eq. (1).
 
-    The larger it is, the more clearly the run shows which model is right.
-
-    It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2) (1), in standard
-    deviations of the noise.
+    It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2), in standard
+    deviations of the noise. The larger it is, the more clearly the run shows which model is right.
 
     Args:
         evaluator: run evaluator that simulates the run.
-        run: the run.
+        run: run that could be recorded.
         model: fitted model with one of the causes.
         competing_model: fitted model with the other one.
         sigma: (C,) standard deviation of the noise of each channel.

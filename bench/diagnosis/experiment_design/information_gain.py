@@ -159,13 +159,11 @@ class RunRanker:
     # -- runs
 
     def rank_runs(self, runs: Sequence[CandidateRun]) -> list[RunValue]:
-        """Return the runs within the limits, the best first.
+        """Return the runs within the limits, the most valuable first.
 
-        They are ordered by the linearised discrimination T, or with one model by the information
-        gain D: eqs. (1) and (2) of the module docstring.
-
-        If models compete, the value is their discrimination (1); otherwise it is the information
-        gain about uncertain parameters (2). Both are defined in the module docstring.
+        If models compete, the value of a run is their discrimination T to first order, eq. (1) of
+        the module docstring. Otherwise it is the information gain D about uncertain parameters, eq.
+        (2).
         """
         diagnosed_model = self.information[0].model
         allowed_runs = [
@@ -280,7 +278,14 @@ class RunRanker:
         theta: Array,
         states: Array | None = None,
     ) -> _LinearisedRun | None:
-        """Linearise a run at a parameter vector and an initial state.
+        """Linearise a run about parameters and an initial state, by finite differences.
+
+        The value of a run follows from the linearisation, without fits.
+
+        1. Simulate the run with each parameter and each free initial state displaced.
+        2. Reject the run if it amplifies differences of the initial state so much that its result
+           could not be interpreted.
+        3. Whiten the differences by the noise.
 
         Shapes: P parameters, s states of a run.
 
@@ -294,25 +299,30 @@ class RunRanker:
             The linearisation; None if the simulation fails, or if the run amplifies differences of
             the initial state so much that its result could not be interpreted.
         """
-        begin = run.states if states is None else states
+        # 1. Simulations.
+        initial_state = run.states if states is None else states
         free_indices = information.model.fit.free_indices.tolist()
         thetas = [theta] * (1 + len(free_indices) + int(self.is_free_state.sum()))
         for row, index in enumerate(free_indices):
             displaced_theta = theta.copy()
             displaced_theta[index] += information.spread[row]
             thetas[1 + row] = displaced_theta
-        shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.is_free_state]
-        initial_states = [begin] * (1 + len(free_indices)) + [begin + shift for shift in shifts]
+        shifts = STATE_STEP_SHARE * np.eye(initial_state.size)[self.is_free_state]
+        initial_states = [initial_state] * (1 + len(free_indices)) + [
+            initial_state + shift for shift in shifts
+        ]
         simulated = self._simulate_run(run, thetas, initial_states)
         if not np.isfinite(simulated).all():
             return None
+        # 2. Amplification.
         differences = np.abs(simulated[1 + len(free_indices) :] - simulated[0])
-        sizes = np.array([channel.scale for channel in self.evaluator.simulator.channels])
+        channel_scales = np.array([channel.scale for channel in self.evaluator.simulator.channels])
         if (
             differences.size
-            and (differences / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
+            and (differences / channel_scales).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
         ):
             return None
+        # 3. Whitening.
         whitened = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
         parameter_responses, state_responses = (
             whitened[1 : 1 + len(free_indices)],
@@ -328,16 +338,19 @@ class RunRanker:
         true_model: _ParameterInformation,
         competing_model: _ParameterInformation,
     ) -> float:
-        """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
+        """Compute the discrimination T of a run by a fit of the competing model.
 
-        The prediction of the model `true_model` takes the place of the recording. The fit of
-        `competing_model` by Levenberg-Marquardt may move its parameters as far as the present data
-        allow.
-
-        It is T = min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta (1), with the
+        It is T = min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta, eq. (1), with the
         difference d of two models, the derivatives J by parameters and B by the initial state, and
-        the covariance C of the parameters.
+        the covariance C of the parameters. The prediction of `true_model` takes the place of the
+        recording. The fit of `competing_model` by Levenberg-Marquardt may move its parameters as
+        far as the present data allow.
+
+        1. Simulate the prediction of the true model.
+        2. Propose a step from the linearisation.
+        3. Accept it if the cost decreases, otherwise increase the damping.
         """
+        # 1. Prediction.
         fit = competing_model.model.fit
         simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
         target = self._whiten(simulated)[0]
@@ -353,6 +366,7 @@ class RunRanker:
         for _ in range(MAX_FIT_ITERATIONS):
             if damping > MAX_DAMPING:
                 break
+            # 2. Step.
             _, step, state_step = _compute_remaining_difference(
                 target - linearisation.centre, linearisation, competing_model, deviation, damping
             )
@@ -370,6 +384,7 @@ class RunRanker:
             cost = residual_cost + float(
                 (deviation + step) @ competing_model.inverse @ (deviation + step)
             )
+            # 3. Acceptance.
             if trial_linearisation is None or not cost < lowest_cost:
                 # The step was too long or failed, so the next one is much shorter (Marquardt).
                 damping *= DAMPING_INCREASE
@@ -429,29 +444,31 @@ def _compute_remaining_difference(
 ) -> tuple[float, Array, Array]:
     """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
-    It is min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta (1), in whitened units.
+    T is min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta, in units of the noise: the
+    difference of the models that remains after the competing model has adapted to the run. Returned
+    are T, the step delta of the parameters and the step z of the initial state.
 
     Shapes: q fitted parameters.
 
     Args:
-        gap: (n,) residual of the competing model.
+        gap: (n,) difference d: prediction of the true model minus that of the competing model.
         slopes: Linearisation of the competing model.
         information: Information of the present runs on the competing model.
-        deviation: (q,) difference of its parameters from their present estimates, in units of
+        deviation: (q,) difference of the parameters from their present estimates, in units of
             `spread`.
         damping: Levenberg-Marquardt damping of the step.
     """
-    q = len(information.spread)
-    deviation = np.zeros(q) if deviation is None else deviation
+    parameter_count = len(information.spread)
+    deviation = np.zeros(parameter_count) if deviation is None else deviation
     columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
     normal, pull = columns.T @ columns, columns.T @ gap
-    normal[:q, :q] += information.inverse
-    pull[:q] -= information.inverse @ deviation
+    normal[:parameter_count, :parameter_count] += information.inverse
+    pull[:parameter_count] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
     step = np.linalg.solve(damped, pull)
     initial_cost = float(gap @ gap + deviation @ information.inverse @ deviation)
     minimum_cost = initial_cost - 2.0 * float(pull @ step) + float(step @ normal @ step)
-    return max(minimum_cost, 0.0), step[:q], step[q:]
+    return max(minimum_cost, 0.0), step[:parameter_count], step[parameter_count:]
 
 
 def _compute_information_gain(slopes: _LinearisedRun, information: _ParameterInformation) -> float:

@@ -97,14 +97,15 @@ def design_next_run(
     seconds: float,
     max_seconds: float,
 ) -> NextRunDesign | None:
-    """Design the best run that could be recorded next.
+    """Design the recording that tells most about models or uncertain parameters.
 
-    Basic plans are ranked by their linearised value, the best ones are evaluated exactly, and
-    variants of the best plans are tried for up to `MAX_VARIATION_ROUNDS` rounds. If none decides,
-    the best plans are tried with the maximum duration.
+    1. Rank basic plans by their linearised value.
+    2. Evaluate the best ones exactly, and try variants of them, for up to `MAX_VARIATION_ROUNDS`
+       rounds.
+    3. If no run decides, try the best plans with the maximum duration.
 
     Args:
-        models: Collection that contains all of the models.
+        models: Fitted models, which include all of these.
         model: Model of the present diagnosis.
         competing_models: Competing models that explain the data as well; empty if there are none.
         seconds: Duration of the run in seconds.
@@ -113,10 +114,12 @@ def design_next_run(
     Returns:
         The design; None if no run can be simulated.
     """
+    # 1. Basic plans.
     rig = RigModel(models.evaluator, seconds)
     ranker = RunRanker(models, [model, *competing_models])
     ranked_runs = ranker.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
     evaluated_plans = {run_value.run.plan for run_value in ranked_runs}
+    # 2. Variants.
     for _ in range(MAX_VARIATION_ROUNDS):
         ranked_runs = _evaluate_fully(ranker, ranked_runs)
         if (
@@ -134,6 +137,7 @@ def design_next_run(
         evaluated_plans.update(new_plans)
         ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
     ranked_runs = _evaluate_fully(ranker, ranked_runs)
+    # 3. Longer runs.
     if ranked_runs and _may_longer_run_help(ranked_runs[0], max_seconds / seconds):
         longer_rig = RigModel(models.evaluator, max_seconds)
         longer_runs = ranker.rank_runs(
@@ -171,9 +175,9 @@ def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
 
 
 def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValue]:
-    """Sort runs by value, after exact evaluation of the first ones.
+    """Evaluate the most valuable runs exactly, and sort all runs by value.
 
-    Linearised values tend to be too high.
+    Linearised values tend to be too high, so a run is proposed only after an exact evaluation.
 
     Args:
         ranker: evaluates runs exactly, by fits of the competing models.
@@ -202,14 +206,15 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
 def _describe_best_run(
     models: ModelSet, models_compared: Sequence[FittedModel], rig: RigModel, run_value: RunValue
 ) -> NextRunDesign:
-    """Describe the best run, and what it is expected to tell, for the report.
+    """Return the design of the best run, and what it is expected to tell, for the report.
 
     With competing models, the design states the effects that it distinguishes and the expected
     discrimination (T-optimal); otherwise the gain of information about parameters (D-optimal).
 
     Args:
         models: Fitted models of the recording.
-        models_compared: The present diagnosis, followed by the models that compete with it.
+        models_compared: Model of the present diagnosis, followed by the models that compete with
+            it.
         rig: Experimental setup.
         run_value: Best run with its value.
     """

@@ -123,14 +123,16 @@ class RigLimits:
     def _simulate_monitored_channels(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
-        """Simulate runs with a model, and return the monitored channels of each, (T,) by name.
+        """Simulate runs with a model, and return all channels that have limits, (T,) by name.
+
+        Channels that are not recorded are simulated too.
 
         Shapes: T samples, s states of a run.
 
         Args:
-            model: fitted model: its effects, parameters, initial states and likelihood.
-            scenarios: R runs.
-            states: (R, s) their initial states.
+            model: fitted model with which the runs are simulated.
+            scenarios: R runs that could be recorded.
+            states: (R, s) initial states of these runs.
         """
         evaluator = self.evaluator
         values = {
@@ -161,9 +163,12 @@ class RigLimits:
     def _determine_bounds(self) -> dict[str, tuple[float, float]]:
         """Determine the allowed range of each monitored channel.
 
-        It is the limit in the model file if there is one, else the range of the present runs,
-        widened.
+        1. A system: the range of the recorded runs, widened.
+        2. A robot: the limit of the model file if it states one.
+        3. Otherwise, for positions, the range of the recorded runs, widened; for speeds and forces,
+           a multiple of the largest recorded value.
         """
+        # 1. Ranges of the recorded runs.
         recorded_ranges = {}
         for name in self.monitored_channels:
             values = np.concatenate([run[name] for run in self.past])
@@ -176,6 +181,7 @@ class RigLimits:
             return {
                 name: _widen_range(*recorded_ranges[name], scales[name]) for name in recorded_ranges
             }
+        # 2. Limits of the model file.
         stated_channels = read_model_file_limits(self.evaluator).channels
         bounds = {}
         for name, (low, high) in recorded_ranges.items():

@@ -116,10 +116,13 @@ def apply_causes(
 ) -> ModifiedModel:
     """Apply fitted causes to a copy of a robot's model, and explain each change in a comment.
 
-    Causes that no model file can state, such as a sensor's bias, become notes.
+    1. Add the elements that causes need: couplings, contact pairs, elements in series.
+    2. Write each cause into the fields of the model. Causes that no model file can state, such as a
+       sensor's bias, become notes.
+    3. Change a copy of the editable model until it compiles to these fields.
 
     Args:
-        robot: robot as read from its model file; it is not changed.
+        robot: model of the robot as read from its file; it is not changed.
         causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
         recording: title of the recording to which they were fitted, for comments.
 
@@ -127,6 +130,7 @@ def apply_causes(
         InputError: the robot has no place of that name.
         RuntimeError: the model does not accept a change; this is a program error.
     """
+    # 1. Elements.
     fitted_causes = expand_families(robot, causes)
     notes = []
     couplings = {
@@ -139,6 +143,7 @@ def apply_causes(
         notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
         added = tuple((c.place, c.effect) for c in fitted_causes if _is_in_series(c))
         robot = prepare_flanks_for_file(add_series_joints(robot, added), series)
+    # 2. Fields.
     target_values = copy_model_fields(robot.compiled)
     comments: dict[ModelElement, list[str]] = {}
     applied_causes: list[FittedCause] = []
@@ -170,6 +175,7 @@ def apply_causes(
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
     spec, model = _compile_changed_spec(robot, target_values)
+    # 3. Compliant flanks need a second compilation.
     if any(is_compliant_flank(transmission)[0] for transmission in series.values()):
         # The solver parameters of compliant flanks depend on all causes, so they are computed
         # again.
@@ -230,15 +236,15 @@ def _write_cause(
     cause: FittedCause,
     series: Mapping[str, SeriesElement],
 ) -> str | None:
-    """Write a cause into the model fields; return None or a reason.
+    """Write a cause into the fields of the model; return None, or a note or reason for the user.
 
-    A reason that begins with + is a note about a cause that was written; otherwise the cause cannot
-    be stated in a model file.
+    A text that begins with + is a note about a cause that was written. Any other text is the reason
+    why a model file cannot state the cause.
 
     Args:
         target_values: fields of the model, changed in place.
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        cause: effect at a place with its fitted numbers.
+        cause: effect at a place with its fitted coefficients.
         series: elements in series, by place, that are not yet written.
     """
     # A coupling is an element of the robot, which has been added before.
@@ -278,9 +284,14 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
 
 
 def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any, Any]:
-    """Change a copy of the robot's spec until it compiles to the wanted fields.
+    """Change a copy of the robot's editable model until it compiles to the wanted fields.
 
-    Several rounds are needed, because a change may also modify values that should stay.
+    The compiler derives fields from attributes, so a change may also modify values that should
+    stay. Several rounds are needed:
+
+    1. Find the attributes whose fields differ from the wanted ones.
+    2. Set them, and compile the model.
+    3. Report an error if some still differ after the last round.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -293,14 +304,17 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
     by_id = SpecElements(spec, robot)
     tolerance = 0.0
     for _ in range(MAX_CORRECTION_ROUNDS):
+        # 1. Differences.
         statements = find_missing_statements(model, target_values, tolerance)
         if not statements:
             return spec, model
+        # 2. Changes.
         for statement in statements:
             set_attributes(by_id.get_element(statement.element), statement)
         if any(statement.element.kind == "body" for statement in statements):
             _keep_masses(spec, target_values)
         model, tolerance = spec.compile(), ROUNDING_TOLERANCE
+    # 3. Remaining differences.
     missing_statements = find_missing_statements(model, target_values, tolerance)
     if missing_statements:
         raise RuntimeError(f"{robot.path}: the model does not take {missing_statements[0]}")
@@ -352,14 +366,14 @@ class SpecElements:
 
 
 def set_attributes(element: Any, statement: AttributeStatement) -> None:
-    """Set the attributes of a statement in an element of a spec.
+    """Set attributes of an element of an editable MuJoCo model.
 
-    Values from MuJoCo's compiled model are converted to the form that the spec expects:
+    Values from the compiled model are converted to the form that the editable model expects:
     enumerations, flags, integers, degrees.
 
     Args:
-        element: element of a mujoco.MjSpec; it is changed in place.
-        statement: attributes in MuJoCo's units.
+        element: element of a `mujoco.MjSpec`; it is changed in place.
+        statement: attributes with their values in the units of the compiled model.
     """
     import mujoco
 

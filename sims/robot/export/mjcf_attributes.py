@@ -284,15 +284,14 @@ def find_missing_statements(
 def find_differing_statements(
     model: Any, present_values: Fields, target_values: Fields, tolerance: float
 ) -> list[AttributeStatement]:
-    """Find the attributes in which two sets of model fields differ.
+    """Find the attributes of a model file in which two sets of model fields differ.
 
-    The result is what has to be written into a model file so that it compiles to the wanted
-    fields.
+    These have to be written into the file so that it compiles to the wanted fields.
 
     Args:
         model: compiled model with the elements.
-        present_values: present fields.
-        target_values: wanted fields.
+        present_values: fields of the present model.
+        target_values: fields that the model should have.
         tolerance: relative difference that is ignored.
 
     Returns:
@@ -604,15 +603,20 @@ def _write_constant_force(
 ) -> UnstatableReason:
     """Write a constant force at a joint into the model, in N or N m.
 
-    A joint with a linear spring gets another rest position: force = stiffness times
-    displacement. Otherwise an actuator of the joint gets a bias, if no force limit would clip
-    it. The result is None, a note that begins with +, or the reason why neither is possible.
+    MuJoCo has no such element, so one of these is used:
+
+    1. A joint with a linear spring gets another rest position: force = stiffness times
+       displacement.
+    2. An actuator of the joint gets a bias, if no force limit would clip it.
+
+    Return None, a note that begins with +, or the reason why neither is possible.
 
     Args:
         fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        robot: model of the robot as read from its file.
+        cause: cause with its fitted force.
     """
+    # 1. Spring.
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
     tendon_count = robot.compiled.ntendon - len(robot.coupled)
@@ -625,6 +629,7 @@ def _write_constant_force(
     ):
         fields["qpos_spring"][0, joint.position] += force / stiffness
         return None
+    # 2. Actuator.
     for driving in robot.actuators:
         actuator = _Actuator(fields, robot, driving.name)
         is_uncoupled = joint.name not in robot.coupled

@@ -193,6 +193,8 @@ class XmlText:
     def _render_element(self, tag: XmlElement) -> bytes:
         """Return the text of an element with its comments, changed attributes and new elements.
 
+        All text that has not changed is kept byte for byte.
+
         Raises:
             NotEditableError: new elements belong into an element with a self-closing tag.
         """
@@ -388,10 +390,10 @@ class MjcfDocument:
         return elements
 
     def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
-        """Map element numbers of the compiled model to the elements of the text.
+        """Map the elements of the compiled model to those of the text.
 
-        Bodies, joints and actuators have the order of the text; geoms and contact pairs are found
-        by their names.
+        Bodies, joints and actuators are found by their order, which is that of the text; geoms and
+        contact pairs are found by their names.
 
         Args:
             model: Compiled model of MuJoCo.

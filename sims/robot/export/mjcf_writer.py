@@ -70,8 +70,11 @@ class MjcfWriter:
     def write(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
         """Write the attributes of one element into the document, and comments before the element.
 
+        How depends on the kind of the element: options and inertials may have to be created, and
+        actuators may need another element name.
+
         Args:
-            statement: element with the attributes and values that it needs.
+            statement: element with the attributes that change.
             comments: reasons for the change, in sentences.
         """
         element = statement.element
@@ -127,9 +130,9 @@ class MjcfWriter:
     ) -> None:
         """Write mass, centre of mass and inertia into the (perhaps new) inertial of a body.
 
-        Only attributes whose value changes are written, or all of them if the statement
-        insists on it. Other forms of the inertial's orientation are removed, because new
-        principal moments come with their own quaternion.
+        Only attributes whose value changes are written, or all of them if the statement insists on
+        it. Other forms of the inertial's orientation are removed, because new principal moments
+        come with their own quaternion.
         """
         values = format_attributes(statement.values)
         for child in self.document.children(body):
@@ -177,13 +180,13 @@ class MjcfWriter:
     def _format_actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
         """Return the attributes of an actuator as text, and keep its element name if possible.
 
-        Names such as position or motor are shortcuts for a general actuator. If the
-        shortcut cannot state the wanted values, the element becomes ``general`` with all
-        the attributes that it needs.
+        Element names such as ``position`` or ``motor`` are shortcuts for a general actuator. If the
+        shortcut cannot state the wanted values, the element becomes ``general`` with all the
+        attributes that it needs.
 
         Args:
-            tag: element of the actuator; its name may be changed.
-            statement: values to write.
+            tag: element of the actuator in the text; its name may be changed.
+            statement: attribute values to write.
         """
         changed = statement.values
         before = {} if statement.insisted else self._list_attributes_before(statement.element)
@@ -230,10 +233,10 @@ def _format_shortcut(
     changed: Mapping[str, Values],
     before: Mapping[str, Values],
 ) -> dict[str, str] | None:
-    """Return the gains of an actuator shortcut as attributes.
+    """Return the gains of an actuator shortcut as attributes; None if it cannot express the values.
 
-    A position actuator has force = kp (u - l) - kv l', and a velocity actuator kv (u - l'). The
-    wanted values fit only if gain and bias have these relations.
+    A position actuator has force = kp (u - l) - kv l', and a velocity actuator kv (u - l'), with
+    the control u and the actuator's position l. So gain and bias must have these relations.
 
     Args:
         name: name of the shortcut, such as ``position``.

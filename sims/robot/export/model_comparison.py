@@ -17,12 +17,13 @@ _IGNORED_NAME_PARTS = ("name", "path", "text", "signature", "tex_data", "nbuffer
 
 
 def format_spec(spec: Any, folder: Path) -> str:
-    """Format a spec as MJCF with full precision and absolute asset folders.
+    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
 
-    Angles and other values keep the notation in which the model file states them.
+    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
+    the notation of the model file.
 
     Args:
-        spec: a compiled mujoco.MjSpec; it must not be used afterwards.
+        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
         folder: folder to which the paths of its assets are relative.
 
     Returns:

@@ -116,13 +116,12 @@ Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
 
 
 def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
-    """Return the numbers of the model file before and after all effects are applied.
+    """Return the values of the model file before and after all effects are applied, for the report.
 
-    Several effects may change one number, such as the mass and the inertia of one body; a total
-    includes all of them.
+    Several effects may change one value, such as the mass of a body; a total includes all of them.
 
     Args:
-        robot: robot with the model file.
+        robot: model of the robot as read from its file.
         fitted: effects with their coefficients.
 
     Returns:
@@ -172,13 +171,13 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
 def _list_totals(
     robot: RobotModel, effect: type[Effect], count: int, file_fields: Fields, changed_fields: Fields
 ) -> list[Total | None]:
-    """Return what the numbers of the file become with one effect, for each of its coefficients.
+    """Return the values of the model file before and after one effect.
 
-    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. The
-    result is None where the file has no such number.
+    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. Return None
+    where the file has no such value.
 
     Args:
-        robot: robot with the model file.
+        robot: model of the robot as read from its file.
         effect: effect at one place.
         count: number of coefficients.
         file_fields: fields of the model file.

@@ -91,11 +91,13 @@ def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
     """Check that a written URDF loads as the model with all causes that a URDF can express.
 
-    Fields, inertia tensors and a test motion are compared; contacts and friction stiffness, which a
-    URDF cannot state, are left out.
+    1. Apply the causes that a URDF can state to the original model.
+    2. Load the written URDF.
+    3. Compare fields, inertia tensors and a test motion. Contacts and friction stiffness, which a
+       URDF cannot state, are left out.
 
     Args:
-        robot: the robot as read from its URDF.
+        robot: model of the robot as read from its URDF.
         causes: coefficients of all causes.
         path: path of the written URDF.
 
@@ -105,13 +107,16 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     from sims.robot.export.urdf_writer import UrdfWriter
     from sims.robot.parsing.read_model_file import read_robot
 
+    # 1. Original model with the causes.
     writer = UrdfWriter(robot, "")
     urdf_causes = {
         c.name: c.numbers for c in expand_families(robot, causes) if writer.write(c) is None
     }
     target_model = apply_causes(read_robot(robot.path), urdf_causes).model
     release_free_memory()
+    # 2. Written URDF.
     reloaded_model = read_robot(path).compiled
+    # 3. Comparison.
     for name in _URDF_FIELDS:
         reloaded_values, target_values = getattr(reloaded_model, name), getattr(target_model, name)
         if reloaded_values.shape != target_values.shape or not np.allclose(

@@ -82,13 +82,13 @@ def _check_actuator_table(
 ) -> None:
     """Check the table of an added actuator: its joint, kind, name and gains.
 
-    `kp`, `ki` and `kv` are gains on position, integral and velocity; `kd` acts on the rate of the
-    error.
+    A message names the table, the wrong entry and what is expected. `kp`, `ki`
+    and `kv` are gains on position, integral and velocity; `kd` acts on the rate of the error.
 
     Args:
-        spec: a mujoco.MjSpec with the joints and actuators of the file.
+        spec: editable MuJoCo model (`mujoco.MjSpec`) with the joints and actuators of the file.
         source: beginning of error messages.
-        table_name: place of the table in the recording's description.
+        table_name: name of the table, for error messages.
         name: name of the new actuator.
         table: entries of the table.
 
@@ -136,10 +136,10 @@ def _has_one_degree_of_freedom(joint: Any) -> bool:
 
 
 def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
-    """Add an actuator to the spec from its checked table: motor, position, velocity or PID.
+    """Add an actuator to a MuJoCo model from its checked table: motor, position, velocity or PID.
 
     Args:
-        spec: Editable model of MuJoCo (`MjSpec`).
+        spec: Editable MuJoCo model (`mujoco.MjSpec`), changed in place.
         name: Name of the actuator.
         table: Table ``[actuators.NAME]`` of the description: kind, joint, gains, gear and ranges.
     """

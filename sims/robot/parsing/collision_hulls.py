@@ -91,26 +91,33 @@ class Hull:
 
 
 def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull | None:
-    """Read the hull of a compiled mesh.
+    """Read the convex hull of a compiled mesh, which is all that contacts read of it.
 
-    The hull is all that contacts read of a mesh. A reduced model that contains it needs less
-    memory, and its contacts are bitwise equal.
+    A reduced model that contains the hull needs less memory, and its contacts are bitwise equal.
+
+    1. Read the graph of the hull's edges.
+    2. Renumber its vertices, so that the others can be left out.
+    3. Read the polygons of the hull.
 
     Args:
-        model: the mujoco.MjModel.
-        mesh: number of the mesh.
+        model: compiled MuJoCo model (`mujoco.MjModel`).
+        mesh: index of the mesh.
         keeps_all_vertices: keep vertices that are not on the hull, and the numbers of all vertices.
 
     Returns:
         The hull; None if the mesh has none, since no geom with it collides.
     """
+    # 1. Graph.
     # MuJoCo's graph: the numbers of vertices and faces, then per vertex the address of its edges
     # and its number in the mesh, then the edges, then three vertices for each face.
-    begin = int(model.mesh_graphadr[mesh])
-    if begin < 0:
+    graph_address = int(model.mesh_graphadr[mesh])
+    if graph_address < 0:
         return None
-    vertex_count, face_count = model.mesh_graph[begin : begin + 2].tolist()
-    graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * vertex_count + 6 * face_count].copy()
+    vertex_count, face_count = model.mesh_graph[graph_address : graph_address + 2].tolist()
+    graph: Integers = model.mesh_graph[
+        graph_address : graph_address + 2 + 3 * vertex_count + 6 * face_count
+    ].copy()
+    # 2. Vertices.
     all_vertices = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
     # The vertices keep their order, as MuJoCo may compare the numbers of two vertices.
     kept_vertices = (
@@ -125,8 +132,9 @@ def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull |
         slice(graph.size - 3 * face_count, graph.size),
     ):
         graph[vertex_entries] = new_numbers[graph[vertex_entries]]
-    first = int(model.mesh_polyadr[mesh])
-    polygon_rows = slice(first, first + int(model.mesh_polynum[mesh]))
+    # 3. Polygons.
+    first_polygon = int(model.mesh_polyadr[mesh])
+    polygon_rows = slice(first_polygon, first_polygon + int(model.mesh_polynum[mesh]))
     vertex_rows = int(model.mesh_vertadr[mesh]) + kept_vertices
     polygons = _gather_lists(
         model.mesh_polyvert,
@@ -231,10 +239,13 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
 
 
 def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull]) -> None:
-    """Add meshes that reserve memory for `write_hulls` in compiled models, if there is too little.
+    """Add meshes to a MuJoCo model so that its arrays are large enough for `write_hulls`.
+
+    MuJoCo computes its own hulls when it compiles, which can have fewer elements than the original
+    ones. The additional meshes, a sphere and a pyramid, reserve the difference.
 
     Args:
-        spec: the mujoco.MjSpec with the meshes of `add_hull`; it is changed in place.
+        spec: editable MuJoCo model with the meshes of `add_hull`; it is changed in place.
         model: model compiled from `spec`.
         full_model: model with the whole meshes.
         hulls: hulls by name of the mesh.
@@ -282,10 +293,10 @@ def has_large_enough_buffers(model: Any, full_model: Any) -> bool:
 
 
 def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
-    """Replace the hulls that MuJoCo's compiler has computed.
+    """Replace the hulls that MuJoCo's compiler has computed by those of the original meshes.
 
-    The compiler computes them from rounded vertices, so that contacts would differ in their eighth
-    digit from those of the original meshes.
+    The compiler computes them from rounded vertices, so contacts would differ in their eighth
+    digit. The data of all hulls are written one after another into MuJoCo's arrays.
 
     Args:
         model: model compiled from a spec with meshes of `add_hull` and `add_memory_reserve`.
@@ -377,14 +388,16 @@ OVERLAP_DEPTH = 1e-4
 
 
 def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
-    """Exclude spurious contacts from a spec.
+    """Exclude contacts of bodies that a model file lets overlap by construction.
 
+    They would exert large forces that a real robot does not have. These are contacts between the
+    fixed base and the bodies attached to it, and between bodies that overlap at the zero position.
     MuJoCo itself excludes contacts between a body and its parent, except if the parent is the
     world; the root of a URDF is fused to the world.
 
     Args:
-        spec: the mujoco.MjSpec; it is changed in place.
-        model: the compiled model of `spec`.
+        spec: editable MuJoCo model (`mujoco.MjSpec`), changed in place.
+        model: compiled model of `spec`.
 
     Returns:
         Notes, one for each kind of excluded contact.

@@ -26,13 +26,14 @@ UNKNOWN_LENGTH = 0.1
 
 
 def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
-    """Return the limits of the offset of a body's centre of mass.
+    """Return the limits of the offset of a body's centre of mass, as the link's size allows it.
 
-    The limits are a box that contains the geoms and sites of the link and the joints of its child
-    links. A link without any is assumed to be as long as its distance from its parent.
+    A fitted offset outside them would put the centre of mass outside the link. The limits are a box
+    that contains the geoms and sites of the link and the joints of its child links. A link without
+    any is assumed to be as long as its distance from its parent.
 
     Args:
-        robot: robot with the body.
+        robot: model of the robot.
         body: name of the body.
 
     Returns:
@@ -55,24 +56,24 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     return box
 
 
-def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
+def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]:
     """Yield the points of a link, in its own frame, that its box must contain.
 
-    They are its origin, its specified centre of mass, the corners of its geoms, its sites, such as
+    They are its origin, its stated centre of mass, the corners of its geoms, its sites, such as
     those of rotors, and the origins of its child bodies.
 
     Args:
         model: compiled model.
-        data: its state at the reference pose.
-        number: number of the body.
+        data: MuJoCo data at the reference pose.
+        body_id: index of the body.
     """
     import mujoco
 
-    origin, axes = data.xpos[number], data.xmat[number].reshape(3, 3)
+    origin, axes = data.xpos[body_id], data.xmat[body_id].reshape(3, 3)
     yield np.zeros(3)
-    yield model.body_ipos[number]
+    yield model.body_ipos[body_id]
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-    for body in _list_fixed_bodies(model, number):
+    for body in _list_fixed_bodies(model, body_id):
         yield axes.T @ (data.xpos[body] - origin)
         for site in np.flatnonzero(model.site_bodyid == body):
             yield axes.T @ (data.site_xpos[site] - origin)
@@ -137,9 +138,10 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
 
 
 def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
-    """Return the observable axes of body `number` of a compiled model, see `observable_axes`.
+    """Return the axes along which an offset of a body's centre of mass changes the motion.
 
-    `axes` collects, in world coordinates, the hinge axes between the body and the world.
+    A body that rotates about parallel hinges only shows no offset along them. `axes` collects, in
+    world coordinates, the hinge axes between the body and the world. See `observable_axes`.
     """
     import mujoco
 
@@ -193,12 +195,13 @@ MAX_UNOBSERVABLE_SHARE = 1e-6
 def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     """Return the axes of a body's frame about which a tilt of a joint's axis changes the motion.
 
-    The frame axis nearest to the joint's own axis is omitted, since the two others give every
-    direction. A tilt out of the plane of a planar mechanism changes nothing to first order, so it
-    is omitted as well: forces of gravity, velocity and inertia are compared in random poses.
+    Only such tilts can be fitted. The frame axis nearest to the joint's own axis is omitted, since
+    the two others give every direction. A tilt out of the plane of a planar mechanism changes
+    nothing to first order, so it is omitted as well: the joint forces with and without a tilt are
+    compared in random states.
 
     Args:
-        robot: robot with the joint.
+        robot: model of the robot.
         name: name of a joint with one coordinate.
 
     Returns:
@@ -230,11 +233,12 @@ def _normalise(vector: Array) -> Array:
 def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array:
     """Return bias forces and inertia matrices in fixed random states, as one vector.
 
-    If a change of the model changes none of these numbers, it changes no motion.
+    They determine the motion. So a change of the model that changes none of these numbers cannot be
+    observed.
 
     Args:
         model: compiled model.
-        joints: joints that are moved.
+        joints: joints that have random positions.
     """
     import mujoco
 

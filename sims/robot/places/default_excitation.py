@@ -125,7 +125,9 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
 def _compute_reference_forces(
     robot: RobotModel, joints: Sequence[Joint]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the holding force of each joint in the reference pose, and a force amplitude.
+    """Return the force that holds each joint in the reference pose, and the amplitude of a force.
+
+    A motor's command is the holding force plus an oscillation that would move a free joint visibly.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -173,14 +175,15 @@ def _make_command(
 ) -> ExcitationCommand:
     """Make a sinusoidal command of an actuator that moves its joint within all limits.
 
-    Position and velocity servos receive a motion instead of a force.
+    A servo receives a position or a velocity, a motor a force. The centre of the oscillation is
+    moved if the control range leaves it no room.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        actuator: the actuator.
+        actuator: actuator that receives the command.
         joint: joint of the actuator.
         holding: force that holds the reference pose, N or N m.
-        force: amplitude of a force that would move the joint, N or N m.
+        force: amplitude of a force that would move the joint visibly, N or N m.
     """
     model = robot.compiled
     start = float(model.qpos0[joint.position])

@@ -101,10 +101,11 @@ def make_world_effect(effect: type[Effect]) -> type[Effect]:
 
 
 def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[Effect]:
-    """Make the class of a registered effect at one joint, actuator, body or channel.
+    """Make the class of a registered effect at one joint, actuator, body or channel of a robot.
 
-    It has the units and plausible ranges that apply there, and methods that read and write only
-    the coordinate or the signal of that place.
+    A registered effect is written for a system of one coordinate. The class passes it the
+    coordinate or the signal of its place only, and has the units and plausible ranges that apply
+    there.
     """
     tilts = effect_place.tilts if effect.name == "joint.axis" else None
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
@@ -258,8 +259,8 @@ def _make_taking_method(
 
         Args:
             _: the armature effect; unused.
-            c: coefficients of the richer effect.
-            simpler: name of the simpler effect.
+            c: coefficients of the flexible joint.
+            simpler: name of the effect that the flexible joint replaces.
             armature: coefficient of the armature effect, kg m² or kg.
         """
         if simpler != drive:
@@ -294,17 +295,17 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
         Shapes: L batch elements, D joints, K coefficients.
 
         Args:
-            self: the effect at its joint.
+            self: effect at its joint.
             c: (K, L, 1) coefficients.
             moment: state of the robot.
             state: hidden state of the effect.
         """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
-        result = np.zeros_like(moment.x)
+        forces = np.zeros_like(moment.x)
         force, rate = effect.act(self, c, joint_snapshot, state)
-        result[:, joint] = force[:, 0]
-        return result, rate
+        forces[:, joint] = force[:, 0]
+        return forces, rate
 
     return act
 
@@ -361,14 +362,14 @@ def _create_placed_effect(
     coefficients: Sequence[Coefficient],
     changed: Mapping[str, Any],
 ) -> type[Effect]:
-    """Create a subclass of an effect that acts at one place, or at all of them.
+    """Create a subclass of a registered effect that acts at one place of a robot, or at all places.
 
     Args:
         effect: registered effect.
         name: name of the new class, such as ``drag.linear@elbow``.
         place: name of the place; empty for an effect of the world.
         coefficients: coefficients with units and ranges for this place.
-        changed: attributes and methods that differ from those of `effect`.
+        changed: attributes and methods that differ from those of `effect`, by name.
     """
     contains = (
         tuple(f"{contained_effect}@{place}" for contained_effect in effect.contains)
@@ -396,16 +397,21 @@ def _unify_units(c: Coefficient) -> Coefficient:
 
 
 def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPlace) -> Coefficient:
-    """Give a coefficient the unit, plausible range and limits that apply at a place.
+    """Return a coefficient with the unit, plausible range and limits that apply at a place.
 
-    Ranges of forces are scaled with the typical force of the joint. If the file specifies a
-    value, the coefficient is a difference from it, limited so that the total is not negative.
+    1. Find the unit of the place, such as N·m at a hinge.
+    2. Scale ranges of forces with the typical force of the joint, since the ranges of the library
+       refer to small joints.
+    3. If the model file states a value, the coefficient is a difference from it: limit it so that
+       the total is not negative.
+    4. Apply the limits of the place, such as those of a link's size.
 
     Args:
         effect: class of the effect.
-        c: its coefficient, as declared in the library.
-        effect_place: the place, with the values of the model file.
+        c: coefficient as declared in the library.
+        effect_place: place, with the values that the model file states there.
     """
+    # 1. Unit.
     system_kind = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
     unit, (low, high) = c.units[system_kind], c.plausible[system_kind]
     lower_limit = c.least
@@ -413,6 +419,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         unit = c.of.replace("error", "input").replace("input", effect_place.unit)
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", effect_place.unit)
+    # 2. Scale.
     # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
     if unit is None:
         unit = "1"
@@ -425,6 +432,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         high = 3.0 * effect_place.inertia
     if c.of == "give":
         high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)
+    # 3. Total.
     upper_limit = c.most
     has_total = effect.at == "joint" or effect.name in EFFECTS_WITH_TOTAL
     file_value = effect_place.stated.get(effect.name) if has_total else None
@@ -433,6 +441,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         # file.
         high = max(high, 2.0 * abs(file_value))
         low = lower_limit = min(0.0 - file_value, 0.0)
+    # 4. Limits of the place.
     if effect.name == "payload" and c.name == "mass":
         high = MAX_PAYLOAD_SHARE * effect_place.mass
     if c.name in effect_place.limits.get(effect.name, {}):
@@ -456,10 +465,12 @@ def make_effect_classes(
 ) -> Iterator[type[Effect]]:
     """Yield the classes of an effect at all places of a robot, followed by its family.
 
+    A family is one effect at all places together; searches test it before its members.
+
     Args:
         effect: registered effect.
         places: places of the robot by kind.
-        native: effects that the engine writes into the model.
+        native: names of effects that the engine writes into the model.
         compiles: returns whether the model with an effect at one place compiles.
     """
     if effect.at == "world":
@@ -502,8 +513,8 @@ def _acts_at(
 ) -> bool:
     """Return whether a place has the quantity that an effect changes.
 
-    `places` lists all places by kind. An actuator effect needs a joint with an actuator, for
-    example, and a servo effect a position servo.
+    For example, a servo effect needs a position servo, and an effect of a drive needs a joint with
+    an actuator. `places` lists all places by kind.
     """
     if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[effect_place.kind]) is None:
         return False

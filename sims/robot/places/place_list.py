@@ -210,10 +210,13 @@ def list_places(
 
 
 def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> EffectPlace:
-    """Make the place of a contact.
+    """Return the contact of two geoms as a place at which effects can act.
+
+    It has the friction that the model file states, and how much softer or stiffer the contact may
+    become.
 
     Args:
-        robot: robot with the geoms.
+        robot: model of the robot.
         pair: name of the pair of geoms.
         pairs: pairs whose contacts get parameters of their own in the same model.
 
@@ -349,11 +352,12 @@ def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float
 def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     """Return the groups of joints that constraints of a MuJoCo model couple.
 
-    A `connect` or `weld` constraint couples the joints between its two bodies and their common
-    ancestor. A joint equality couples its two joints.
+    Their motions are not independent, so effects at them may be indistinguishable. A `connect` or
+    `weld` constraint couples the joints between its two bodies and their common ancestor. A joint
+    equality couples its two joints.
 
     Args:
-        model: the mujoco.MjModel.
+        model: compiled MuJoCo model (`mujoco.MjModel`).
         dofs: index of the degree of freedom of each joint.
 
     Returns:
@@ -367,15 +371,24 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     groups: list[set[int]] = []
     for constraint in range(model.neq):
         kind = int(model.eq_type[constraint])
-        first, second = int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])
+        first_object, second_object = (
+            int(model.eq_obj1id[constraint]),
+            int(model.eq_obj2id[constraint]),
+        )
         if kind == int(constraint_types.mjEQ_JOINT):
-            coupled_dofs = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
+            coupled_dofs = [
+                int(model.jnt_dofadr[joint])
+                for joint in (first_object, second_object)
+                if joint >= 0
+            ]
         elif kind in (int(constraint_types.mjEQ_CONNECT), int(constraint_types.mjEQ_WELD)):
             if int(model.eq_objtype[constraint]) == int(object_types.mjOBJ_SITE):
-                first, second = (int(model.site_bodyid[site]) for site in (first, second))
+                first_object, second_object = (
+                    int(model.site_bodyid[site]) for site in (first_object, second_object)
+                )
             first_ancestors, second_ancestors = (
-                _list_ancestors(model, first),
-                _list_ancestors(model, second),
+                _list_ancestors(model, first_object),
+                _list_ancestors(model, second_object),
             )
             coupled_dofs = [
                 dof
