@@ -924,12 +924,14 @@ def _get_noise_of_states(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Ar
     """Return the noise (D,) of positions, and that of velocities if they are differences of these.
 
     Args:
-        evaluator: the runs of a robot on the ground, whose joints are recorded.
+        evaluator: the runs of a robot. A joint without readings, in a closed loop, has no noise.
         noise: sensor noise of each channel.
     """
     channels = list(evaluator.channels)
     names = evaluator.simulator.system.coordinates
-    positions = np.array([noise.sigma[channels.index(name)] for name in names])
+    positions = np.array(
+        [noise.sigma[channels.index(name)] if name in channels else 0.0 for name in names]
+    )
     return positions, positions / evaluator.sample_interval
 
 

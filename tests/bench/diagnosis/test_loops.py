@@ -41,9 +41,9 @@ NOISE = 3e-4
 
 
 def write_log(folder, planted_damping):
-    """Write three runs of 1.5 s by plain MuJoCo; the encoders are at hip and crank alone."""
+    """Write three runs of 3 s by plain MuJoCo; the encoders are at hip and crank alone."""
     rng, runs = np.random.default_rng(5), {}
-    times = np.arange(151) / 100
+    times = np.arange(301) / 100
     for name in ("1", "2", "3"):
         model = mujoco.MjModel.from_xml_string(LEG)
         model.dof_damping[model.joint("knee").dofadr[0]] += planted_damping
