@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from bench.diagnosis import explain as explaining
-from bench.diagnosis.pipeline import base_model
 from tests.exams.robot_files import write_robot_recording
 
 NOISE = 5e-4
@@ -76,8 +75,3 @@ def test_a_planted_damping_is_found_in_pieces(tmp_path):
 def test_nothing_is_missing_where_nothing_was_planted(tmp_path):
     path = write_log(tmp_path, STATED)
     assert explaining.explain(path).verdict == "adequate"
-
-
-def test_whole_runs_are_not_followed_without_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr(base_model, "MAX_RUN_AMPLIFICATION", np.inf)
-    assert explaining.explain(write_log(tmp_path, STATED)).verdict != "adequate"
