@@ -37,7 +37,7 @@ MAX_RUN_AMPLIFICATION = 1000.0
 """Maximum factor by which whole runs may amplify an error of their first positions."""
 MAX_SEGMENT_AMPLIFICATION = 100.0
 """Maximum factor by which segments may amplify an error of their first positions."""
-MIN_REFITTED_RESIDUAL = 1.1
+MIN_REFITTED_RESIDUAL = 1.05
 """Minimum RMS residual, in units of the noise, at which first states are fitted again."""
 MIN_UNFOLLOWED_RESIDUAL = 3.0
 """Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""

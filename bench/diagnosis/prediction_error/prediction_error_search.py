@@ -191,6 +191,9 @@ class PredictionErrorSearch(EffectSearch):
             best = self._add_missing_effects(best, selected, friction)
         best = fit_single_in_place(context, best)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
+            # These effects are fitted from other first states, which must not be their only gain.
+            best = select_more_likely(best, self.refit_first_states(self.base_model))
+        if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)

@@ -129,7 +129,9 @@ class HeldOutRuns:
         """Predict the held-out runs with each model; see `fit_initial_states`."""
         return self.fit_initial_states([fit.theta for fit in fits])
 
-    def fit_initial_states(self, thetas: Sequence[Array]) -> list[HeldOutFit]:
+    def fit_initial_states(
+        self, thetas: Sequence[Array], is_staged: bool = False
+    ) -> list[HeldOutFit]:
         """Simulate the runs with each parameter vector (P,) and fit their initial states.
 
         Least squares may converge to a different minimum for similar models, and chance would then
@@ -137,10 +139,15 @@ class HeldOutRuns:
         initial states, and the better fit counts.
 
         Shapes: P parameters.
+
+        Args:
+            thetas: parameters of each model.
+            is_staged: whether to fit ever longer parts of the runs even if a fit to whole runs
+                comes near the noise.
         """
         guess = self.evaluator.initial_state_guesses
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
-        is_filtered = self.evaluator.filtered_runs is not None
+        is_filtered = self.evaluator.filtered_runs is not None and not is_staged
         fits = self._fit_initial_states(
             initial_starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
         )
@@ -290,7 +297,7 @@ def find_first_states(
     """
     derivatives_before = evaluator.state_derivatives
     runs = HeldOutRuns(evaluator, noise)
-    (prediction,) = runs.fit_initial_states([fit.theta])
+    (prediction,) = runs.fit_initial_states([fit.theta], is_staged=True)
     squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
     evaluator.state_derivatives = derivatives_before
     if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
