@@ -103,9 +103,10 @@ def test_friction_that_nearly_explains_is_compared_with_its_soft_form_before_oth
         monkeypatch.setattr(prediction_error_search, name, function)
     monkeypatch.setattr(PredictionErrorSearch, "_identify_servos", lambda *_: None)
     search = object.__new__(PredictionErrorSearch)
-    search.is_form_given = True
+    search.is_form_given, search.models = True, {frozenset(): friction}
     search.__dict__["_search_context"] = SimpleNamespace(
-        columns=SimpleNamespace(select=lambda: None)
+        columns=SimpleNamespace(select=lambda: None),
+        filters=SimpleNamespace(base=SimpleNamespace(is_on_ground=False)),
     )
     with pytest.raises(expected):
         search._search_effects()
