@@ -65,7 +65,9 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
     """
     search, evaluator = context.search, context.evaluator
     if context.filters.base.is_on_ground:
-        start = context.filters.estimate_start(start)
+        # Another radius or mass has contacts of another depth.
+        settled = context.filters.base.settle(start.theta, start.initial_states)
+        start = replace(start, initial_states=settled)
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
