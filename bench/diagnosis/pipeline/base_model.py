@@ -156,6 +156,9 @@ class BaseModel:
         runs, followed = self.runs, self.runs.fitting.filtered_runs
         if followed is None or followed.has_missing_force or not self.is_usable:
             return self
+        # First states of a robot on the ground are those with settled contacts.
+        if followed.is_on_ground:
+            return self
         if self.rate()[1] < MIN_REFITTED_RESIDUAL:
             return self
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)

@@ -274,6 +274,9 @@ class PredictionErrorSearch(EffectSearch):
         """Refit the first states of a model that leaves more than noise; see `simulated_fits`."""
         if not np.isfinite(model.fit.cost) or is_at_noise(self._search_context, model):
             return model
+        # First states of a robot on the ground are those with settled contacts.
+        if self._search_context.filters.base.is_on_ground:
+            return model
         return refit_first_states(self._search_context, model)
 
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
