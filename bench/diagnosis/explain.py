@@ -143,7 +143,7 @@ def _diagnose(
             except DivergingSimulationError as error:
                 if not may_divide:
                     raise
-                retried = [s for s in retried if s <= error.longest_segment] or retried[-1:]
+                retried = [s for s in retried if s <= error.longest_segment]
             else:
                 yield diagnosis
                 return

@@ -99,12 +99,17 @@ def score_model(
         evaluator.close()
         return evaluator, squares, sigma
 
+    def compute_cost(scored: tuple[RunEvaluator, Array, Array]) -> float:
+        """Return the sum of squared errors in units of the noise of each channel."""
+        _, squares, sigma = scored
+        return float((squares / np.square(sigma)).sum())
+
     scores = [score(recording_used)]
-    filled, note = fill_lost_commands(recording_used)
-    if note and kind.has_model:
-        # Commands of lost rows were held or sent; the smaller error tells.
-        scores.append(score(filled))
-    evaluator, squares, sigma = min(scores, key=lambda one: float(one[1].sum()))
+    if kind.has_model:
+        filled, note = fill_lost_commands(recording_used)
+        # Commands of lost rows were held or sent; the smaller error tells which.
+        scores += [score(filled)] if note else []
+    evaluator, squares, sigma = min(scores, key=compute_cost)
     if not np.isfinite(squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
     return _summarise_errors(evaluator, squares, sigma)

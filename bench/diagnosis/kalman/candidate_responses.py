@@ -562,16 +562,17 @@ class FollowedRuns:
             seconds: duration of the segments; whole runs by default.
         """
         samples = self.runs.residuals.shape[1]
-        interval = self.evaluator.runs[0].times[1] - self.evaluator.runs[0].times[0]
-        length = int(min(max(seconds / interval, 1.0) + 1, samples))
+        length = int(min(max(seconds / self.evaluator.sample_interval, 1.0) + 1, samples))
         segments = self if length == samples else replace(self, runs=self.runs.segments(length))
-        joints = len(self.linear[0].trajectory.x[0])
-        errors = np.zeros((len(segments.runs.residuals), self.runs.prior.size, joints))
-        errors[:, np.arange(joints), np.arange(joints)] = _get_noise_of_states(
-            self.evaluator, self.noise
-        )[0]
+        channels = list(self.evaluator.channels)
+        coordinates = self.evaluator.simulator.system.coordinates
+        # Joints of a closed loop may have no readings.
+        recorded = [i for i, name in enumerate(coordinates) if name in channels]
+        sigma = self.noise.sigma[[channels.index(coordinates[i]) for i in recorded]]
+        errors = np.zeros((len(segments.runs.residuals), self.runs.prior.size, len(recorded)))
+        errors[:, recorded, np.arange(len(recorded))] = sigma
         changes = segments._propagate_without_gain(errors) / self.noise.sigma[:, None]
-        return float(np.abs(changes).max())
+        return float(np.abs(changes).max(initial=0.0))
 
     def sensitivities(self, columns: Columns) -> Array:
         """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
@@ -881,14 +882,12 @@ def _get_noise_of_states(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Ar
     """Return the noise (D,) of positions, and that of velocities if they are differences of these.
 
     Args:
-        evaluator: the runs of a robot. A joint without readings, in a closed loop, has no noise.
+        evaluator: the runs of a robot on the ground, whose joints are recorded.
         noise: sensor noise of each channel.
     """
     channels = list(evaluator.channels)
     names = evaluator.simulator.system.coordinates
-    positions = np.array(
-        [noise.sigma[channels.index(name)] if name in channels else 0.0 for name in names]
-    )
+    positions = np.array([noise.sigma[channels.index(name)] for name in names])
     return positions, positions / evaluator.sample_interval
 
 

@@ -156,9 +156,6 @@ class BaseModel:
         runs, followed = self.runs, self.runs.fitting.filtered_runs
         if followed is None or followed.has_missing_force or not self.is_usable:
             return self
-        # First states of a robot on the ground are those with settled contacts.
-        if followed.is_on_ground:
-            return self
         if self.rate()[1] < MIN_REFITTED_RESIDUAL:
             return self
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
@@ -178,9 +175,8 @@ class BaseModel:
         followed = self.runs.fitting.filtered_runs
         if followed is None or not self.is_usable:
             return None
-        if self.rate()[1] < MIN_UNFOLLOWED_RESIDUAL:
-            return None
-        if not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
+        is_followed = self.rate()[1] < MIN_UNFOLLOWED_RESIDUAL
+        if is_followed or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
             return None
         for seconds in SEGMENT_DURATIONS:
             if followed.compute_amplification(seconds) <= MAX_SEGMENT_AMPLIFICATION:

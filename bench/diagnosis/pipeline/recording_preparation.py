@@ -148,8 +148,10 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     A logger may have lost a row whose command was sent, or the controller may have sent none, so
     that the previous command was held. The innovations of the filter tell them apart.
     """
+    if not runs.kind.has_model:
+        return runs
     filled, note = fill_lost_commands(runs.recording)
-    if not note or not runs.kind.has_model:
+    if not note:
         return runs
     count = sum(
         new.times.size - old.times.size

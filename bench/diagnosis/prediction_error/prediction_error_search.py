@@ -76,7 +76,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_at_noise,
     is_explained,
     is_nearly_explained,
-    refit_first_states,
     remove_idle_effects,
     select_lowest_of_each,
     select_more_likely,
@@ -91,6 +90,7 @@ from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.score_test import CandidateScores
 from bench.diagnosis.search.start_value_selection import add_effect_to_start
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
+from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6
@@ -271,13 +271,21 @@ class PredictionErrorSearch(EffectSearch):
         return best
 
     def refit_first_states(self, model: FittedModel) -> FittedModel:
-        """Refit the first states of a model that leaves more than noise; see `simulated_fits`."""
+        """Fit a model that leaves more than noise again from better first states, if there are any.
+
+        A joint that sticks, or a motion that amplifies errors, may leave the first states of a run
+        in a local minimum, which looks like a missing effect.
+
+        Args:
+            model: the fitted model.
+
+        Returns:
+            The refitted model, or `model` if it is as good.
+        """
         if not np.isfinite(model.fit.cost) or is_at_noise(self._search_context, model):
             return model
-        # First states of a robot on the ground are those with settled contacts.
-        if self._search_context.filters.base.is_on_ground:
-            return model
-        return refit_first_states(self._search_context, model)
+        start = find_first_states(self.evaluator, self.noise, model.fit)
+        return model if start is None else select_more_likely(model, self.fit_one(start))
 
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""

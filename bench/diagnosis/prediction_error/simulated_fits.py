@@ -25,7 +25,6 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
@@ -83,23 +82,6 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
         if has_dry_friction(evaluator, [name]) and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)
     return fitted
-
-
-def refit_first_states(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Fit a model again from first states that are fitted to ever longer parts of the runs.
-
-    A joint that sticks, or a motion that amplifies errors, may leave the first states of a run in a
-    local minimum, which looks like a missing effect.
-
-    Args:
-        context: context of the search.
-        model: the fitted model.
-
-    Returns:
-        The refitted model, or `model` if it is as good.
-    """
-    start = find_first_states(context.evaluator, context.search.noise, model.fit)
-    return model if start is None else select_more_likely(model, context.search.fit_one(start))
 
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:

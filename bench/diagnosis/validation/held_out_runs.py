@@ -288,13 +288,16 @@ def find_first_states(
     """Return a start with better first states of fitted runs, None if there are none.
 
     They are fitted to ever longer parts of the runs, as those of held-out runs, with the parameters
-    of the fit.
+    of the fit. A robot on the ground keeps its first states, those with settled contacts.
 
     Args:
         evaluator: the fitted runs.
         noise: noise that weights the channels.
         fit: fit of these runs.
     """
+    followed = evaluator.filtered_runs
+    if followed is not None and followed.is_on_ground:
+        return None
     derivatives_before = evaluator.state_derivatives
     runs = HeldOutRuns(evaluator, noise)
     (prediction,) = runs.fit_initial_states([fit.theta], is_staged=True)

@@ -96,11 +96,6 @@ class LostSamples(NamedTuple):
     counts: NDArray[np.intp]
     jitter: float
 
-    @property
-    def total(self) -> int:
-        """Number of lost samples."""
-        return int(self.counts.sum())
-
 
 def find_lost_samples(times: Array) -> LostSamples:
     """Find lost samples: intervals that are a multiple of the median interval.
@@ -154,10 +149,10 @@ def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
         counts: (T - 1,) number of samples to insert into each interval.
     """
     first = np.repeat(np.arange(counts.size), counts)
-    before = np.cumsum(counts) - counts
-    shares = (np.arange(first.size) - before[first] + 1.0) / (counts[first] + 1.0)
-    times = run.times[first] + shares * np.diff(run.times)[first]
-    places = first + 1
+    inserted_before = np.cumsum(counts) - counts
+    fractions = (np.arange(first.size) - inserted_before[first] + 1.0) / (counts[first] + 1.0)
+    times = run.times[first] + fractions * np.diff(run.times)[first]
+    indices = first + 1
 
     def interpolate(values: Array) -> Any:
         """Return a local cubic interpolation, which does not overshoot where commands jump."""
@@ -168,11 +163,11 @@ def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
 
     def insert(signals: Mapping[str, Any], values: Callable[[Any], Any]) -> dict[str, Any]:
         """Insert the values that a function gives for each signal."""
-        return {name: np.insert(old, places, values(old)) for name, old in signals.items()}
+        return {name: np.insert(old, indices, values(old)) for name, old in signals.items()}
 
     return replace(
         run,
-        times=np.insert(run.times, places, times),
+        times=np.insert(run.times, indices, times),
         channels=insert(run.channels, lambda _: np.nan),
         inputs=insert(run.inputs, lambda old: interpolate(old)(times)),
         extra=insert(run.extra, lambda old: old[first]),

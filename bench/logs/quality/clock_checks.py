@@ -78,7 +78,7 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         if times.size < 3:
             continue
         steps, lost = np.diff(times), find_lost_samples(times)
-        jitter, run_lost_count = lost.jitter, lost.total
+        jitter, run_lost_count = lost.jitter, int(lost.counts.sum())
         jitters.append(jitter)
         if jitter > JITTER_THRESHOLD:
             jittered.append(run.name)
