@@ -176,13 +176,22 @@ class FollowedRuns:
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
+        The filter's smoothed motion is closer to the true one, so the model is linearised and
+        filtered again about it, while the log-likelihood increases. For a robot on the ground, each
+        motion is simulated from the smoothed first state instead.
+
         Args:
             evaluator: the runs.
             theta: (P,) parameters of the model.
             noise: sensor noise.
-            trajectories: motion of each run, if it has been estimated before.
-            force: (E,) initial missing forces for the fit of the process noise.
+            trajectories: motion of each run, about which the model is linearised once; None to
+                estimate it.
+            force: (E,) initial standard deviations of the missing forces for the fit of the process
+                noise; None for a share of typical forces.
             max_linearisations: maximum number of linearisations if the motion is not given.
+
+        Returns:
+            The filter with the highest log-likelihood.
         """
         assert isinstance(evaluator.simulator, RobotSimulator)
         robot = evaluator.simulator.robot
@@ -237,12 +246,15 @@ class FollowedRuns:
         """Return the filter of a model with other parameters.
 
         The model is linearised once about the smoothed motion of this filter, and its process noise
-        starts from the present one.
+        starts from the present one. Derivatives (Jacobians) take most of the time, so they are
+        reused where they hardly differ.
 
         Args:
             theta: (P,) the parameters.
-            simulator: simulator to use instead of that of the evaluator.
-            similar: filter of a similar model, whose Jacobians are reused.
+            simulator: simulator to use instead of that of the evaluator, such as one with another
+                form of dry friction.
+            similar: filter of a similar model, whose Jacobians are reused; None to compute them,
+                unless they are certain to be equal.
         """
         reuses_jacobians = similar is not None or (
             simulator is None and self._has_jacobians_of(theta)
@@ -326,7 +338,9 @@ class FollowedRuns:
     ) -> FollowedRuns:
         """Return the filter stored in the evaluator if it has these parameters, else a new one.
 
-        The new filter is stored in the evaluator.
+        A filter takes long, and several steps of a diagnosis need that of the base model. The new
+        filter is stored in the evaluator; it begins with the motion of the stored one if the time
+        steps agree.
 
         Args:
             evaluator: the runs.
@@ -363,16 +377,17 @@ class FollowedRuns:
         """Return how a change of each parameter changes the whitened innovations of the filter.
 
         The model is linearised about the same motion, so that a change of a parameter changes the
-        defects of the motion and the predicted readings. They pass through the filter as those of
-        a candidate do, eq. (1) of the module docstring. Jacobians, gains and process noise stay
-        the same.
+        defects of the motion (by how much a step misses the next state) and the predicted readings.
+        They pass through the filter as those of a candidate do, eq. (1) of the module docstring.
+        Jacobians, gains and process noise stay the same.
 
         Args:
             places: indices of n parameters in theta.
             sizes: (n,) finite changes of the parameters.
 
         Returns:
-            Minus the derivatives of the whitened innovations (R, T, C, n) by the parameters.
+            Minus the derivatives of the whitened innovations (R, T, C, n) by the parameters: R
+            runs, T samples, C channels.
         """
         run_count, samples, channels = self.runs.residuals.shape
         pushed = np.zeros(
@@ -407,7 +422,8 @@ class FollowedRuns:
     def losses_without_force(self) -> Array:
         """Loss in twice the log-likelihood (E,) if the process noise of one force is removed.
 
-        A large loss shows that the model lacks a force at this coordinate.
+        Process noise stands for unknown forces. A large loss shows that the model lacks a force at
+        this coordinate. Noise is not removed wholly, but reduced to a negligible force.
         """
         coloured, white = add_noise_states(self.runs, self.noise)
         log_likelihood = self.log_likelihood
@@ -455,16 +471,21 @@ class FollowedRuns:
         return trajectories
 
     def columns(self, probes: Sequence[CandidateDirection]) -> Columns:
-        """Compute the inputs that candidates add to states and readings, once per effect and place.
+        """Compute the inputs that candidates add to states and readings, once for equal candidates.
+
+        Candidates with the same effect and coefficients, such as a family with a single acting
+        member and that member alone, share a column. Columns with an infinite number are set to
+        zero, so that they explain nothing.
 
         Args:
-            probes: the candidates.
+            probes: the candidates: effects with trial coefficients.
         """
         effects: list[tuple[Effect, Array]] = []
         column_by_key: dict[tuple[str, bytes], int] = {}
         column_indices = []
         for probe in probes:
             effect, c = self.evaluator.available_effects[probe.effect], probe.coefficients
+            # Members of a family, each with its part of the coefficients.
             parts = [(part, k) for part, k in effect.parts(c[:, None, None]) if k.any()]
             # A member of a family has the same response as the single effect.
             if len(parts) == 1:
@@ -539,7 +560,8 @@ class FollowedRuns:
     def compute_state_sensitivities(self) -> Array:
         """Return the derivatives (R, T, C, 2 D) of the readings by the first states of D joints.
 
-        The first states are positions and velocities; readings are not fed back.
+        The first states are positions and velocities. The derivatives are those of simulated runs,
+        which no reading corrects, so the gain of the filter is left out.
         """
         joints = len(self.linear[0].trajectory.x[0])
         joint_states = np.concatenate(
@@ -575,10 +597,11 @@ class FollowedRuns:
         return float(np.abs(changes).max(initial=0.0))
 
     def sensitivities(self, columns: Columns) -> Array:
-        """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
+        """Return the derivatives (R, T, C, K) of simulated readings by K candidate effects.
 
-        Unlike in the filter, the readings are not fed back (gain zero): the changes are those of a
-        simulation. They are in units of the probes' coefficients.
+        A column is the response to an effect with a finite coefficient; divided by that coefficient
+        (`columns.sizes`), it is the response to a unit. Simulated runs are not corrected by
+        readings, so the gain of the filter is zero. Shapes: R runs, T samples, C channels.
         """
         number, _, _, count = columns.readings.shape
         changes = self._propagate_without_gain(
@@ -590,11 +613,12 @@ class FollowedRuns:
     def _propagate_without_gain(self, s: Array, columns: Columns | None = None) -> Array:
         """Propagate changes of the first states, and optional columns, through the linear model.
 
-        The recursion is s[i+1] = A s[i] + b[i] with readings H s + ψ, eq. (1) of the module
-        docstring with gain zero.
+        So would simulated runs change, which no reading corrects. The recursion is s[i+1] = A s[i]
+        + b[i] with readings H s + ψ, eq. (1) of the module docstring with gain zero. Changes that
+        diverge are set to zero.
 
         Args:
-            s: (R, Z, K) changes of the first states.
+            s: (R, Z, K) changes of the Z first states of R runs, by K candidates.
             columns: inputs of candidates; None if there are none.
 
         Returns:
@@ -723,9 +747,12 @@ class FollowedRuns:
     def settle(self, theta: Array, states: Array) -> Array:
         """Return first states (R, 2 D) near given ones at which the contacts are in equilibrium.
 
+        Otherwise a simulated robot would jump at the first step, because noise of its pose makes
+        contacts too deep.
+
         Args:
             theta: (P,) parameters of the model.
-            states: (R, 2 D) positions and velocities.
+            states: (R, 2 D) positions and velocities of D coordinates in R runs.
         """
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
@@ -743,8 +770,9 @@ class FollowedRuns:
         """Propagate columns through the filter, and return the whitened responses (R, T, C, M).
 
         The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where K is the gain of
-        the filter; the whitened response is W u. It is eq. (1) of the module docstring, for all M
-        columns at once in single precision.
+        the filter: part of a change of the state is corrected by the next reading. The whitened
+        response is W u. It is eq. (1) of the module docstring, for all M columns in single
+        precision, in batches that fit in the CPU cache.
 
         Args:
             pushed: (R, T - 1, E + nu, M) forces and controls, or states if `inputs` is None.
@@ -797,14 +825,19 @@ class _NoiseFit(NamedTuple):
 def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array) -> _NoiseFit:
     """Fit the process noise and the correlation of the sensor noise by maximum likelihood.
 
+    The process noise is fitted with the given correlation first. Larger correlations φ of AR(1)
+    noise follow, in ascending order, each with the process noise fitted again, as long as the
+    log-likelihood increases.
+
     Args:
         runs: the linear models.
-        noise: sensor noise; larger correlations are tried, too.
+        noise: sensor noise of each channel.
         force: (E,) initial standard deviations of the missing forces.
         typical: (E,) typical forces.
     """
     best: _NoiseFit | None = None
     present_phi = float(noise.phi.max(initial=0.0))
+    # None is the given noise itself, whose channels may have different correlations.
     for phi in (None, *(phi for phi in CORRELATIONS if phi > present_phi)):
         tried_noise = (
             noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
@@ -836,9 +869,10 @@ def _linearise_run(
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
-    For a robot on the ground the motion is simulated from a first state with settled contacts:
-    contacts are less deep than the noise of encoders, so that a measured motion has wrong contact
-    forces.
+    The motion is given, or estimated from the readings. For a robot on the ground it is simulated
+    from a first state with settled contacts: contacts are less deep than the noise of encoders, so
+    that a measured motion has wrong contact forces. Jacobians of a simulated motion are never
+    reused, because contacts may differ.
 
     Args:
         evaluator: the runs.
@@ -894,15 +928,16 @@ def _get_noise_of_states(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Ar
 def _compute_prior_deviations(
     evaluator: RunEvaluator, linear: Sequence[MeasuredLinear], size: int
 ) -> Array:
-    """Return standard deviations (Z,) of the first states about the measured motion.
+    """Return prior standard deviations (Z,) of the first states, from which the filter begins.
 
-    With a stiff servo, the first velocity decays within a sample, so the readings do not determine
-    it.
+    They are relative to the measured motion, so positions are nearly known. A velocity that is not
+    determined by the readings, as with a stiff servo, where it decays within a sample, needs a
+    bound: a share of the joint's highest speed in any run.
 
     Args:
         evaluator: the runs.
         linear: linearised model of each run.
-        size: number Z of states, with the hidden ones of effects.
+        size: number Z of states, with the hidden states that effects may have.
 
     Returns:
         Standard deviations in SI units: of positions first, then of velocities; almost zero for
@@ -910,13 +945,15 @@ def _compute_prior_deviations(
     """
     coordinates = evaluator.simulator.system.coordinates
     prior = np.full(size, 1e-9)
-    joints, positions = len(coordinates), linear[0].positions
-    speeds = np.max([np.abs(run_model.trajectory.v).max(axis=0) for run_model in linear], axis=0)
-    for joint, name in enumerate(coordinates[:joints]):
+    joint_count, position_count = len(coordinates), linear[0].positions
+    max_speeds = np.max(
+        [np.abs(run_model.trajectory.v).max(axis=0) for run_model in linear], axis=0
+    )
+    for joint, name in enumerate(coordinates[:joint_count]):
         if name in evaluator.channels:
             prior[joint] = POSITION_PRIOR
-            speed = VELOCITY_PRIOR * float(speeds[joint]) + MIN_VELOCITY_PRIOR
-            prior[positions + joint] = min(speed, MAX_VELOCITY_PRIOR)
+            velocity_deviation = VELOCITY_PRIOR * float(max_speeds[joint]) + MIN_VELOCITY_PRIOR
+            prior[position_count + joint] = min(velocity_deviation, MAX_VELOCITY_PRIOR)
         else:
-            prior[joint], prior[positions + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
+            prior[joint], prior[position_count + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
     return prior

@@ -28,7 +28,8 @@ def multiply_sparse(a: Array, b: Array, out: Array) -> None:
 def propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
     """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
 
-    `half` receives the product a p. Only one triangle is computed; the other one is copied.
+    `half` receives the product a p. Only one triangle is computed; the other one is copied. Zeros
+    of a are skipped, because most entries of a transition matrix are zero.
     """
     multiply_sparse(a, p, half)
     size = a.shape[0]
@@ -74,9 +75,13 @@ def run_filter(
     half: Array,
     w: Array,
 ) -> None:
-    """Filter B runs of T samples by (1) to (4).
+    """Filter B runs of T samples by (1) to (4) of `filter_and_smoother`.
 
-    Results are written to `predicted` and the five arguments after it; the last ten are buffers.
+    For each sample: store the prediction, update the state by the reading, and predict the next
+    state. S = L Lᵀ is factorised, so that W = L⁻¹ whitens the innovations. A run whose covariance
+    exceeds the limit is lost: its covariance is reset to a wide prior. Results are written to
+    `predicted` and the five arguments after it; the last ten are buffers, so that no memory is
+    allocated.
 
     Args:
         states: A (B, T - 1, Z, Z).
@@ -235,8 +240,9 @@ def run_smoother(
     closed: Array,
     weighed: Array,
 ) -> None:
-    """Smooth B runs by (5) and (6).
+    """Smooth B runs by (5) and (6) of `filter_and_smoother`, backward from the last sample.
 
+    The adjoint λ and its information Λ collect what later readings say about the present state.
     Results are written to `smoothed` and the three arguments after it; the last ten are buffers.
 
     Args:

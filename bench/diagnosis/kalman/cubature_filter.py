@@ -129,6 +129,9 @@ def smooth_first_states(
 ) -> list[SmoothedStart] | None:
     """Filter and smooth all runs with the likeliest missing force of each.
 
+    The missing force allows for an incomplete model. Several sizes of it are tried for each run,
+    and the result with the highest log-likelihood is returned.
+
     Args:
         evaluator: the runs.
         theta: (P,) parameters of the model.
@@ -173,6 +176,7 @@ def _refine_first_state(
     is_recorded = np.isfinite(evaluator.observed[run])
     rng = np.random.default_rng(0)
     root = compute_root(smoothed.covariance[None])[0]
+    # Deviates are in units of the uncertainty: a state is mean + root @ deviates.
     best, deviates = smoothed.mean, np.zeros(smoothed.mean.size)
     width, lowest = 1.0, np.inf
     for _ in range(SEARCH_ROUNDS):
@@ -218,6 +222,9 @@ def filter_hypotheses(
 ) -> list[SmoothedStart]:
     """Filter and smooth runs under several hypotheses, with as many as possible in one batch.
 
+    A batch steps many states of one model at once, so its runs must have the same sample times, and
+    their effects must add the same elements to the model.
+
     Args:
         evaluator: the runs; `can_filter` must be true.
         sigma: (C,) standard deviation of the noise of each channel.
@@ -230,10 +237,12 @@ def filter_hypotheses(
     assert isinstance(simulator, RobotSimulator)
     points = count_cubature_points(len(simulator.addresses.positions))
     width = max(LINEARISATION_BATCH_SIZE // points, 1)
-    acting = simulator.get_active_effects(np.array([one.theta for one in hypotheses]))
+    active_effects = simulator.get_active_effects(np.array([one.theta for one in hypotheses]))
     groups: dict[tuple[int, bytes], list[int]] = {}
     # Batch elements with different elements of the model cannot share a batch.
-    for kind, elements in enumerate(group_by_added_elements(acting, len(hypotheses)).values()):
+    for kind, elements in enumerate(
+        group_by_added_elements(active_effects, len(hypotheses)).values()
+    ):
         for number in elements:
             times = evaluator.prepared_runs[hypotheses[number].run].scenario.times
             groups.setdefault((kind, times.tobytes()), []).append(number)
@@ -241,8 +250,10 @@ def filter_hypotheses(
     for numbers in groups.values():
         for first in range(0, len(numbers), width):
             part = numbers[first : first + width]
-            found = _CubatureFilters(evaluator, sigma, [hypotheses[i] for i in part]).smooth()
-            results.update(zip(part, found, strict=True))
+            batch_results = _CubatureFilters(
+                evaluator, sigma, [hypotheses[i] for i in part]
+            ).smooth()
+            results.update(zip(part, batch_results, strict=True))
     return [results[number] for number in range(len(hypotheses))]
 
 
@@ -252,7 +263,17 @@ class _CubatureFilters:
     def __init__(
         self, evaluator: RunEvaluator, sigma: Array, hypotheses: Sequence[Hypothesis]
     ) -> None:
-        """Compute the inputs over all steps, and find the recorded components of the state."""
+        """Compute the inputs over all steps, and find the recorded components of the state.
+
+        Each hypothesis gets its controls, forces, first state with prior, and readings. The batch
+        of the engine gets the effects of each hypothesis once per cubature point.
+
+        Args:
+            evaluator: the runs.
+            sigma: (C,) standard deviation of the noise of each channel.
+            hypotheses: runs with parameters and missing forces; sample times and added elements are
+                equal.
+        """
         simulator = evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
         joints = len(simulator.addresses.positions)
@@ -263,7 +284,7 @@ class _CubatureFilters:
         self._force_deviations = np.array([h.share * typical for h in hypotheses])
         starts, speed_priors, controls, forces = [], [], [], []
         for index, hypothesis in enumerate(hypotheses):
-            track = evaluator.prepared_runs[hypothesis.run]
+            run_data = evaluator.prepared_runs[hypothesis.run]
             start = evaluator.initial_state_guesses[hypothesis.run].copy()
             speed_prior = np.ones(joints)
             measured = estimate_measured_states(evaluator, sigma, hypothesis.run)
@@ -272,8 +293,8 @@ class _CubatureFilters:
                 speed_prior[joint] = _compute_speed_deviation(evaluator, sigma, joint)
             own_effects = slice_active_effects(acting, np.array([index]))
             work = RobotRunBatch(
-                track.scenario,
-                simulator.run_inputs(track.scenario),
+                run_data.scenario,
+                simulator.run_inputs(run_data.scenario),
                 own_effects,
                 start[None, :joints],
                 start[None, joints:],
@@ -297,16 +318,23 @@ class _CubatureFilters:
         names = [*simulator.system.coordinates, *simulator.system.rates]
         columns = [i for i, name in enumerate(evaluator.channels) if name in names]
         self._rows = [names.index(evaluator.channels[i]) for i in columns]
-        tracks = [evaluator.prepared_runs[h.run] for h in hypotheses]
-        self._observed = np.array([track.observed[:, columns] for track in tracks])
+        data_of_runs = [evaluator.prepared_runs[h.run] for h in hypotheses]
+        self._observed = np.array([run_data.observed[:, columns] for run_data in data_of_runs])
         self._variances = np.square(sigma[columns])
 
     def smooth(self) -> list[SmoothedStart]:
-        """Filter and smooth the runs."""
-        size, count = self._size, self._point_count // 2
+        """Filter the runs forward, smooth them backward, and return the first states.
+
+        Each interval is propagated by the cubature points, eq. (1) of the module docstring, and its
+        moments are kept. Backward, the smoother of Rauch, Tung and Striebel, eq. (2), uses them. A
+        filter that diverges has the log-likelihood -inf.
+        """
+        size, component_count = self._size, self._point_count // 2
         mean = self._start.copy()
         covariance = np.square(self._prior)[:, :, None] * np.eye(size)
-        points = np.sqrt(count) * np.concatenate([np.eye(count), -np.eye(count)])
+        points = np.sqrt(component_count) * np.concatenate(
+            [np.eye(component_count), -np.eye(component_count)]
+        )
         log_likelihood = np.zeros(len(mean))
         has_failed = np.zeros(len(mean), dtype=bool)
         intervals: list[tuple[Array, ...]] = []
@@ -357,7 +385,14 @@ class _CubatureFilters:
         ]
 
     def _update(self, i: int, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Update means and covariances by the readings of sample i (Kalman filter).
+        """Update means and covariances of F hypotheses by the readings of sample i (Kalman filter).
+
+        Readings are components of the state, so the observation matrix selects rows.
+
+        Args:
+            i: number of the sample.
+            mean: (F, Z) predicted states.
+            covariance: (F, Z, Z) their covariances.
 
         Returns:
             Log-likelihoods of the readings (F,), means, and covariances.
@@ -382,16 +417,23 @@ class _CubatureFilters:
     def _propagate(self, states: Array, forces: Array, begin: int, end: int) -> Array:
         """Step states (F, n, 2 D) with additional forces (F, n, D) through the engine.
 
+        There are F hypotheses with n cubature points and D joints. All F n states are stepped in
+        batches of the size that the engine has.
+
+        Args:
+            states: positions, then velocities.
+            forces: missing force of each joint, constant over the steps.
+            begin: first step.
+            end: step after the last one; if it equals `begin`, nothing is stepped.
+
         Returns:
-            (F, n, 2 D) states at the end.
+            (F, n, 2 D) states at the end; NaN where the simulation fails.
         """
         if end == begin:
             return states.copy()
         joints, mujoco_batch = self._joints, self._mujoco_batch
-        position_columns, velocity_columns = (
-            mujoco_batch.file_joints.positions,
-            mujoco_batch.file_joints.velocities,
-        )
+        position_columns = mujoco_batch.file_joints.positions
+        velocity_columns = mujoco_batch.file_joints.velocities
         flat_states, flat_forces = states.reshape(-1, 2 * joints), forces.reshape(-1, joints)
         runs = np.repeat(np.arange(len(states)), states.shape[1])
         result = np.empty_like(flat_states)

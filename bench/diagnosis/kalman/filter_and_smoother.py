@@ -104,7 +104,8 @@ class LinearRuns:
     def segments(self, length: int) -> LinearRuns:
         """Split the runs into segments of `length` samples, each with the prior of a run.
 
-        The process noise is fitted on such segments.
+        The process noise is fitted on such segments: they are filtered in parallel, so this needs
+        fewer steps.
         """
         run_count, samples, _ = self.residuals.shape
         count = -(-samples // length)
@@ -127,7 +128,10 @@ class LinearRuns:
 
     @classmethod
     def stacked(cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array) -> LinearRuns:
-        """Stack the linear models of runs.
+        """Stack the linear models of R runs into arrays, padded to the length T of the longest run.
+
+        After its end, the state of a run stays, and nothing is recorded, so that the likelihood
+        does not change. Numbers of a model that diverges are set to zero, too.
 
         Args:
             maps: linear model of each run.
@@ -204,7 +208,11 @@ class Smoothed:
 
 
 def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, Array]:
-    """Add states for AR(1) noise.
+    """Add states for autocorrelated AR(1) noise, because a Kalman filter expects white noise.
+
+    The noise n of a channel becomes a state: n[i+1] = φ n[i] + white innovation, and is added to
+    the reading of the channel. A small share of white noise remains, so that the filter stays well
+    conditioned.
 
     Args:
         runs: the linear models.
@@ -215,11 +223,11 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
         variances of the remaining white noise.
     """
     coloured_channels = np.flatnonzero(noise.phi > 0)
-    white = np.square(noise.sigma)
+    white_variances = np.square(noise.sigma)
     if not coloured_channels.size:
-        return runs, white
-    white = white.copy()
-    white[coloured_channels] *= AR_FLOOR
+        return runs, white_variances
+    white_variances = white_variances.copy()
+    white_variances[coloured_channels] *= AR_FLOOR
     (run_count, samples, channels), size = runs.residuals.shape, runs.prior.size
     noise_count = coloured_channels.size
     transitions = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
@@ -253,17 +261,24 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
         prior=prior,
         jumps=jumps,
     )
-    return runs_with_noise, white
+    return runs_with_noise, white_variances
 
 
 def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """Follow all runs with a Kalman filter, eqs. (1) to (4) of the module docstring.
+
+    A recording has no reading of some channels at some samples. Such a reading is replaced by zero
+    with variance one and no dependence on the state, so that it changes neither state nor
+    likelihood.
 
     Args:
         runs: the linear models.
         force: (E,) standard deviations of the missing forces, or (B, E) of each run; further
             columns of G, those of coloured noise, have 1.
         white: R (C,) variances of white noise.
+
+    Returns:
+        Results of the filter; the log-likelihood of a run in which the model diverges is -inf.
     """
     if runs.states.shape[1] != runs.residuals.shape[1] - 1:
         raise ValueError(f"expected a step between two samples, got {runs.states.shape[1]} steps")
@@ -282,6 +297,9 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
 
 def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
     """Smooth all runs backward, eqs. (5) and (6) of the module docstring (Bryson and Frazier).
+
+    The smoothed states and forces are the most likely ones, given all samples of a run and not only
+    those before. The score says whether the assumed variances of the forces are too small, eq. (7).
 
     Args:
         runs: the linear models.

@@ -41,6 +41,9 @@ def maximise_innovation_likelihood(
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
+    A step that does not increase the likelihood is halved a few times. The fit ends when a step
+    gains, or promises, less than `min_gain`.
+
     Args:
         followed: the runs, filtered with the initial parameters.
         bounds: bounds of the fitted parameters, by index.
@@ -78,6 +81,9 @@ def compute_likelihood_step(
 ) -> tuple[Array, float]:
     """Compute the Gauss-Newton step of some parameters on the innovations.
 
+    With derivatives J of the whitened innovations e, it solves J'J x = J'e. Columns are scaled to
+    unit length and a small ridge is added, which keeps the solution well conditioned.
+
     Args:
         followed: the runs, filtered with the present parameters.
         bounds: bounds of the parameters that change, by index; they limit the step. A set
@@ -91,15 +97,15 @@ def compute_likelihood_step(
     if not indices:
         return np.zeros_like(followed.theta), 0.0
     derivatives, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
-    gram, cross = derivatives.T @ derivatives, derivatives.T @ target.reshape(-1)
-    scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
-    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(indices))
+    information, cross = derivatives.T @ derivatives, derivatives.T @ target.reshape(-1)
+    scale = np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
+    normal = information / scale / scale[:, None] + RIDGE * np.eye(len(indices))
     values = followed.theta[indices]
     low, high = np.array(list(bounds.values())).T
     change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
     step = np.zeros_like(followed.theta)
     step[indices] = change
-    return step, float(change @ cross - 0.5 * change @ gram @ change)
+    return step, float(change @ cross - 0.5 * change @ information @ change)
 
 
 def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
@@ -127,11 +133,11 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
     sizes = np.array(
         [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
     )
-    moved = np.flatnonzero(sizes)
-    places = np.array(list(bounds), dtype=np.intp)[moved]
-    responses = followed.compute_parameter_responses(places.tolist(), sizes[moved])
+    displaced = np.flatnonzero(sizes)
+    places = np.array(list(bounds), dtype=np.intp)[displaced]
+    responses = followed.compute_parameter_responses(places.tolist(), sizes[displaced])
     derivatives = np.zeros((*responses.shape[:3], len(bounds)))
-    derivatives[..., moved] = responses
+    derivatives[..., displaced] = responses
     return derivatives.reshape(-1, len(bounds))
 
 

@@ -59,9 +59,10 @@ def estimate_measured_states(
 def _compute_measured_states(
     evaluator: RunEvaluator, sigma: Array, run: int
 ) -> Mapping[int, Array]:
-    """Compute the result of `estimate_measured_states` for a run that is not in its cache.
+    """Estimate the states of the joints of one run; `estimate_measured_states` caches the result.
 
-    Joints with fewer than three recorded positions are left out.
+    Only joints whose position is recorded are estimated; a recorded velocity is used too. Joints
+    with fewer than three recorded positions are left out.
 
     Args:
         evaluator: the runs.
@@ -95,7 +96,8 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     """Estimate position, velocity and acceleration of joints with a Kalman filter and smoother.
 
     Each joint moves with a constant, unknown jerk between two samples, eq. (1) of the module
-    docstring; the size of the jerk with the largest likelihood is used.
+    docstring. All joints are filtered with each size of the jerk in one batch, and the likeliest
+    size of each joint is used. Positions are relative to the first reading, in units of the noise.
 
     Args:
         times: (T,) times of the samples.
@@ -119,10 +121,10 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     residuals[:, :, 0] -= first_readings[:, None]
     recorded = np.isfinite(residuals)
     residuals = np.where(recorded, residuals, 0.0) / scale
-    reading = np.zeros((count, samples, 2, 3))
-    reading[..., 0, 0] = 1.0 / scale[..., 0]
-    reading[..., 1, 1] = 1.0 / scale[..., 1]
-    reading[~recorded] = 0.0
+    observation_matrices = np.zeros((count, samples, 2, 3))
+    observation_matrices[..., 0, 0] = 1.0 / scale[..., 0]
+    observation_matrices[..., 1, 1] = 1.0 / scale[..., 1]
+    observation_matrices[~recorded] = 0.0
     position_ranges = np.array(
         [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
     )
@@ -132,24 +134,24 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     widths = np.array(PRIOR_WIDTHS) / np.array([1.0, span, span**2])
     prior = widths * max(float(position_ranges.max()), 1e-9)
     jerk_count = JERKS.size
-    joints, zeros = np.arange(count), np.zeros((count, samples - 1, 3))
+    joint_indices, zeros = np.arange(count), np.zeros((count, samples - 1, 3))
     runs = LinearRuns(
         states=np.tile(transitions, (count, 1, 1, 1)),
         defects=zeros,
         forces=np.tile(jerk_responses, (count, 1, 1, 1)),
         inputs=np.zeros((count, samples - 1, 3, 0)),
-        readings=reading,
+        readings=observation_matrices,
         residuals=residuals,
         recorded=recorded,
         prior=prior,
         jumps=zeros,
-    ).subset(np.repeat(joints, jerk_count))
+    ).subset(np.repeat(joint_indices, jerk_count))
     force = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
     filtered = filter_runs(runs, force, np.ones(2))
     log_likelihoods = filtered.log_likelihood.reshape(count, jerk_count)
-    likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joints
-    best = runs.subset(likeliest)
-    smoothed = smooth_runs(best, filtered.subset(likeliest), force[likeliest])
+    likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joint_indices
+    best_runs = runs.subset(likeliest)
+    smoothed = smooth_runs(best_runs, filtered.subset(likeliest), force[likeliest])
     states = smoothed.states
     states[:, :, 0] += first_readings[:, None]
     return list(states)
@@ -195,12 +197,17 @@ def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
 def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
     """Compute the joint forces of a run by MuJoCo's inverse dynamics.
 
-    Positions, velocities and accelerations are estimated from the recorded positions first.
+    They show whether a drive is active, without a fit. Positions, velocities and accelerations are
+    estimated from the recorded positions first. Recorded external forces are subtracted from the
+    required ones.
 
     Args:
         robot: robot as read from its model file.
         recording: the recording.
         run: the recorded run.
+
+    Returns:
+        Forces that the motion requires, that the drives exert, and that would hold the robot still.
     """
     model = robot.compiled
     states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
@@ -239,6 +246,7 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tup
         for name in (f"q.{joint.name}", f"qd.{joint.name}"):
             values = run.channels.get(name, np.full(run.times.size, np.nan))
             columns.append(values)
+            # Zero stands for unknown noise.
             sigma = recording.noise.get(name, 0.0)
             if not sigma > 0 and name in run.channels:
                 sigma = estimate_noise([(run.times, values)]).sigma
@@ -266,7 +274,9 @@ def _compute_mean_input(run: Run, name: str) -> Array:
 def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
     """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
 
-    nu and na are MuJoCo's numbers of actuators and of activation states.
+    nu and na are MuJoCo's numbers of actuators and of activation states. Some actuators filter
+    their control with a first-order lag; the activation is the output of this filter, stepped
+    exactly between samples.
 
     Args:
         robot: model of the robot.
@@ -286,9 +296,9 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
             controls[:, activation_filter.actuator.control]
         )
         activation = float(clipped_controls[0])
-        for k, decay in enumerate(
+        for sample, decay in enumerate(
             np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9)).tolist()
         ):
-            activations[k, activation_filter.address] = activation
-            activation = clipped_controls[k] + decay * (activation - clipped_controls[k])
+            activations[sample, activation_filter.address] = activation
+            activation = clipped_controls[sample] + decay * (activation - clipped_controls[sample])
     return controls, activations

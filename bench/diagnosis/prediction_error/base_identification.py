@@ -82,20 +82,25 @@ class _Start(NamedTuple):
 def identify_base(
     evaluator: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
 ) -> IdentifiedBase:
-    """Identify the base parameters of a robot from the innovations of a filter.
+    """Identify the base parameters of a robot from the innovations (prediction errors) of a filter.
 
-    They are fitted alone, then with friction and constant forces at the joints, then with the
-    effect that explains most, until no force is missing.
+    An effect that the model lacks biases the estimates. So up to three fits are tried, until one
+    leaves no force missing: the parameters alone; together with friction and constant forces at the
+    joints; together with the effect of the library that explains most. The likeliest fit gives the
+    parameters. The effects are then removed again, and the runs are filtered with the parameters
+    alone.
 
     Args:
         evaluator: the runs for fitting; ranges that do not contain an estimate are replaced.
         noise: sensor noise.
         followed: the runs, filtered with the nominal parameters.
-        is_resisted: whether friction is certain, so that only the second of these fits is made.
+        is_resisted: whether friction is certain, so that only the fit with friction and constant
+            forces is made.
 
     Returns:
-        The identified parameters. They are the nominal ones if the likelihood gains nothing, an
-        estimate is at its widest bound, or the search has to end.
+        The filter and the identified parameters. `parameters` is None and the filter is the given
+        one, with nominal parameters, if the likelihood gains nothing, an estimate is at its widest
+        bound, or the search has to end.
     """
     search_control = evaluator.search_control
 
@@ -105,15 +110,17 @@ def identify_base(
 
     base_indices = evaluator.base_indices.tolist()
     limits = {i: compute_range_around(evaluator, i) for i in base_indices}
+    # A fit must exceed the nominal parameters by MIN_GAIN.
     best, best_log_likelihood = followed, followed.log_likelihood + MIN_GAIN
     effects: dict[str, Array] = {}
-    makers: list[Callable[[], _Start | None]] = [
+    # Starts are made late, because the last one depends on the best fit before it.
+    start_makers: list[Callable[[], _Start | None]] = [
         lambda: _Start(followed, _list_resisting_effects(followed))
     ]
     if not is_resisted:
-        makers.insert(0, lambda: _Start(followed, ()))
-        makers.append(lambda: _start_with_effect(followed, best, follow))
-    for make_start in makers:
+        start_makers.insert(0, lambda: _Start(followed, ()))
+        start_makers.append(lambda: _start_with_effect(followed, best, follow))
+    for make_start in start_makers:
         try:
             start = make_start()
             if start is None:
@@ -136,6 +143,7 @@ def identify_base(
             break
     if best is followed:
         return IdentifiedBase(followed, None)
+    # An estimate outside its usual range gets a range around it.
     wider_bounds = {}
     for i in base_indices:
         value, (low, high) = float(best.theta[i]), evaluator.parameters[i].bounds
@@ -158,7 +166,11 @@ def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
 
 
 def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follow) -> _Start | None:
-    """Return a start with the effect that explains most with nominal base parameters.
+    """Return a start with the effect that explains most while base parameters are nominal.
+
+    A regression of the innovations ranks the effects of the library. The best few are put into the
+    filter's model one by one, and their coefficients are improved. The start contains the likeliest
+    one.
 
     Args:
         followed: the runs, filtered with the nominal parameters.
@@ -166,8 +178,8 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
         follow: filters the runs with other parameters.
 
     Returns:
-        The start with the likeliest of the proposed effects; None if the regression proposes no
-        effect that nearly reaches the likelihood of the best parameters.
+        The start; None if the regression proposes no effect whose gain in likelihood is at least
+        the share `MIN_GAIN_SHARE` of that of the best parameters so far.
     """
     evaluator = followed.evaluator
     names = [name for name in evaluator.library if not has_many_shapes(name)]
@@ -177,6 +189,7 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
     gains = regression.compute_net_gains()
     best_gain = best.log_likelihood - followed.log_likelihood
     starts, tried = list[_Start](), set[str]()
+    # An effect has one group of columns for each of its shapes: its best one comes first.
     for i in np.argsort(-gains, kind="stable").tolist():
         group = regression.groups[i]
         if len(tried) == MAX_TRIED_EFFECTS or not gains[i] > 0.0:

@@ -71,7 +71,7 @@ def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
     """Add effects to a fitted model as long as each pays, and fit the set.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     current = FilteredSet(context.filters.get_filter(model), model.effects)
@@ -87,7 +87,7 @@ def add_to_dry_friction(
     """Add effects to the dry friction of a selection.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
         friction: its dry friction, fitted alone.
 
@@ -103,20 +103,27 @@ def add_to_dry_friction(
 
 
 def select_in_model(context: SearchContext, friction: FitStart | None = None) -> FittedModel:
-    """Add effects one after another to dry friction, or to the base model.
+    """Add effects one after another to dry friction, or to the base model, and fit the best sets.
+
+    Filters with one more effect in the model are compared first, since they are fast. The sets that
+    are nearly as likely as the best are then fitted by simulation. If none explains the runs, all
+    servos are fitted together, and then the likeliest set is extended by further effects.
 
     Args:
-        context: context of the search.
-        friction: dry friction that is in the model from the start, if any.
+        context: search, filters and regressions of the recording.
+        friction: dry friction that is in the model from the start; None to start from the base
+            model.
+
+    Returns:
+        The model with the highest penalised log-likelihood; the base model if no effect pays or no
+        fit succeeds.
 
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    search_control, filters, base = (
-        context.evaluator.search_control,
-        context.filters,
-        context.search.base_model,
-    )
+    search_control = context.evaluator.search_control
+    filters = context.filters
+    base = context.search.base_model
     current = filters.empty_set
     if friction is not None:
         current = filters.follow_with_effects(friction.theta, friction.effects)
@@ -162,9 +169,11 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
 
 
 def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
-    """Return the sets with one more effect whose gain in likelihood exceeds its penalty.
+    """Return the sets with one more effect whose gain in likelihood exceeds the minimum.
 
-    The likeliest set is the first.
+    The gain, in twice the log-likelihood, must reach the penalty of the added effect, and a small
+    share of the gain of the present set over the base model: with long recordings even useless
+    effects gain more than the penalty. The likeliest set is the first.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -172,24 +181,29 @@ def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[
     """
     filters = context.filters
     present = current.followed if current.names else filters.base
-    share = MIN_FURTHER_GAIN_SHARE * filters.compute_gain(present)
+    min_share_gain = MIN_FURTHER_GAIN_SHARE * filters.compute_gain(present)
     return [
         larger
         for larger in try_one_more_effect(context, current)
         if 2.0 * (larger.followed.log_likelihood - present.log_likelihood)
-        >= max(filters.penalty(larger.names[-1]), share)
+        >= max(filters.penalty(larger.names[-1]), min_share_gain)
     ]
 
 
 def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
-    """Follow the runs with each effect that gains most in addition to a set.
+    """Follow the runs with each proposed effect in addition to a set, and rank the larger sets.
+
+    All proposals are filtered with the coefficients of the regression. Those of the most likely
+    sets are then improved by Gauss-Newton steps, because a good effect with a wrong coefficient
+    would lose.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         current: the set.
 
     Returns:
-        The larger sets, the likeliest first; empty if no effect gains.
+        The larger sets, the likeliest (after the penalty of its effect) first; empty if no effect
+        gains.
     """
     search_control, filters = context.evaluator.search_control, context.filters
     search_control.begin_stage(
@@ -197,7 +211,7 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
     )
     larger_sets = []
     for start in context.proposals.of(current):
-        larger_sets.append(filters.follow_with_effects(start.theta, start.effects, 0))
+        larger_sets.append(filters.follow_with_effects(start.theta, start.effects, steps=0))
         search_control.advance()
         search_control.check_not_stopped()
     larger_sets.sort(key=lambda larger_set: _compute_criterion(context, larger_set))
@@ -214,6 +228,8 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set explains the runs, and another one is far worse.
+
+    The coefficients of the other set then need not be improved.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -306,15 +322,17 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     """Return a model with one effect in place of several if it is as good.
 
     Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
-    few. The several effects explain the runs, or nearly.
+    few. If a model with several effects explains the runs, or nearly, the likeliest single effect
+    of the filters is fitted too, with its competitors. The model with the higher penalised
+    log-likelihood is returned.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         best: the best model so far.
     """
-    imitates = len(best.effects) > 1 and is_nearly_explained(context, best)
+    may_imitate = len(best.effects) > 1 and is_nearly_explained(context, best)
     if (
-        not imitates
+        not may_imitate
         or has_series(context.evaluator, best.effects)
         or context.evaluator.search_control.is_over()
     ):
@@ -326,6 +344,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     (name,) = single_sets[0].names
     penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
     loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
+    # Fewer effects save penalty; the single one is not fitted if it loses far more likelihood.
     if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
         return best
     return select_more_likely(
@@ -336,9 +355,17 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 
+    Each effect of the best model is replaced in turn by the effects that a regression, and a filter
+    if the regression is not certain, finds nearly as good. The effects are also moved to other
+    joints of their kinematic loop. Models that remain close to the best are fitted to convergence.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         best: the best model so far.
+
+    Returns:
+        The fitted model with the highest penalised log-likelihood among those with as many effects
+        as `best`; `best` itself if it has no effects or series joints.
     """
     search, evaluator = context.search, context.evaluator
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
@@ -358,6 +385,7 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     if starts:
         search.refit_models(starts, is_racing=False)
     size = len(best.effects)
+    # Jumps of the state in the linear model come from drives at their force limits.
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits may stop in local minima.
         laws = JOINT_MODEL + SERVO_MODEL
@@ -377,8 +405,13 @@ def _find_competing_effects(
 ) -> list[_CompetingEffect]:
     """Return the effects that are nearly as good by the regression in place of the given one.
 
+    The regression is about the fitted model without the given effect, so that its gain and that of
+    every other effect are comparable. Compared are gains in twice the log-likelihood minus the
+    penalty of the effect. An effect of the joint or servo model at the same joint may be much
+    worse, because the linear regression is inaccurate for large effects.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
         name: name of the effect to replace.
     """
@@ -411,7 +444,9 @@ def _confirm_by_filter(
 ) -> FitStart | None:
     """Return a start with a competing model that a filter confirms, else None.
 
-    A filter is used only if the competing model is far behind by the regression, which is linear.
+    The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
+    best one, the start is returned at once. If not, a filter with the effect in its model decides:
+    it improves the coefficients, and its log-likelihood must come close to that of the best model.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -419,6 +454,10 @@ def _confirm_by_filter(
         competing_effect: the effect that replaces one of its effects, with its loss in the
             regression.
         start: the competing model, with the coefficients from the regression.
+
+    Returns:
+        The start, with the coefficients of the filter if one was used; None if the competing model
+        is far less likely.
     """
     if competing_effect.loss <= COMPETING_MODEL_MARGIN:
         return start
@@ -448,7 +487,10 @@ def _confirm_by_filter(
 
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
-    """Fit the best models of a size with each effect moved to the other joints of its loop.
+    """Fit the best models of a size with effects moved to the other joints of their kinematic loop.
+
+    Joints of a closed loop move together, so the data may not show at which of them an effect acts.
+    The fitted models are added to `search.models`.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -469,9 +511,10 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
 
 
 def _refine_near(context: SearchContext, size: int) -> None:
-    """Fit the models of a size with nearly the best merit to convergence.
+    """Fit the models of a size whose merit is nearly the best one to convergence.
 
-    Otherwise, incomplete fits would decide between them.
+    Otherwise, incomplete fits would decide between them. Improved fits replace those in
+    `search.models`. Merit is the penalised log-likelihood.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -54,10 +54,14 @@ class SoftFrictionError(Exception):
 def check_selection(context: SearchContext, selected: Selected) -> None:
     """Raise `SoftFrictionError` if soft dry friction explains the runs better than a selection.
 
-    It compares log-likelihoods of filters, before anything but dry friction is fitted.
+    MuJoCo simulates dry friction with a compliant constraint ("soft form"), so that joints creep;
+    the other form ("stiff") lets them stick. The form decides about the simulator of the whole
+    search, so it is tested before anything but dry friction is fitted. Log-likelihoods of filters
+    are compared. Nothing is raised if stiff friction explains the runs, or if another effect at the
+    joint promises more.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
 
     Raises:
@@ -92,6 +96,9 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
 def _find_soft_friction(context: SearchContext) -> FitStart | None:
     """Return the likeliest model of soft dry friction at the joint where regression shows friction.
 
+    The joint is that of the Coulomb friction with the largest gain, and the sign of its coefficient
+    tells whether there is more or less friction than in the model file.
+
     Returns:
         The model; None if the gain of dry friction by regression is far below the largest gain, or
         if friction is already soft.
@@ -123,7 +130,7 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
     effect.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
         log_likelihood: log-likelihood of the other model.
     """
@@ -141,7 +148,7 @@ def check_filter(
     """Raise `SoftFrictionError` if soft dry friction is likelier than a model with its filter.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         log_likelihood: log-likelihood of the filter.
         is_preliminary: whether nothing has been fitted yet.
 
@@ -163,7 +170,7 @@ def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
     Filters are linear, so simulation decides if soft friction is nearly as likely.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
 
     Raises:
@@ -185,7 +192,7 @@ def check_fit(context: SearchContext, model: FittedModel) -> None:
     It is refitted with the same effects in the soft form.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
 
     Raises:
@@ -196,15 +203,18 @@ def check_fit(context: SearchContext, model: FittedModel) -> None:
 
 
 def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
-    """Fit the dry friction of a selection alone.
+    """Fit the dry friction of a selection alone, before its other effects.
+
+    Where joints stick, friction is far from linear, so the coefficients of the regression are poor
+    starts for a fit of all effects at once.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
 
     Returns:
-        The fitted model, or the base model if the selection has no friction or leaves no force
-        missing.
+        The fitted model, also if it does not explain the runs. The base model if the selection has
+        no friction or leaves no force missing.
     """
     friction = make_dry_friction_start(context, selected)
     if not friction.effects or not selected.followed.has_missing_force:
@@ -221,10 +231,12 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
 def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitStart:
     """Return a start with only the dry friction of a selection, in its form without a state.
 
-    A family replaces its members.
+    Friction laws with an internal state (such as bristles) are replaced by the law without one.
+    Only laws are used that MuJoCo simulates by a field of its model, which is fast. A law that
+    another one of them contains, such as the member of a family, is left out.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
     """
     evaluator, filters = context.evaluator, context.filters
@@ -251,13 +263,17 @@ def is_friction_sufficient(
 ) -> bool:
     """Return whether dry friction without a state follows the data as well as the selection.
 
+    The filter is run with the whole selection, in which laws with an internal state are replaced by
+    laws without: in the stiff form and in MuJoCo's soft form. One of these log-likelihoods must be
+    indistinguishable from that of the selection, which is minus infinity if nothing was replaced.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
         friction: its dry friction, fitted alone.
 
     Raises:
-        SoftFrictionError: the friction has MuJoCo's soft form.
+        SoftFrictionError: the soft form is clearly likelier, and `check_fit` confirms it.
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)

@@ -81,11 +81,18 @@ class EffectProposals:
     def of(
         self, current: FilteredSet, max_joint_proposals: int = MAX_JOINT_PROPOSALS
     ) -> list[FitStart]:
-        """Return models with one more effect than a set.
+        """Return models with one more effect than a set: the effects worth trying next.
+
+        Proposals by regression come first, then those of the standard joint and servo models.
+        Proposals for the base model are cached for each number of candidates.
 
         Args:
-            current: the set.
+            current: the set of effects in the model, with its filter; no effects mean the base
+                model.
             max_joint_proposals: maximum number of effects of the joint and servo models.
+
+        Returns:
+            Starts of fits, each with the effects of the set and one more, with a first coefficient.
         """
         evaluator, count = self.filters.evaluator, len(self.columns.library.probes)
         proposed = self._propose_effects(current) if current.names else self._for_base.get(count)
@@ -111,7 +118,9 @@ class EffectProposals:
         """Propose the effects with the largest net gain by regression, with their coefficients.
 
         The innovations (one-step prediction errors) of the filter with the set `current` are
-        regressed on the responses to each effect.
+        regressed on the responses to each effect. The net gain is the gain in twice the
+        log-likelihood minus the penalty of the effect. Effects whose gain is a small share of the
+        largest, and all but a few families (effects at every place, ``@*``), are left out.
         """
         if current.names:
             regression, _ = build_regression_about(current, self.columns.library, current.followed)
@@ -135,7 +144,10 @@ class EffectProposals:
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Return an encoder offset of a joint, and less dry friction than the model file specifies.
 
-        The derivative by more friction does not show the effect of less friction.
+        A regression misses both: an offset of the encoder changes the pose, and the derivative by
+        more friction does not show the effect of less friction. The offset is that of the readings
+        from the servo's command. A coefficient of zero, because there is no offset or no friction
+        to remove, is not proposed.
 
         Args:
             joint: index of the joint.
@@ -161,17 +173,23 @@ class EffectProposals:
     ) -> Proposals:
         """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
 
-        They are in descending order of their gain in likelihood.
+        A delay of all commands is added if no actuator acts at the joint alone. The coefficient of
+        an effect is that of its first Gauss-Newton step on the innovations, or a typical size if
+        that step hardly gains. Effects are in descending order of the gain in log-likelihood that
+        the step predicts.
 
         Args:
             followed: the runs, followed by the filter of the set that is extended.
             joint: index of the joint.
             excluded: names of effects that are not proposed.
+
+        Returns:
+            Names and coefficients of the effects.
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
         speed = max(
-            float(np.abs(proposal.trajectory.v[:, joint]).max()) for proposal in followed.linear
+            float(np.abs(linear_run.trajectory.v[:, joint]).max()) for linear_run in followed.linear
         )
         interval = float(np.median(np.diff(evaluator.runs[0].times)))
         typical = {
@@ -191,7 +209,7 @@ class EffectProposals:
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 proposals.append((gain, name, np.array([change])))
-        proposals.sort(key=lambda proposal: -proposal[0])
+        proposals.sort(key=lambda linear_run: -linear_run[0])
         return [(name, c) for _, name, c in proposals]
 
     def compute_largest_gain_of_others(self, friction: str) -> float:
@@ -213,10 +231,8 @@ class EffectProposals:
     def _list_effects_at(self, joint: int) -> list[str]:
         """Return the effects of the joint model of a joint, of its servo, and of all commands."""
         evaluator = self.filters.evaluator
-        place, servo = (
-            get_joint_name(evaluator, joint),
-            get_servo_input(evaluator, joint).removeprefix("u."),
-        )
+        place = get_joint_name(evaluator, joint)
+        servo = get_servo_input(evaluator, joint).removeprefix("u.")
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
         if not getattr(evaluator.simulator.system, "drives", {}).get(joint):

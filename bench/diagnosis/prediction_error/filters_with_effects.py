@@ -91,6 +91,10 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
 def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
     """Return the effects of the joint and servo models at the joint where an effect acts.
 
+    These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
+    often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
+    left out.
+
     Args:
         evaluator: the runs.
         name: name of the effect; at a body, the joints are those that carry it.
@@ -133,6 +137,10 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     Args:
         evaluator: the runs.
         name: name of the effect.
+
+    Returns:
+        Names of effects with coefficients in the evaluator; empty if the effect does not act at a
+        joint, or if no constraint of the model couples the joint to others.
     """
     law, _, place = name.partition("@")
     count = len(evaluator.simulator.system.coordinates)
@@ -167,7 +175,8 @@ def has_many_shapes(name: str) -> bool:
 def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
     """Return the mean difference in rad or m of a joint's readings from its servo's command.
 
-    The command acts on the actuator, so it is multiplied by the gear to get a joint position.
+    It is a first guess of an encoder offset. The command acts on the actuator, so it is multiplied
+    by the gear to get a joint position.
 
     Args:
         evaluator: the runs.
@@ -299,8 +308,10 @@ class ModelFilters:
         """Return the Kalman filter of the runs with a fitted model; it is cached.
 
         The filter starts from the newest one with the same effects, or from that of the base model,
-        about whose smoothed motion the model is linearised. The share `numerics` of the
-        integrator's step errors is subtracted from the defects of the steps.
+        about whose smoothed motion the model is linearised. A first filter with these effects is
+        linearised once more, about its own motion with the same Jacobians. The share `numerics` of
+        the integrator's step errors is subtracted from the defects of the steps (by how much a step
+        of the model misses the next state), so that they are not taken for a missing force.
         """
         if not model.effects:
             return self.base
@@ -323,7 +334,10 @@ class ModelFilters:
         return self._of_sets.get(frozenset(model.effects)) or self.get_filter(model)
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
-        """Return the log-likelihood of the innovations of a model.
+        """Return the log-likelihood of the innovations of a model; it is cached.
+
+        The innovations are the prediction errors of a Kalman filter whose model has the given
+        parameters.
 
         Args:
             theta: (P,) parameters of the model.
@@ -387,18 +401,18 @@ class ModelFilters:
         return followed.with_parameters(theta) if is_far else followed
 
     def estimate_first_states(self, followed: FollowedRuns) -> Array:
-        """Return states at the first samples (R, s), estimated from the readings.
+        """Return states at the first samples (R, s) of the R runs, estimated from the readings.
 
-        With an encoder offset, positions are smoothed ones. The states of the base fit are not
-        used, because they are biased by what is missing.
+        They are the guesses of the evaluator. A position is replaced by the smoothed one of the
+        filter where this differs by far more than noise, because an encoder offset is then in the
+        readings. The states of the base fit are not used, because they are biased by the effects
+        that it lacks.
         """
-        states, positions = (
-            self.evaluator.initial_state_guesses.copy(),
-            followed.get_first_positions(),
-        )
+        states = self.evaluator.initial_state_guesses.copy()
+        positions = followed.get_first_positions()
         measured_positions = states[:, : positions.shape[1]]
-        noise = float(np.nanmax(self.noise.sigma))
-        has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * noise
+        max_sigma = float(np.nanmax(self.noise.sigma))
+        has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * max_sigma
         is_offset = (
             np.isfinite(positions)
             & has_moved
@@ -436,7 +450,11 @@ class ModelFilters:
         return self._soft_friction[name, sign]
 
     def _search_soft_friction(self, name: str, sign: float) -> FitStart | None:
-        """Search the force of the model that `find_soft_friction` returns.
+        """Search the friction force of the model that `find_soft_friction` returns.
+
+        The models have a few friction forces in ascending order. Beginning at the middle, the
+        search goes in the direction in which the log-likelihood of the filter increases, and stops
+        where it decreases.
 
         Args:
             name: name of a friction effect at a joint.
@@ -452,14 +470,14 @@ class ModelFilters:
             return None
         followed: dict[int, FollowedRuns] = {}
 
-        def log_likelihood(k: int) -> float:
-            if k not in followed:
+        def log_likelihood(number: int) -> float:
+            if number not in followed:
                 # Jacobians depend little on the force.
-                alike = next(iter(followed.values()), None)
-                theta = models[k]
-                followed[k] = self.base.with_parameters(theta, self._soft_simulator, alike)
-                self._likelihoods[theta.tobytes(), True] = followed[k].log_likelihood
-            return followed[k].log_likelihood
+                similar = next(iter(followed.values()), None)
+                theta = models[number]
+                followed[number] = self.base.with_parameters(theta, self._soft_simulator, similar)
+                self._likelihoods[theta.tobytes(), True] = followed[number].log_likelihood
+            return followed[number].log_likelihood
 
         middle = len(models) // 2
         step = 1 if log_likelihood(middle) > log_likelihood(middle - 1) else -1
@@ -479,10 +497,11 @@ class ModelFilters:
 def make_soft_friction_models(
     followed: FollowedRuns, theta: Array, joint: int, sign: float = 1.0
 ) -> list[Array]:
-    """Return models with dry friction of several sizes at a joint.
+    """Return models with dry friction of several sizes at a joint, for a search of the best size.
 
-    They are for a simulator with MuJoCo's soft form. The list is empty if the library has no such
-    effect, or if friction is already soft.
+    They are for a simulator with MuJoCo's soft form. The sizes are multiples of the force that the
+    filter misses at the joint. The list is empty if the library has no such effect, or if friction
+    is already soft.
 
     Args:
         followed: the runs, without the effect.

@@ -113,8 +113,13 @@ class IdentifiedSet:
 def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     """Identify the effects and the base parameters of a long recording by prediction errors.
 
+    The textbook effects (Coulomb friction, drag, inertia of the bodies) are fitted in the filter's
+    model and pruned. Then up to `MAX_ADDED` further effects are added, each with the largest gain
+    by regression, until the missing forces are negligible or no effect pays. The result is
+    simulated, but not fitted by simulation: an incomplete model drifts away over a long run.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
 
     Returns:
         The identified set; None if the runs are short or nearly explained, if no effect pays, or
@@ -182,9 +187,12 @@ def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bound
 def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
     """Maximise the likelihood of the innovations with effects in the filter's model.
 
+    Fitted are the free base parameters and the coefficients of the effects, by Gauss-Newton steps.
+    They end when a step gains little compared with the gain over the base model so far.
+
     Args:
-        context: context of the search.
-        followed: the runs, followed by a filter.
+        context: search, filters and regressions of the recording.
+        followed: the runs, filtered with the parameters from which the fit starts.
         names: names of the effects.
     """
     base_log_likelihood = context.filters.base.log_likelihood
@@ -205,9 +213,11 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
 def compute_wald_statistics(
     evaluator: RunEvaluator, theta: Array, names: Sequence[str], information: Information
 ) -> dict[str, float]:
-    """Return the loss in twice the log-likelihood without each effect of a set.
+    """Return the loss in twice the log-likelihood without each effect of a set (Wald statistic).
 
-    It is c' V^-1 c for the coefficients c of the effect and their covariance V.
+    It is c' V^-1 c for the k coefficients c of the effect and their covariance V, which contains
+    the uncertainty by all other parameters. So no fit without the effect is needed. Pseudo-inverses
+    allow parameters that the data do not determine.
 
     Args:
         evaluator: the runs.
@@ -251,13 +261,14 @@ def _prune_set(
     maximised again, and the remaining effects are tested again.
 
     Args:
-        context: context of the search.
-        current: names of the effects, and the runs followed by a filter with these effects.
+        context: search, filters and regressions of the recording.
+        current: the set, with the runs followed by a filter with its effects.
 
     Returns:
         The remaining set, and the gain of each of its effects.
     """
     followed, names, lost_gain = current.followed, list(current.names), 0.0
+    # The information is computed once; removing an effect only removes its rows and columns.
     bounds = _get_bounds(context, names)
     information = Information(list(bounds), compute_information(followed, bounds))
     min_gains = {name: _compute_min_gain(context, current, name) for name in names}
@@ -291,13 +302,14 @@ def _add_next_effect(
 ) -> FilteredSet | None:
     """Add the effect that gains most by regression, in place of the effects that it contains.
 
-    It must predict left-out runs better, because a model that stays incomplete lets an effect
-    imitate what is missing in some of the runs.
+    The regression about the present set chooses the effect and its first coefficients. The larger
+    set is fitted, and must gain enough. The effect must also predict left-out runs better, because
+    a model that stays incomplete lets an effect imitate a missing force in some of the runs.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         current: the set.
-        columns: inputs of the effects that may be added.
+        columns: responses of the effects that may be added.
 
     Returns:
         The larger set; None if no effect gains enough, or if the best one does not predict
@@ -312,9 +324,9 @@ def _add_next_effect(
     if not gains.max() > 0.0 or not regression.generalises([], [best]):
         return None
     name, (solution,) = best.effect, regression.solve([best])[1]
-    c = group_coefficients(evaluator, columns.probes, best, solution)
-    present = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
-    start = add_effect_to_start(evaluator, present, name, c)
+    coefficients = group_coefficients(evaluator, columns.probes, best, solution)
+    present_start = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
+    start = add_effect_to_start(evaluator, present_start, name, coefficients)
     larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
     return larger if gain > _compute_min_gain(context, larger, name) else None
@@ -336,7 +348,7 @@ def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
     """Simulate the runs with identified parameters, from fitted initial states.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         start: the parameters, and estimates of the initial states.
     """
     evaluator, search = context.evaluator, context.search

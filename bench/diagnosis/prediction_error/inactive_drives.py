@@ -115,11 +115,13 @@ class InactiveDrive:
     def is_likely(self, masks: Sequence[Mask]) -> bool:
         """Return whether the drive is inactive in the given samples, and only there.
 
-        A drive with small commands does not show exactly when it is switched off, so the masks may
-        cost slightly more than the likeliest ones.
+        Used to test whether a column of the recording shows when the drive is off. A drive with
+        small commands does not show exactly when it is switched off, so the masks may cost more
+        than the likeliest ones, in proportion to the number of changes. Masks with too many
+        intervals are refused.
 
         Args:
-            masks: (T,) samples of each run.
+            masks: (T,) samples of each run in which the drive would be inactive.
         """
         extra_cost, changes = 0.0, 0
         for costs, mask, likeliest_mask in zip(self.costs, masks, self.masks, strict=True):
@@ -135,8 +137,10 @@ class InactiveDrive:
 def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
     """Switch off inactive drives or omit these samples, and add notes to the recording.
 
-    If a column of the recording shows when a drive is off, the drive is switched off there;
-    otherwise the samples are omitted.
+    A fit would explain samples without drive force by wrong effects. If a column of the recording
+    shows when a drive is off, the drive is switched off in the model there; otherwise, or if a
+    brake holds the joint, the samples are omitted. They are kept if no run for fitting would
+    remain.
 
     Args:
         recording: the recording as it was read, before its runs are divided.
@@ -154,7 +158,8 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
         if not switches:
             unexplained.append(drive)
             inactive_masks = [
-                a | _widen_mask(b) for a, b in zip(inactive_masks, drive.masks, strict=True)
+                present | _widen_mask(added)
+                for present, added in zip(inactive_masks, drive.masks, strict=True)
             ]
             continue
         runs, texts = apply_drive_switches(recording.path, runs, switches)
@@ -176,14 +181,14 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
 def _format_message(
     recording: Recording, drives: Sequence[InactiveDrive], inactive_masks: Sequence[Mask]
 ) -> str:
-    """Write the note on samples with inactive drives that were left out.
+    """Write the note on samples that were omitted because drives are inactive.
 
     No column of the recording shows when these drives are on. The note says how a column can be
     stated that does.
 
     Args:
         recording: the recording.
-        drives: drives that are off in a part of it.
+        drives: drives that are inactive in a part of it; all of them are held, or none.
         inactive_masks: (T,) mask of each run, of the samples that were left out.
     """
     joints = ", ".join(drive.joint for drive in drives)
@@ -222,7 +227,8 @@ def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwit
 def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
     """Return the first other column that changes only where drives become inactive or active.
 
-    The result is empty if there is no such column.
+    The note to the user names it as a hint: it may show the state of the drives. The result is
+    empty if there is no such column.
 
     Args:
         recording: the recording, with further columns.
@@ -249,11 +255,15 @@ def _widen_mask(mask: Mask) -> Mask:
 
 
 def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
-    """Find drives that are inactive in some samples, by (1).
+    """Find drives that are inactive in some samples, by (1) of the module docstring.
+
+    Forces are computed from the recorded motion, at every k-th sample of long recordings. Each
+    joint is tested alone for a drive that is off. If there is none, all joints together are tested
+    for a brake or an emergency stop that holds them. Masks are then extended to all samples.
 
     Args:
         recording: the recording as it was read.
-        kind: a simulator of its system.
+        kind: the simulator class of its system, with the model of the robot.
 
     Returns:
         The drives; empty if the positions of some joints are not recorded, if there is a floating
@@ -265,18 +275,19 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
     if any(run.times.size <= 3 * MIN_SAMPLES for run in recording.runs):
         return []
     total = sum(run.times.size for run in recording.runs)
+    # Rounded up, so that at most MAX_SAMPLES samples remain.
     sample_stride = -(-total // MAX_SAMPLES)
     with np.errstate(all="ignore"):
         forces = [
             compute_joint_forces(robot, recording, run)
             for run in _thin_runs(recording, sample_stride)
         ]
-    driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
+    joint_actuators = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
     actuators = {
-        joint_index: tuple(a.name for a in driven if a.joint == joint.name)
+        joint_index: tuple(a.name for a in joint_actuators if a.joint == joint.name)
         for joint_index, joint in enumerate(robot.joints)
     }
-    joints = [joint_index for joint_index, names in actuators.items() if names]
+    joints = [joint_index for joint_index, actuator_names in actuators.items() if actuator_names]
     drives = []
     for joint in joints:
         intervals = _Intervals(forces, [joint], OFF)
@@ -287,15 +298,15 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
         drives = [(joint, intervals) for joint in joints] if intervals.any() else []
     return [
         InactiveDrive(
-            robot.joints[joint].name,
-            actuators[joint],
-            intervals.state == HELD,
-            tuple(
+            joint=robot.joints[joint].name,
+            actuators=actuators[joint],
+            is_held=intervals.state == HELD,
+            masks=tuple(
                 np.repeat(mask, sample_stride)[: run.times.size]
                 for mask, run in zip(intervals.masks, recording.runs, strict=True)
             ),
-            tuple(intervals.costs),
-            sample_stride,
+            costs=tuple(intervals.costs),
+            every=sample_stride,
         )
         for joint, intervals in drives
     ]
@@ -323,22 +334,26 @@ class _Intervals:
     def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
         """Find the most likely intervals of the hypothesis, and keep those that are plausible.
 
-        `residuals` of a joint are its force residuals under each hypothesis, run by run; the costs
-        of all joints are added. If the intervals are too many, the hypothesis explains noise, and
-        none is kept.
+        Each sample costs more under the hypothesis that fits it worse, and each change costs too;
+        dynamic programming finds the cheapest sequence. Costs of all joints are added, since the
+        hypothesis is that they are inactive together. If the intervals are too many, the hypothesis
+        explains noise, and none is kept.
 
         Args:
             forces: forces in the runs.
             joints: indices of the joints to which the hypothesis applies.
-            state: number of the hypothesis.
+            state: the hypothesis, ``OFF`` or ``HELD`` (by a brake); it is also a row of the
+                residuals.
         """
         self.state = state
         self._forces, self._joints = forces, joints
-        self._residuals = [[one.residuals(joint) for one in forces] for joint in joints]
-        self.costs = [np.zeros((2, len(one.needed))) for one in forces]
+        self._residuals = [
+            [run_forces.residuals(joint) for run_forces in forces] for joint in joints
+        ]
+        self.costs = [np.zeros((2, len(run_forces.needed))) for run_forces in forces]
         for of_runs in self._residuals:
-            for cost, more in zip(self.costs, _compute_costs(of_runs, state), strict=True):
-                cost += more
+            for cost, joint_costs in zip(self.costs, _compute_costs(of_runs, state), strict=True):
+                cost += joint_costs
         masks = [_remove_short_intervals(_choose_second_hypothesis(cost)) for cost in self.costs]
         if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
             masks = [np.zeros_like(mask) for mask in masks]
@@ -351,7 +366,14 @@ class _Intervals:
     def _accept_masks(self, masks: Sequence[Mask]) -> list[Mask]:
         """Return masks (T,) if they fulfil the conditions of the module docstring, else empty ones.
 
-        Single intervals that do not fulfil them are removed.
+        All intervals are rejected together if they are too long or too short, if the model's drive
+        is not clearly worse inside them than outside, or if the hypothesis leaves large forces.
+        Then single intervals that the hypothesis does not explain are removed; a joint held by a
+        brake must also be at rest. Changes themselves are not compared, because the smoothed motion
+        is blurred there.
+
+        Args:
+            masks: samples of each run in which the hypothesis is the likelier one.
         """
         empty_masks = [np.zeros_like(mask) for mask in masks]
         active_masks = [~_widen_mask(mask) for mask in masks]
@@ -376,8 +398,10 @@ class _Intervals:
             )
         )
         is_small = all(
-            e <= MAX_RESIDUAL_SHARE * u
-            for e, u in zip(hypothesis_error_inside, hypothesis_error_outside, strict=True)
+            inside <= MAX_RESIDUAL_SHARE * outside
+            for inside, outside in zip(
+                hypothesis_error_inside, hypothesis_error_outside, strict=True
+            )
         )
         if not (
             is_worse
@@ -428,6 +452,9 @@ class _Intervals:
     def _compute_largest_errors(self, masks: Sequence[Mask], length: int) -> list[float]:
         """Return the largest force error of the model's drive in a window, by joint.
 
+        The error in an inactive interval is compared with it: a model whose drive is wrong in other
+        short windows too does not show that the drive is off.
+
         Args:
             masks: (T,) samples of each run in which the drive is active.
             length: length of the windows in samples; they overlap by half.
@@ -471,10 +498,11 @@ def _remove_edges(mask: Mask) -> Mask:
 
 
 def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
-    """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint.
+    """Return costs (2, T) in each run, of an active drive (row 0) and of a hypothesis (row 1).
 
-    The cost of a sample is the absolute residual in units of the typical residual of the better
-    hypothesis, at most `MAX_SAMPLE_COST`.
+    The cost of a sample is the absolute residual force at one joint in units of the typical
+    residual of the better hypothesis, at most `MAX_SAMPLE_COST`. An unknown residual has this cost
+    under both. Costs are zero if no residual is known.
 
     Args:
         residuals: (S, T) residual forces of each run under the S hypotheses, NaN where unknown.
@@ -501,23 +529,26 @@ def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
 def _choose_second_hypothesis(costs: Array) -> Mask:
     """Return where the second of two hypotheses is chosen (T,), from costs (2, T).
 
-    Dynamic programming finds the sequence with the lowest cost.
+    The sequence with the lowest sum of sample costs and `CHANGE_COST` for each change is found by
+    dynamic programming (Viterbi): forward, the lowest cost that ends in each hypothesis; backward,
+    the choices that led there.
     """
     # Python's own numbers: an operation of NumPy takes ten times as long for two of them.
     first_costs, second_costs = costs.tolist()
-    first, second = first_costs[0], second_costs[0]
+    first_total, second_total = first_costs[0], second_costs[0]
     from_other = [(False, False)]
     for first_cost, second_cost in zip(first_costs[1:], second_costs[1:], strict=True):
-        first_with_change, second_with_change = second + CHANGE_COST, first + CHANGE_COST
-        from_other.append((first_with_change < first, second_with_change < second))
-        first = min(first, first_with_change) + first_cost
-        second = min(second, second_with_change) + second_cost
+        first_with_change = second_total + CHANGE_COST
+        second_with_change = first_total + CHANGE_COST
+        from_other.append((first_with_change < first_total, second_with_change < second_total))
+        first_total = min(first_total, first_with_change) + first_cost
+        second_total = min(second_total, second_with_change) + second_cost
     result = np.zeros(len(from_other), dtype=bool)
-    hypothesis = int(second < first)
+    current = int(second_total < first_total)
     for i in range(len(from_other) - 1, -1, -1):
-        result[i] = hypothesis == 1
-        if from_other[i][hypothesis]:
-            hypothesis = 1 - hypothesis
+        result[i] = current == 1
+        if from_other[i][current]:
+            current = 1 - current
     return result
 
 

@@ -123,6 +123,11 @@ class PredictionErrorSearch(EffectSearch):
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show.
 
+        A likely model from before is fitted first, if there is one; else a long recording is
+        identified by filters without simulation. If neither explains the runs, effects are
+        searched. The result is also stored in `best_supported_model`, for a search that is stopped
+        later.
+
         Raises:
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
         """
@@ -153,12 +158,21 @@ class PredictionErrorSearch(EffectSearch):
         )
 
     def _search_effects(self) -> FittedModel:
-        """Select effects by regression and fit them by simulation, until only noise is left.
+        """Select effects by regression and fit them by simulation, until only noise remains.
 
-        Each further method is slower, so it is tried only if the best model does not explain the
-        runs: dry friction alone, the selected set, effects with many shapes, effects that
-        regression missed, one effect in place of several, and at last elastic or slack
-        transmissions.
+        A robot with unknown servos is identified servo by servo, and nothing else is done.
+        Otherwise each further method is slower, so it is tried only if the best model does not
+        explain the runs: dry friction alone, the selected set, effects with many shapes, effects
+        that regression missed (singly, then one by one), one effect in place of several, and at
+        last series effects (elastic or slack transmissions). If no effect was accepted, the
+        selected set is fitted whole.
+
+        The functions named ``check_`` return nothing; they end the search by raising
+        `SoftFrictionError` if dry friction is likelier in MuJoCo's soft form.
+
+        Raises:
+            SoftFrictionError: dry friction has MuJoCo's soft form; the caller searches again in
+                that form.
         """
         context = self._search_context
         selected = context.columns.select()
@@ -187,6 +201,7 @@ class PredictionErrorSearch(EffectSearch):
             best = select_more_likely(best, self.refit_first_states(self.base_model))
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
+        # The quick fits may have skipped the selection because it is slow to simulate.
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
         return best
@@ -194,12 +209,16 @@ class PredictionErrorSearch(EffectSearch):
     def _identify_servos(self, selected: Selected) -> IdentifiedSet | None:
         """Identify the servos of a real arm, whose model is incomplete at most joints.
 
+        This takes many simulations, so it is done only if neither the base model, one effect, nor
+        the selected effects come near the data. The result is used only if it adds effects at most
+        joints and leaves a smaller residual than the selection.
+
         Args:
             selected: the selection by regression.
 
         Returns:
-            The identified set; None if the servos' gains are known, if the base model or the
-            selection leaves a small residual, or if other effects may be missing.
+            The identified set; None if one of these conditions does not hold, or if the servos'
+            gains are known.
         """
         context = self._search_context
         if not self.compute_excess_residual(self.base_model) > MIN_EXCESS:
@@ -252,6 +271,10 @@ class PredictionErrorSearch(EffectSearch):
     ) -> FittedModel:
         """Fit effects alone, and add effects one by one, until a set explains the runs.
 
+        If several effects already remove most of the discrepancy, further ones are added to them,
+        and nothing else is tried. Otherwise single effects are fitted; then effects are added to
+        the dry friction of the selection; then effects are added to the base model.
+
         Args:
             best: the best model so far; effects are added to it if it removes most of the
                 discrepancy.
@@ -292,7 +315,11 @@ class PredictionErrorSearch(EffectSearch):
         return fit_competing_models(self._search_context, best)
 
     def get_best_so_far(self) -> FittedModel:
-        """Return the likeliest model if its gain is significant, without any simulation."""
+        """Return the likeliest model if its gain is significant, without any simulation.
+
+        It is the answer of a search that must end early. The base model is returned if the p-value
+        of the gain, corrected for the number of effects in the library, exceeds the threshold.
+        """
         base, library_size = self.base_model, len(self.evaluator.library)
         best = max(self.models.values(), key=lambda model: model.penalised_log_likelihood)
         indices = [i for name in best.effects for i in self.evaluator.get_coefficient_indices(name)]
@@ -320,22 +347,20 @@ class PredictionErrorSearch(EffectSearch):
     def compute_p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
 
-        If it is significant by the linear innovations, it is fitted by simulation.
+        Three tests are made, each slower and more accurate; the p-value of the first that is not
+        significant is returned. They are the linear regression of the innovations, the filter with
+        the effect in its model at a few shares of the coefficient, and the fit by simulation.
         """
         scores = self.score_missing_effects(model)
         if scores.p_value > EFFECT_P_VALUE_THRESHOLD or not np.isfinite(model.fit.cost):
             return scores.p_value
-        filters, columns, name = (
-            self._search_context.filters,
-            self._search_context.columns,
-            scores.effects[0],
-        )
+        filters = self._search_context.filters
+        columns = self._search_context.columns
+        name = scores.effects[0]
         coefficients = columns.coefficients(*scores.peaks[0][0])
         start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, coefficients)
-        indices, library_size = (
-            self.evaluator.get_coefficient_indices(name),
-            len(self.evaluator.library),
-        )
+        indices = self.evaluator.get_coefficient_indices(name)
+        library_size = len(self.evaluator.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         log_likelihood = filters.get_filter(model).log_likelihood
         gains = []
@@ -377,7 +402,13 @@ class PredictionErrorSearch(EffectSearch):
         return score_by_regression(regression, set(self._list_addable_effects(model)), rng)
 
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
-        """Return the p-value of the best additional force and the signal it depends on."""
+        """Return the p-value of the best additional force and the signal it depends on.
+
+        The candidates are forces that are any piecewise linear function of one signal ("hats"),
+        such as a position or the time. A significant one shows a force that no effect of the
+        library describes. The result is None for effects with own states in series, about which the
+        filter is not linear.
+        """
         if has_series(self.evaluator, model.effects):
             return None
         columns, filters = self._search_context.columns, self._search_context.filters
@@ -393,7 +424,8 @@ class PredictionErrorSearch(EffectSearch):
     def make_final_start(self, model: FittedModel) -> FitStart:
         """Return the start of a final fit, with derivatives about the model.
 
-        The fit of the model has those by parameters, and its filter those by initial states.
+        A fit with known derivatives needs fewer simulations. The fit of the model has those by
+        parameters, and its filter those by initial states, if the filter follows the runs.
         """
         start = model.fit.make_start_with_derivatives()
         if not model.effects or has_series(self.evaluator, model.effects):

@@ -141,11 +141,12 @@ class LibraryColumns:
         return group_coefficients(self.filters.evaluator, self.library.probes, group, solution)
 
     def regression(self, model: FittedModel) -> ModelRegression:
-        """Return the regression with the effects of a fitted model in the filter's model.
+        """Return the cached regression with the effects of a fitted model in the filter's model.
 
         The candidates are the library and forces of any shape. The derivatives by the coefficients
         of the model are part of every set, so that a regression about nearly the same coefficients
-        gives the same gains to first order.
+        gives the same gains to first order. The cached one is therefore reused if coefficients
+        hardly differ.
         """
         theta, names = model.fit.theta, model.effects
         if names in self._regressions:
@@ -161,7 +162,9 @@ class LibraryColumns:
     def sensitivities(self, start: FitStart) -> KnownJacobian:
         """Return the derivatives of the runs by the coefficients of a model's effects.
 
-        They are differences of responses about the measured motion.
+        Each effect is simulated in the linear model as it is, and with one coefficient displaced at
+        a time. The derivative is the difference of the two responses divided by the displacement.
+        Responses are about the measured motion.
         """
         evaluator, followed = self.filters.evaluator, self.filters.base
         tangents = [_make_tangent_probes(evaluator, name, start.theta) for name in start.effects]
@@ -184,12 +187,15 @@ def list_probes(
 ) -> list[CandidateDirection]:
     """Return small trial coefficients (probes) of effects; their responses are regressors.
 
+    An effect with several shapes has several probes, for example one for each period of a periodic
+    force.
+
     Args:
         evaluator: the runs.
         model_effects: names of the effects that the model contains.
         names: names of the candidates.
     """
-    probes = list[CandidateDirection]()
+    probes: list[CandidateDirection] = []
     for name in names:
         bounds = compute_coefficient_bounds(evaluator, name)
         for probe in iterate_first_probes(evaluator, model_effects, name):
@@ -209,16 +215,18 @@ def group_coefficients(
 ) -> Array:
     """Return the coefficients (k,) of an effect from the regression, within their bounds.
 
+    The regression gives one factor for each column (response to one probe). Most effects are linear
+    in one or more coefficients, which these factors are. An effect with probe points, whose
+    coefficients are not linear, combines the points of its probes.
+
     Args:
         evaluator: the runs.
-        probes: probes of all columns.
-        group: columns of the effect.
+        probes: probes of all columns of the regression.
+        group: columns of the effect, as indices into `probes`.
         solution: regression coefficients of these columns.
     """
-    group_probes, effect = (
-        [probes[i] for i in group.column_indices],
-        evaluator.available_effects[group.effect],
-    )
+    effect = evaluator.available_effects[group.effect]
+    group_probes = [probes[i] for i in group.column_indices]
     if effect.probe_points():
         sizes = np.array([probe.coefficients[probe.coefficient_index] for probe in group_probes])
         points = np.array([probe.coefficients for probe in group_probes])
@@ -234,7 +242,11 @@ def group_coefficients(
 def build_regression_about(
     current: FilteredSet, columns: Columns, followed: FollowedRuns
 ) -> ModelRegression:
-    """Set up the regression with effects in the model.
+    """Set up the regression of innovations on candidates, with effects in the filter's model.
+
+    The columns of the present effects, as a whole and by each coefficient, are added after those of
+    the candidates and are part of every set. So a candidate gains only by what a change of the
+    present coefficients cannot explain.
 
     Args:
         current: the runs, filtered with these effects.
@@ -259,8 +271,9 @@ def _make_tangent_probes(
 ) -> list[CandidateDirection]:
     """Return probes for an effect of the model: as it is, and with each coefficient displaced.
 
-    The first shows what the effect changes as a whole; the differences of the others from it are
-    the derivatives by the coefficients.
+    The first shows the whole change by the effect; the differences of the others from it are the
+    derivatives by the coefficients. A displacement goes downwards if the coefficient is at its
+    upper bound.
 
     Args:
         evaluator: the runs.

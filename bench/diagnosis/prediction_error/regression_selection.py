@@ -118,7 +118,11 @@ class Regression:
         return self.compute_log_ratio(self.solve([])[0], self.solve([group])[0])
 
     def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
-        """Return whether the data show the first column of `always`, in addition to a set."""
+        """Return whether the data show the first column of `always`, in addition to a set.
+
+        That column is the discretisation error of the integrator. Its coefficient must be nearer to
+        one (the full error) than to zero, and it must improve the fit.
+        """
         with_it, parts = self._fit_groups([*chosen, self._nuisance])
         others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
         without, _ = self._fit_groups([*chosen, others])
@@ -138,10 +142,10 @@ class Regression:
         gram: Array | None = None,
         cross: Array | None = None,
     ) -> tuple[float, list[Array]]:
-        """Fit a set of groups by least squares.
+        """Fit a set of groups by least squares, with some coefficients that must be nonnegative.
 
         Constrained coefficients that are negative are fixed at zero one by one, the most negative
-        first.
+        (in units of the length of its column) first, and the others are fitted again.
 
         Args:
             chosen: the groups.
@@ -199,8 +203,12 @@ class Regression:
     def gains(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the gain (n,) in twice the log-likelihood of each group in addition to a set.
 
-        The columns of the set are projected out first. Groups that are collinear with the set, or
+        The columns of the set are projected out of the others first, so that all n groups are
+        fitted at once without solving for the set again. Groups that are collinear with the set, or
         that the set contains, gain nothing.
+
+        Args:
+            chosen: groups of the set; empty for gains over the model itself.
         """
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
@@ -212,6 +220,7 @@ class Regression:
             gram = gram - rows.T @ solved[:, :-1]
             cross = cross - rows.T @ solved[:, -1]
             rss, _ = self.solve(chosen)
+        # Almost nothing of a collinear column remains after the projection.
         is_collinear = np.diagonal(gram) <= COLLINEARITY_TOLERANCE * np.diagonal(self.gram)
         contained_effects = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
@@ -243,8 +252,10 @@ class Regression:
     def select(self, max_groups: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
         """Select effects by forward and backward steps.
 
-        The effect with the largest gain above its price is added if it predicts left-out runs
-        better; then effects that no longer gain their price are removed.
+        The effect with the largest gain above its price, the right side of (2) of the module
+        docstring, is added; then effects that no longer gain their price are removed. The selection
+        ends when no effect gains its price, when the best one does not predict left-out runs
+        better, or when it is removed again at once.
 
         Args:
             max_groups: maximum number of effects.
@@ -283,7 +294,12 @@ class Regression:
         return bool(after.sum() < before.sum() and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
 
     def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
-        """Return the residual sum of squares (R,) of each run, predicted from the other runs."""
+        """Return the residual sum of squares (R,) of each run, predicted from the other runs.
+
+        The products of eq. (1) of a run are subtracted from those of all runs, which gives the fit
+        without that run: rss = e'e - 2 c'h + c'G c with the products G, h of the run and
+        coefficients c of the others.
+        """
         residual_squares = []
         groups = [*chosen, self._nuisance]
         columns = list_columns(groups)
@@ -302,18 +318,20 @@ class Regression:
     def prune(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
         """Remove effects one by one whose gain is below their price, the right side of (2).
 
-        The effect with the smallest net gain is removed first.
+        The gain of an effect is the loss in twice the log-likelihood without it. The effect with
+        the smallest gain minus price is removed first, and the gains of the others are computed
+        again.
         """
         remaining = list(chosen)
         while remaining:
             rss, _ = self.solve(remaining)
-            losses = []
+            net_gains = []
             for group in remaining:
                 others = [other for other in remaining if other is not group]
                 rss_without = self.solve(others)[0]
-                losses.append(self.compute_log_ratio(rss_without, rss) - self.price(group))
-            weakest = int(np.argmin(losses))
-            if losses[weakest] > 0:
+                net_gains.append(self.compute_log_ratio(rss_without, rss) - self.price(group))
+            weakest = int(np.argmin(net_gains))
+            if net_gains[weakest] > 0:
                 break
             del remaining[weakest]
         return remaining
@@ -344,7 +362,11 @@ def list_columns(groups: Sequence[DirectionGroup]) -> IndexArray:
 
 
 def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
-    """Group the columns of the probes of one effect at one grid point, which act together."""
+    """Group the columns of the probes of one effect at one grid point, which act together.
+
+    The index of a column is that of its probe. A grid point is one shape of the effect, for
+    instance one period; the probes of a group differ in the coefficient that scales them.
+    """
     columns_by_group: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(probes):
         columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
@@ -374,11 +396,15 @@ def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> 
 def score_by_regression(
     regression: Regression, names: Collection[str], rng: np.random.Generator
 ) -> CandidateScores:
-    """Score effects by a regression.
+    """Score effects by a regression: gains, their null distributions and p-values.
+
+    The score of an effect is the largest gain of its shapes. Under the null hypothesis each gain
+    follows a chi-squared law, so the maximum over shapes follows from draws and quantiles of it.
+    The p-value of the best effect is multiplied by the number of effects (Bonferroni correction).
 
     Args:
         regression: regression about the model that lacks the effects.
-        names: names of the effects to score.
+        names: names of the effects to score; those without a column in the regression are left out.
         rng: random numbers for draws from the null distribution.
     """
     gains = regression.gains([])
@@ -394,6 +420,7 @@ def score_by_regression(
         degrees_of_freedom = max(len(regression.groups[i].column_indices) for i in group_indices)
         shapes = len(group_indices)
         null_quantiles.append(
+            # The quantile of the maximum of independent draws, one for each shape.
             chi_squared_quantile(degrees_of_freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes))
         )
         null_draws.append(
@@ -463,10 +490,17 @@ def shows_step_errors(followed: FollowedRuns) -> bool:
 def identify(followed: FollowedRuns, columns: Columns, first: Regression | None = None) -> Selected:
     """Select effects, with the process noise fitted again after each selection.
 
+    Process noise stands for missing forces: while it is large, it hides effects. With the selected
+    effects in the linear model the filter needs less noise, and a regression of the new innovations
+    may select others. This is repeated until the log-likelihood gains less than 1.
+
     Args:
         followed: the runs, without any effect.
         columns: inputs of the candidates.
-        first: regression of these runs on the columns, if it is known.
+        first: regression of these runs on the columns, if it is known; None to compute it.
+
+    Returns:
+        The selection with the highest log-likelihood.
     """
     refitted, selected_before = followed, list[DirectionGroup]()
     coefficients: list[Array] = []
@@ -511,29 +545,35 @@ def regress(
 ) -> Regression:
     """Set up the regression of all that effects explain, including those in the linear model.
 
+    The innovations of the filter are what the chosen effects do not explain. Their responses, and
+    the share `numerics` of the response to the integrator's step errors, are added to the
+    innovations. So all effects compete on equal terms. The last column is the response to the step
+    errors.
+
     Args:
         followed: the runs, filtered with the chosen effects in the linear model.
         columns: inputs of the candidates.
         chosen: the effects in the linear model.
         coefficients: coefficients of these effects.
-        numerics: share of the integrator's errors that is in the linear model.
+        numerics: share of the integrator's step errors that is in the linear model.
         always: indices of probes that are part of every set, and are not candidates.
     """
-    responses = followed.responses(columns)
-    run_count, _, _, count = responses.shape
-    nuisance = followed.step_error_response()
+    # Shapes: R runs, T samples, C channels, K candidates; the arrays of a run have rows T C.
+    candidate_responses = followed.responses(columns)
+    run_count, _, _, count = candidate_responses.shape
+    step_error_responses = followed.step_error_response()
     own_columns = list_columns(chosen)
     weights = np.concatenate([*coefficients, np.zeros(0)])
     grams = np.zeros((run_count, count + 1, count + 1))
     crosses, totals = np.zeros((run_count, count + 1)), np.zeros(run_count)
     for run in range(run_count):
-        target = followed.filtered.whitened[run].reshape(-1)
-        rows = responses[run].reshape(target.size, count).astype(np.float64)
-        rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
-        target = target + rows[:, own_columns] @ weights + numerics * rows[:, -1]
+        innovations = followed.filtered.whitened[run].reshape(-1)
+        rows = candidate_responses[run].reshape(innovations.size, count).astype(np.float64)
+        rows = np.concatenate([rows, step_error_responses[run].reshape(-1, 1)], axis=1)
+        innovations = innovations + rows[:, own_columns] @ weights + numerics * rows[:, -1]
         grams[run] = rows.T @ rows
-        crosses[run] = rows.T @ target
-        totals[run] = target @ target
+        crosses[run] = rows.T @ innovations
+        totals[run] = innovations @ innovations
     contains = {
         name: effect.contains for name, effect in followed.evaluator.available_effects.items()
     }
@@ -549,7 +589,7 @@ def follow_linear_with_effects(
     coefficients: Sequence[Array],
     numerics: float,
 ) -> FollowedRuns:
-    """Put effects into the linear model, and fit the process noise again.
+    """Subtract the forces and readings of effects from the runs, and fit the process noise again.
 
     Args:
         followed: the runs, without any effect.

@@ -141,8 +141,11 @@ class _Trial:
 def has_unknown_servos(context: SearchContext) -> bool:
     """Return whether a robot has several joints, all with encoders and with servos of unknown gain.
 
+    Only then the servos are identified joint by joint. Gains are unknown if stiffness and damping
+    of every servo are free parameters of the base model.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
     """
     evaluator = context.evaluator
     coordinates = evaluator.simulator.system.coordinates
@@ -159,8 +162,12 @@ def has_unknown_servos(context: SearchContext) -> bool:
 def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]:
     """Identify the servos of a robot that `has_unknown_servos`.
 
+    See the module docstring for the method. Laws (effects without their place) are chosen by some
+    of the runs; only joints whose last law helped are considered again in the next round. The
+    parameters are then fitted to all runs, and effects without a gain are removed.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
 
     Returns:
         The effects with all parameters, and the gain of each effect: the loss in twice the
@@ -173,13 +180,15 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
     spread = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
     fitter = _ServoFitter(context, spread.round().astype(np.intp))
     joint_model = model = fitter.fit_joint_model()
-    growing = set(range(len(evaluator.channels)))
+    growing_joints = set(range(len(evaluator.channels)))
     for number in range(MAX_ROUNDS):
-        if not growing or evaluator.search_control.is_over():
+        if not growing_joints or evaluator.search_control.is_over():
             break
         evaluator.search_control.begin_stage(f"identifying the servos, round {number + 1}")
-        larger = fitter.add_laws(model, growing & fitter.list_far_from_noise(model))
-        growing = {joint for joint in growing if larger.laws[joint] != model.laws[joint]}
+        larger = fitter.add_laws(model, growing_joints & fitter.list_far_from_noise(model))
+        growing_joints = {
+            joint for joint in growing_joints if larger.laws[joint] != model.laws[joint]
+        }
         model = fitter.share_laws(larger, joint_model)
     final_fitter = _ServoFitter(context, all_runs)
     model = final_fitter.fit(final_fitter.simulate(model.theta, model.laws), FINAL_ITERATIONS)
@@ -204,7 +213,7 @@ class _ServoFitter:
     """Fits the parameters of each joint to its own position.
 
     Attributes:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         runs: (R,) indices of the runs.
     """
 
@@ -242,7 +251,7 @@ class _ServoFitter:
 
     @cached_property
     def _places(self) -> list[tuple[str, str, str]]:
-        """Joint, actuator and position channel of each joint."""
+        """List joint, actuator and position channel of each joint, at which effects may act."""
         evaluator = self._evaluator
         return [
             (
@@ -255,7 +264,11 @@ class _ServoFitter:
 
     @cached_property
     def _laws_at_joint(self) -> list[dict[str, str]]:
-        """Effects of each joint's servo, transmission and sensor with few coefficients, by law."""
+        """Map laws to effects for each joint, for example ``drag.linear`` to ``drag.linear@elbow``.
+
+        These are the effects of the joint's servo, transmission and sensor with few coefficients
+        and without own states, which the fit by blocks does not know.
+        """
         evaluator = self._evaluator
         result: list[dict[str, str]] = []
         for places in self._places:
@@ -296,9 +309,13 @@ class _ServoFitter:
         return bounds
 
     def fit_joint_model(self) -> ServoModel:
-        """Fit the servos, and then dry friction at the joints whose residual it reduces."""
-        none: list[tuple[str, ...]] = [()] * len(self._joints)
-        start = self.simulate(self.context.search.base_model.fit.theta, none)
+        """Fit the servos, and then dry friction at the joints whose residual it reduces.
+
+        Friction is tried at all joints in one fit, since joints hardly influence each other. It is
+        kept only where it helps.
+        """
+        no_laws: list[tuple[str, ...]] = [()] * len(self._joints)
+        start = self.simulate(self.context.search.base_model.fit.theta, no_laws)
         model = self.fit(start, FIRST_ITERATIONS)
         theta, laws = model.theta.copy(), list(model.laws)
         for joint, available in enumerate(self._laws_at_joint):
@@ -307,8 +324,10 @@ class _ServoFitter:
                 slot = self._evaluator.coefficient_slices[available[DRY_FRICTION]]
                 theta[slot] = TRIED_SHARES[0] * self._evaluator.parameters[slot.start].bounds[1]
         larger = self.fit(self.simulate(theta, laws), FIRST_ITERATIONS)
-        helped = {joint: larger for joint in self._joints if self._helps(model, larger, joint)}
-        return self._join(model, helped)
+        improved_joints = {
+            joint: larger for joint in self._joints if self._helps(model, larger, joint)
+        }
+        return self._join(model, improved_joints)
 
     def simulate(self, theta: Array, laws: Sequence[tuple[str, ...]]) -> ServoModel:
         """Simulate the runs from the initial states of the base model."""
@@ -334,26 +353,33 @@ class _ServoFitter:
     def _compute_jacobians(self, model: ServoModel, joints: Sequence[int]) -> dict[int, Array]:
         """Compute the block of the Jacobian of each joint by forward differences.
 
+        A joint's position hardly depends on the parameters of other joints. So one simulation
+        displaces one parameter of every joint at once, and there are only as many simulations as
+        one joint has parameters.
+
         Args:
             model: the model about which parameters are displaced.
             joints: the joints whose blocks are computed.
 
         Returns:
-            The block (R T, k) of each joint with its k parameters.
+            The block (R T, k) of each joint: derivatives of its positions by its k parameters, in
+            units of the noise.
         """
-        places = {joint: self._list_parameters(joint, model.laws[joint]) for joint in joints}
+        parameter_indices = {
+            joint: self._list_parameters(joint, model.laws[joint]) for joint in joints
+        }
         size = self._mask[:, :, 0].size
-        blocks = {joint: np.empty((size, len(places[joint]))) for joint in joints}
-        for number in range(max(map(len, places.values()))):
+        blocks = {joint: np.empty((size, len(parameter_indices[joint]))) for joint in joints}
+        for column in range(max(map(len, parameter_indices.values()))):
             theta, steps = model.theta.copy(), dict[int, float]()
-            for joint, indices in places.items():
-                if number < len(indices):
-                    steps[joint] = self._compute_difference(model.theta, joint, indices[number])
-                    theta[indices[number]] += steps[joint]
+            for joint, indices in parameter_indices.items():
+                if column < len(indices):
+                    steps[joint] = self._compute_difference(model.theta, joint, indices[column])
+                    theta[indices[column]] += steps[joint]
             displaced = self.simulate(theta, model.laws)
             for joint, step in steps.items():
                 change = self._compute_change(displaced, model, joint)
-                blocks[joint][:, number] = change / step
+                blocks[joint][:, column] = change / step
         return blocks
 
     def _compute_difference(self, theta: Array, joint: int, index: int) -> float:
@@ -369,7 +395,8 @@ class _ServoFitter:
     ) -> ServoModel:
         """Fit the parameters of joints by Levenberg-Marquardt steps, all joints at once.
 
-        A joint accepts a step if it reduces the joint's own squared residual.
+        A joint accepts a step if it reduces the joint's own squared residual. It leaves the fit
+        when its steps gain little or when its damping is large.
 
         Args:
             model: the start.
@@ -395,9 +422,13 @@ class _ServoFitter:
     def _step(self, model: ServoModel, damping: dict[int, float]) -> ServoModel | None:
         """Return the model after a step of the joints that accept it; None if none does.
 
+        A joint accepts if its own squared residual decreases. Its damping then decreases; otherwise
+        it increases. The step is tried again with the new dampings until at least one joint
+        accepts.
+
         Args:
             model: the present model.
-            damping: damping of each joint that is fitted; it is changed.
+            damping: Levenberg-Marquardt damping of each joint that is fitted; it is changed.
         """
         blocks = self._compute_jacobians(model, list(damping))
         residual = self._compute_residual(model.simulated)
@@ -435,22 +466,31 @@ class _ServoFitter:
         clipped: Array = np.clip(stepped, *np.array(self._get_bounds(joint, laws)).T)
         return clipped
 
-    def _join(self, model: ServoModel, chosen: Mapping[int, ServoModel]) -> ServoModel:
-        """Return the model in which some joints have the parameters and laws of other models."""
+    def _join(self, model: ServoModel, model_of_joint: Mapping[int, ServoModel]) -> ServoModel:
+        """Return the model in which some joints have the parameters and laws of other models.
+
+        It is simulated, unless one of the other models has exactly these parameters.
+        """
         theta, laws = model.theta.copy(), list(model.laws)
-        for joint, other in chosen.items():
+        for joint, other in model_of_joint.items():
+            # Remove the joint's present laws before it gets the others.
             for name in laws[joint]:
                 theta[self._evaluator.coefficient_slices[name]] = 0.0
             laws[joint] = other.laws[joint]
             indices = self._list_parameters(joint, laws[joint])
             theta[indices] = other.theta[indices]
-        for other in chosen.values():
+        for other in model_of_joint.values():
             if np.array_equal(other.theta, theta):
                 return replace(other, laws=tuple(laws))
         return self.simulate(theta, laws)
 
     def add_laws(self, model: ServoModel, joints: Collection[int]) -> ServoModel:
         """Add to each joint the law that reduces its squared residual most, and fit all joints.
+
+        The gain of every law is estimated first; then the best laws of each joint are fitted, in a
+        first fit the best of every joint, in the next fit the second best, and so on. Each fit
+        starts from the parameters of the model, or from those that the estimate changed together
+        with the law, whichever simulate the joint better.
 
         Args:
             model: the fitted model.
@@ -461,11 +501,9 @@ class _ServoFitter:
         """
         trials = self._estimate_gains(model, joints) if joints else {}
         best = dict[int, ServoModel]()
-        for number in range(MAX_FITTED_LAWS):
+        for rank in range(MAX_FITTED_LAWS):
             chosen = {
-                joint: at_joint[number]
-                for joint, at_joint in trials.items()
-                if number < len(at_joint)
+                joint: at_joint[rank] for joint, at_joint in trials.items() if rank < len(at_joint)
             }
             if not chosen or self._evaluator.search_control.is_over():
                 break
@@ -477,8 +515,8 @@ class _ServoFitter:
             for joint, trial in chosen.items():
                 theta[self._list_parameters(joint, model.laws[joint])] = trial.parameters
             adapted = self.simulate(theta, laws)
-            nearer = [joint for joint in chosen if adapted.costs[joint] < start.costs[joint]]
-            start = self._join(start, dict.fromkeys(nearer, adapted))
+            better_joints = [joint for joint in chosen if adapted.costs[joint] < start.costs[joint]]
+            start = self._join(start, dict.fromkeys(better_joints, adapted))
             fitted = self.fit(start, TRIAL_ITERATIONS, list(chosen))
             for joint in chosen:
                 present = best.get(joint, model)
@@ -492,7 +530,9 @@ class _ServoFitter:
         """Try the laws of the joint that improved most at all other joints.
 
         Robots often have the same servo at several joints, and another law at one of them may be a
-        local optimum.
+        local optimum. Starts have the coefficients of that joint times several factors, with and
+        without its correction of stiffness and damping. Each joint is fitted from its best start,
+        and keeps the laws only if they are better than its own.
 
         Args:
             model: the fitted model.
@@ -501,16 +541,16 @@ class _ServoFitter:
         Returns:
             The model in which those joints have these laws that are simulated better with them.
         """
-        donor = int(np.argmin(model.costs / joint_model.costs))
+        best_joint = int(np.argmin(model.costs / joint_model.costs))
         theta, laws, joints = joint_model.theta.copy(), list(joint_model.laws), list[int]()
         for joint, available in enumerate(self._laws_at_joint):
-            for name in model.laws[donor]:
+            for name in model.laws[best_joint]:
                 law = name.partition("@")[0]
                 slot = self._evaluator.coefficient_slices.get(available.get(law, ""))
                 if slot is not None and available[law] not in laws[joint]:
                     laws[joint] = (*laws[joint], available[law])
                     theta[slot] = model.theta[self._evaluator.coefficient_slices[name]]
-            if joint != donor and set(laws[joint]) != set(model.laws[joint]):
+            if joint != best_joint and set(laws[joint]) != set(model.laws[joint]):
                 joints.append(joint)
         if not joints:
             return model
@@ -518,8 +558,8 @@ class _ServoFitter:
         # The same servo needs the same correction of its stiffness and damping.
         corrected = theta.copy()
         for joint in joints:
-            donor_indices = self._list_parameters(donor, ())
-            corrected[self._list_parameters(joint, ())] = model.theta[donor_indices]
+            best_joint_indices = self._list_parameters(best_joint, ())
+            corrected[self._list_parameters(joint, ())] = model.theta[best_joint_indices]
         coefficients = [
             i
             for joint in joints
@@ -532,8 +572,8 @@ class _ServoFitter:
                 scaled = start.copy()
                 scaled[coefficients] *= factor
                 starts.append(self.simulate(scaled, laws))
-        nearest = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
-        shared = self.fit(self._join(starts[0], nearest | others), SHARED_ITERATIONS, joints)
+        nearest_starts = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
+        shared = self.fit(self._join(starts[0], nearest_starts | others), SHARED_ITERATIONS, joints)
         better = [joint for joint in joints if self._is_better(shared, model, joint)]
         if not better:
             return model
@@ -550,9 +590,9 @@ class _ServoFitter:
         return set(np.flatnonzero(mean_squares > MIN_RESIDUAL**2).tolist())
 
     def _helps(self, model: ServoModel, larger: ServoModel, joint: int) -> bool:
-        """Return whether a larger model reduces a joint's residual enough.
+        """Return whether a larger model reduces a joint's squared residual enough.
 
-        It must do so even without the run that gains most.
+        It must do so even without the run that gains most, so that one odd run does not decide.
         """
         before, after = (
             np.square(self._compute_residual(one.simulated)[:, :, joint]).sum(axis=1)
@@ -568,6 +608,10 @@ class _ServoFitter:
         self, model: ServoModel, joints: Collection[int]
     ) -> dict[int, list[_Trial]]:
         """Simulate every law at joints, and return the best trials of each joint, best first.
+
+        Each law is simulated with a few coefficients of either sign. Its gain, together with a
+        change of the joint's present parameters, is estimated by linear least squares. Laws that
+        gain far less than the best one of the joint are left out.
 
         Args:
             model: the fitted model.
@@ -608,12 +652,15 @@ class _ServoFitter:
     ) -> Iterator[tuple[_Trial, int]]:
         """Simulate a law at several joints at once, and yield its estimated gain at each.
 
+        The joints do not influence each other much, so one simulation is enough. Trials with a
+        small gain are not yielded.
+
         Args:
             model: the fitted model.
             names: the law's effect at each joint.
             share: coefficients as a share of their usual range; negative for the lower end.
             blocks: block of the Jacobian of each joint.
-            residual: (R, T, n) residual of the model.
+            residual: (R, T, n) residual of the model in units of the noise; n joints.
         """
         evaluator = self._evaluator
         theta, coefficients = model.theta.copy(), dict[int, Array]()
@@ -630,16 +677,17 @@ class _ServoFitter:
         displaced = self.simulate(theta, model.laws)
         for joint, c in coefficients.items():
             change = self._compute_change(displaced, model, joint)
-            block, left = blocks[joint], residual[:, :, joint].ravel()
-            gain = _estimate_gain(block, change, left)
+            block, joint_residual = blocks[joint], residual[:, :, joint].ravel()
+            gain = _estimate_gain(block, change, joint_residual)
             if gain > MIN_ESTIMATED_GAIN:
-                parameters = self._step_parameters(model, joint, block, left - change)
+                parameters = self._step_parameters(model, joint, block, joint_residual - change)
                 yield _Trial(gain, names[joint], c, parameters), joint
 
     def compute_gains(self, model: ServoModel) -> dict[str, float]:
         """Return the loss in twice the log-likelihood without each effect, by the Wald statistic.
 
-        The residual of each joint is taken as white noise. Effects without a gain are left out.
+        The residual of each joint is taken as white noise, whose variance is its mean square.
+        Effects that gain less than their penalty are left out.
 
         Args:
             model: the fitted model.
@@ -673,6 +721,9 @@ def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
 def _estimate_gain(block: Array, change: Array, residual: Array) -> float:
     """Estimate the gain of a law together with the parameters that are already in the model.
 
+    What these parameters can explain is projected out of the change and of the residual (by a QR
+    decomposition). The rest of the change is then scaled to reduce the rest of the residual.
+
     Args:
         block: (m, k) derivatives of the samples by these parameters.
         change: (m,) change of the samples by the law.
@@ -685,11 +736,13 @@ def _estimate_gain(block: Array, change: Array, residual: Array) -> float:
     low, high = SCALE_LIMITS
     norms = np.linalg.norm(block, axis=0)
     basis, _ = np.linalg.qr(block[:, norms > 0.0] / norms[norms > 0.0])
-    rest, left = change - basis @ (basis.T @ change), residual - basis @ (basis.T @ residual)
-    square = float(rest @ rest)
-    scale = float(rest @ left) / square if square > 0.0 else 0.0
+    projected_change = change - basis @ (basis.T @ change)
+    projected_residual = residual - basis @ (basis.T @ residual)
+    square = float(projected_change @ projected_change)
+    scale = float(projected_change @ projected_residual) / square if square > 0.0 else 0.0
     if not scale > low:
         return 0.0
     scale = min(scale, high)
-    remaining = left - scale * rest
-    return float(left @ left - remaining @ remaining) / float(residual @ residual)
+    remaining = projected_residual - scale * projected_change
+    reduction = projected_residual @ projected_residual - remaining @ remaining
+    return float(reduction) / float(residual @ residual)

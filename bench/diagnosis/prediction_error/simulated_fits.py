@@ -56,11 +56,15 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
 
     If the residual is large, the fit is repeated with derivatives by the first states about the
     simulated motion, because those about the measured motion may be invalid. Dry friction is then
-    fitted again from nearby coefficients.
+    fitted again from nearby coefficients, because its fit may stop in a local minimum.
 
     Args:
-        context: context of the search.
-        start: start of the fit.
+        context: search, filters and regressions of the recording.
+        start: the effects, with first parameters and initial states.
+
+    Returns:
+        The fitted model, even if it does not explain the runs; its cost is infinite if simulation
+        fails.
     """
     search, evaluator = context.search, context.evaluator
     if context.filters.base.is_on_ground:
@@ -88,7 +92,7 @@ def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Fit a set by simulation, starting from the coefficients of its filter.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         current: the set.
     """
     states = context.filters.estimate_first_states(current.followed)
@@ -99,7 +103,7 @@ def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedM
     """Fit a model again from the best of several nearby coefficients of an effect.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
         name: name of the effect.
     """
@@ -108,12 +112,13 @@ def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedM
 
 
 def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) -> list[FitStart]:
-    """Return starts with nearby coefficients of an effect.
+    """Return starts with nearby coefficients of an effect, each changed by several factors.
 
-    Initial states are those of the fit, or those that were measured.
+    The cost of a fit has local minima, for instance where joints stick; one of these starts may lie
+    beyond. Initial states are those of the fit, or those that were measured.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
         name: name of the effect.
     """
@@ -135,12 +140,15 @@ def select_lowest_of_each(
 ) -> list[tuple[float, FitStart]]:
     """Simulate starts, and return the one with the lowest cost for each set of effects.
 
+    Simulating all starts once, without a fit, is cheap. Only these best starts are then fitted.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         starts: the starts.
 
     Returns:
-        The cost and the start for each set, in ascending order of the cost.
+        The cost (sum of squared residuals in units of the noise) and the start for each set, in
+        ascending order of the cost. A start that cannot be simulated has an infinite cost.
     """
     if not starts:
         return []
@@ -161,7 +169,7 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     the friction has MuJoCo's soft form (`filters.is_soft` if the simulator has that form already).
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     if is_at_noise(context, model):
@@ -179,7 +187,7 @@ def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
     """Return whether a fitted model leaves only noise.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     return (
@@ -192,7 +200,7 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
     """Return whether a model removes most of the discrepancy.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     compute_excess = context.search.compute_excess_residual
@@ -215,7 +223,7 @@ def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedMod
     """Remove effects that do not pay, and replace a family by a member that is as good.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     model = _merge_into_families(context, context.search.drop_unneeded_effects(model))
@@ -288,7 +296,7 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     It is not fitted if simulation is slow and the filter shows that a force is still missing.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
 
     Returns:
@@ -306,9 +314,15 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
 def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit the selected set by simulation, and drop effects that do not pay there.
 
+    If the innovations show errors of the integrator's steps, the fit is corrected for them.
+
     Args:
-        context: context of the search.
-        selected: the selection.
+        context: search, filters and regressions of the recording.
+        selected: the selection by regression, with coefficients to start from.
+
+    Returns:
+        The fitted model; the base model if it is more likely, if the selection is empty, or if it
+        cannot be simulated.
     """
     base = context.search.base_model
     if not selected.groups:
@@ -327,33 +341,33 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
 def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected:
     """Drop the last effects of a selection that gain little with the set in a filter's model.
 
-    Far from the base model, the linear regression is wrong.
+    Far from the base model, the linear regression is wrong. So the first one, two, three, ...
+    effects of the selection are put into a filter's model. The number of effects with the largest
+    gain minus penalty is kept. The trials end when several further effects do not gain enough.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection.
     """
     filters = context.filters
     base_log_likelihood = filters.base.log_likelihood
-    best_net_gain, best_count, best_gain = 0.0, 0, 0.0
+    best_net_gain, kept_count, best_gain = 0.0, 0, 0.0
     best_coefficients: list[Array] = []
     for count in range(1, len(selected.groups) + 1):
-        if count > best_count + MAX_SURPLUS:
+        if count > kept_count + MAX_SURPLUS:
             break
         groups = selected.groups[:count]
         coefficients = selected.regression.solve(groups)[1]
         theta = context.columns.start(groups, coefficients).theta
         gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
         penalty = sum(filters.penalty(group.effect) for group in groups)
-        min_gain = MIN_FURTHER_GAIN_SHARE * max(best_gain, 0.0) * (count - best_count)
+        min_gain = MIN_FURTHER_GAIN_SHARE * max(best_gain, 0.0) * (count - kept_count)
         if gain - penalty > best_net_gain and gain - best_gain > min_gain:
-            best_net_gain, best_count, best_gain, best_coefficients = (
-                gain - penalty,
-                count,
-                gain,
-                coefficients,
-            )
-    return replace(selected, groups=selected.groups[:best_count], coefficients=best_coefficients)
+            best_net_gain = gain - penalty
+            kept_count = count
+            best_gain = gain
+            best_coefficients = coefficients
+    return replace(selected, groups=selected.groups[:kept_count], coefficients=best_coefficients)
 
 
 def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
@@ -378,9 +392,15 @@ def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
 def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
     """Select again with effects of many shapes, at the joints where a force is missing.
 
+    These effects, such as forces of any period, are many and slow to test, so they are left out of
+    the first selection.
+
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the previous selection.
+
+    Returns:
+        The new selection; the previous one if the library has no such effects at these joints.
     """
     evaluator, missing_forces = context.evaluator, selected.followed.missing_forces
     # A selection that leaves no force missing but does not explain simulated runs is wrong.

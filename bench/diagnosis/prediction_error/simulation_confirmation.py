@@ -63,7 +63,10 @@ class Confirmation(Inquiry):
         self._robot = search
 
     def answered(self) -> DiagnosisResult:
-        """Return the result of the complete diagnosis.
+        """Return the result of the complete diagnosis, by the steps of the module docstring.
+
+        The search stops at once if the base model does not fit at all. A set that filters
+        identified in an incomplete model gets its result without competing models and alternatives.
 
         Raises:
             SearchStoppedError: the search had to end early.
@@ -115,13 +118,15 @@ class Confirmation(Inquiry):
         return self._make_result(verdict, base, model, causes, lack_of_fit)
 
     def _build_filter_result(self, identified: IdentifiedSet) -> DiagnosisResult:
-        """Return the result for a set that filters identified in a model that stays incomplete."""
-        search, search_control, model, trial = (
-            self._robot,
-            self._search_control,
-            identified.model,
-            None,
-        )
+        """Return the result for a set that filters identified in a model that stays incomplete.
+
+        The causes are the identified effects, in descending order of their gain. The verdict always
+        counts an unexplained residual, since the model is known to be incomplete.
+        """
+        search = self._robot
+        search_control = self._search_control
+        model = identified.model
+        trial = None
         if self._held_out is not None:
             search_control.begin_question("held_out")
             trial = self._trial = HeldOutValidation(self._held_out)

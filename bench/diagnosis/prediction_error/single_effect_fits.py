@@ -40,10 +40,13 @@ MAX_IMPROVED_SIZE = 3
 
 
 def fit_single_effects(context: SearchContext) -> FittedModel:
-    """Fit each of the proposed effects alone.
+    """Fit each of the proposed effects alone, by simulation.
+
+    A regression misjudges effects where a servo is at its limit, so the effects that are most
+    likely missing are fitted in one batch, and the best of them to convergence.
 
     Returns:
-        The best model, or the base model if none explains the runs.
+        The best model without effects that do not pay, or the base model if none explains the runs.
 
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
@@ -68,15 +71,18 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
 
 
 def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel]) -> FittedModel:
-    """Fit some effects alone to convergence, and return the model with the highest merit.
+    """Fit some effects alone to convergence, and return the likeliest model after penalties.
 
-    Those with the lowest cost are fitted first. Fits may stop in local minima where joints stick
-    and at force limits, and likelihoods with coloured noise are unreliable if the residual is
-    large.
+    Those with the lowest cost are fitted first, from the fit and from nearby coefficients. Fits may
+    stop in local minima where joints stick and at force limits, and likelihoods with coloured noise
+    are unreliable if the residual is large.
 
     Args:
-        context: context of the search.
-        fitted: models with a single effect.
+        context: search, filters and regressions of the recording.
+        fitted: models with a single effect, fitted in few steps.
+
+    Returns:
+        The best model, or the base model if that is likelier.
     """
     starts: list[FitStart] = []
     for model in fitted:
@@ -97,11 +103,15 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
 def fit_series_effects(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit elastic joints and backlash between drive and links at the most affected joint.
 
-    These effects have their own states, so each shape is simulated.
+    These effects have their own states, so a regression cannot score them. Each shape is simulated;
+    the best of each effect is fitted; the likeliest is fitted to convergence.
 
     Args:
-        context: context of the search.
+        context: search, filters and regressions of the recording.
         selected: the selection, whose missing forces determine the joint.
+
+    Returns:
+        The fitted model, whether or not it is good; the base model if there are no such effects.
     """
     evaluator, search = context.evaluator, context.search
     joints = selected.followed.joints_by_loss[:1]
