@@ -297,16 +297,20 @@ class ConventionComparison:
         if not filtered_runs.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
-        relative_forces = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
+        relative_missing_forces = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
         is_missing = (
-            filtered_runs.missing_forces.any() or relative_forces.max() > ABSURD_MISSING_FORCE
+            filtered_runs.missing_forces.any()
+            or relative_missing_forces.max() > ABSURD_MISSING_FORCE
         )
-        if not is_missing or relative_forces.max() <= MIN_MISSING_FORCE:
+        if not is_missing or relative_missing_forces.max() <= MIN_MISSING_FORCE:
             return []
-        limit = min(SUSPECT_SHARE * max(1.0, float(relative_forces.max())), MAX_SUSPECT_LIMIT)
-        if relative_forces.max() < LARGE_MISSING_FORCE:
-            limit = SIMILAR_SHARE * float(relative_forces.max())
-        relative_force_of = dict(zip(coordinates, relative_forces.tolist(), strict=True))
+        # A wrong joint disturbs others, so the limit grows with the largest force.
+        limit = min(
+            SUSPECT_SHARE * max(1.0, float(relative_missing_forces.max())), MAX_SUSPECT_LIMIT
+        )
+        if relative_missing_forces.max() < LARGE_MISSING_FORCE:
+            limit = SIMILAR_SHARE * float(relative_missing_forces.max())
+        relative_force_of = dict(zip(coordinates, relative_missing_forces.tolist(), strict=True))
         return [j for j in self._generator.joints if relative_force_of[f"q.{j.name}"] > limit]
 
     def _find_best_hypothesis(
@@ -344,8 +348,10 @@ class ConventionComparison:
                 continue
             evaluated_changes.append(key)
             # 2. Cheap tests.
-            growth = self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
-            if growth > MAX_FORCE_ERROR_GROWTH:
+            force_error_growth = (
+                self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
+            )
+            if force_error_growth > MAX_FORCE_ERROR_GROWTH:
                 continue
             if (
                 not self._compute_log_likelihood(hypothesis, recording, worst_run)
@@ -375,9 +381,11 @@ class ConventionComparison:
             for score, rated_hypothesis in accepted
             if score > best - EQUAL_LOG_LIKELIHOOD
         ]
-        first, *others = sorted(equally_likely, key=lambda rated_hypothesis: rated_hypothesis.size)
+        simplest, *others = sorted(
+            equally_likely, key=lambda rated_hypothesis: rated_hypothesis.size
+        )
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
-        return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
+        return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
 
     def _compute_log_force_error(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int
@@ -397,8 +405,10 @@ class ConventionComparison:
         """
         kind: Any = self.subject.kind
         robot: RobotModel = kind.robot
-        names = [name for name in hypothesis.changes if name not in recording.runs[0].inputs]
-        if not all(name.startswith("q.") for name in names) or not has_joint_forces(
+        changed_channels = [
+            name for name in hypothesis.changes if name not in recording.runs[0].inputs
+        ]
+        if not all(name.startswith("q.") for name in changed_channels) or not has_joint_forces(
             robot, recording
         ):
             return -np.inf
@@ -421,11 +431,15 @@ class ConventionComparison:
             recording: segments of the recording.
         """
         inputs = recording.runs[0].inputs
-        changes = hypothesis.changes
-        scales_inputs = all(name in inputs and abs(c.scale) != 1.0 for name, c in changes.items())
-        if not changes or not scales_inputs:
+        signal_changes = hypothesis.changes
+        scales_inputs = all(
+            name in inputs and abs(c.scale) != 1.0 for name, c in signal_changes.items()
+        )
+        if not signal_changes or not scales_inputs:
             return True
-        switched_off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
+        switched_off = {
+            name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in signal_changes.items()
+        }
         score_without_inputs = self._compute_log_likelihood(
             replace(hypothesis, changes=switched_off), recording
         )
@@ -498,7 +512,6 @@ class ConventionComparison:
             evaluator,
             evaluator.get_nominal_theta(),
             _estimate_white_noise(evaluator, recording),
-            None,
             max_linearisations=max_linearisations,
         )
         evaluator.close()
@@ -536,7 +549,6 @@ class ConventionComparison:
             evaluator,
             evaluator.get_nominal_theta(),
             _estimate_white_noise(evaluator, segments),
-            None,
         )
         if not filtered.has_expected_innovations:
             evaluator.close()
@@ -670,10 +682,11 @@ def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) 
 
 
 def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
-    """Return the largest log-likelihood with dry friction in MuJoCo's soft form.
+    """Return the largest log-likelihood with dry friction in MuJoCo's soft form, of several sizes.
 
-    The friction acts at the joint with the largest missing force, and is not part of the
-    regression. The result is minus infinity without such an effect.
+    The friction acts at the joint with the largest missing force. The regression cannot propose it,
+    because its force depends on MuJoCo's constraint solver. The result is minus infinity without
+    such an effect.
 
     Args:
         followed: Result of the filter without this friction.
@@ -693,7 +706,8 @@ def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
 def _select_liveliest_part(run: Run) -> slice:
     """Return the slice of a run, of `PART_SAMPLES` samples, in which its channels move most.
 
-    Hypotheses are compared on such segments, because filtering whole runs would take too long.
+    Hypotheses are compared on such segments, because filtering whole runs would take too long. The
+    starts that are compared are half a segment apart.
     """
     # The commands after the end of a run are not known, and a hypothesis may move them.
     count = run.times.size - max(LATE_SAMPLES)

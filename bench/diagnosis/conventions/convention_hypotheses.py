@@ -164,21 +164,24 @@ class ConventionHypothesis:
 
 
 def _advance_inputs(run: Run, delay: float) -> Run:
-    """Return a run with its inputs earlier by a delay in s; without its end, whose inputs are lost.
+    """Return a run with its inputs earlier by a delay in s, without its end, where they are lost.
 
     Samples are moved instead of the offset of the time stamps, because a part of a run contains no
-    inputs after its end.
+    inputs after its end. Inputs that are linear between samples are interpolated; others hold their
+    last value.
     """
-    stamps = run.times + delay
-    count = int(np.searchsorted(stamps, run.times[-1] + 0.5 * delay, side="right"))
+    shifted_times = run.times + delay
+    count = int(np.searchsorted(shifted_times, run.times[-1] + 0.5 * delay, side="right"))
     count = min(max(count, 2), run.times.size)
     inputs = {}
     for name, values in run.inputs.items():
         if name in run.linear:
-            advanced = np.interp(stamps, run.times, values)
+            advanced = np.interp(shifted_times, run.times, values)
         else:
             # The tolerance is for stamps that differ by rounding.
-            last_indices = np.searchsorted(run.times, stamps + 1e-6 * delay, side="right") - 1
+            last_indices = (
+                np.searchsorted(run.times, shifted_times + 1e-6 * delay, side="right") - 1
+            )
             advanced = values[last_indices]
         inputs[name] = advanced
     return replace(run, inputs=inputs).part(slice(0, count))
@@ -299,7 +302,8 @@ class HypothesisGenerator:
     def _generate_normalised_positions(self) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses that positions and commands are shares of the range of each joint.
 
-        The shares are in percent, from 0 or from -100 to 100, as LeRobot records them.
+        The shares are in percent, from 0 to 100 or from -100 to 100, as LeRobot records them. Only
+        joints with a range in the model are changed.
         """
         limited = [joint for joint in self.joints if joint.range and "q" in joint.channels]
         if not limited:
@@ -322,7 +326,8 @@ class HypothesisGenerator:
 def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses of a reversed sign at a joint.
 
-    They are: position with velocity, command, velocity alone, torque alone, and the whole axis.
+    They are: position with velocity, the commands, velocity alone, torque alone, and the whole axis
+    (all signals of the joint).
     """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
@@ -381,6 +386,9 @@ def _generate_wrapped_angles(
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that recorded angles jump by whole turns, which have to be added again.
 
+    An encoder may count only within one turn. An angle of a hinge that jumps by nearly a turn
+    between two samples is such a case; the command then shows the right turn.
+
     Args:
         joints: joints with their recorded signals.
         recording: the recording, whose training runs are examined.
@@ -408,8 +416,8 @@ def _generate_joint_orders(
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that the columns of the log belong to the joints in another order.
 
-    The channels, the commands, or both have this order. Pairs of suspects are exchanged. Orders of
-    all joints are the alphabetical one, the reversed one, and the one in which positions follow
+    The channels, the commands, or both may have this order. Tried are exchanges of two suspects,
+    the alphabetical order and its inverse, the reversed one, and the one in which positions follow
     commands best. An order maps the index of a joint to the index of the joint whose columns it
     has.
 
@@ -422,7 +430,7 @@ def _generate_joint_orders(
     has_commands = all(len(joint.inputs) == 1 for joint in joints)
     quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
     suspect_indices = [i for i in indices if joints[i] in suspects]
-    orders = [{a: b, b: a} for a, b in combinations(suspect_indices, 2)]
+    orders = [{one: other, other: one} for one, other in combinations(suspect_indices, 2)]
     alphabetical = sorted(indices, key=lambda i: joints[i].name)
     orders += [
         {i: alphabetical.index(i) for i in indices},
@@ -432,13 +440,13 @@ def _generate_joint_orders(
     if has_commands and "q" in quantities:
         orders.append(_find_order_of_commands(joints, recording))
     for order in orders:
-        exchanged = {a: b for a, b in order.items() if a != b}
+        exchanged = {joint: source for joint, source in order.items() if joint != source}
         if not exchanged:
             continue
-        names = join_first_names([joints[a].name for a in sorted(exchanged)], MAX_NAMED)
+        names = join_first_names([joints[joint].name for joint in sorted(exchanged)], MAX_NAMED)
         channels = {
-            joints[a].channels[q]: SignalChange(joints[b].channels[q])
-            for a, b in exchanged.items()
+            joints[joint].channels[q]: SignalChange(joints[source].channels[q])
+            for joint, source in exchanged.items()
             for q in quantities
         }
         if channels:
@@ -446,7 +454,8 @@ def _generate_joint_orders(
         if not has_commands:
             continue
         commands = {
-            joints[a].inputs[0]: SignalChange(joints[b].inputs[0]) for a, b in exchanged.items()
+            joints[joint].inputs[0]: SignalChange(joints[source].inputs[0])
+            for joint, source in exchanged.items()
         }
         yield ConventionHypothesis(f"the commands of {names} look exchanged", commands)
         if channels:
@@ -478,8 +487,9 @@ def _generate_units(
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that some signals have another unit than the description states.
 
-    The signals share a stated unit. If all values of an angle are integers, encoder ticks are tried
-    as well.
+    The signals share a stated unit, such as radians; each other unit of that quantity is a factor.
+    If all values of an angle are integers, encoder ticks are tried as well, with the zero at 0 or
+    at half a turn.
 
     Args:
         signals: signals with the same stated unit.
@@ -576,6 +586,7 @@ def find_copied_commands(
     """
     robot: Any = kind.robot  # type: ignore[attr-defined]
     for actuator in robot.actuators:
+        # A position servo is compared with the position, a velocity servo with the velocity.
         quantity = MEASURED_QUANTITIES.get(actuator.kind)
         command, channel = f"u.{actuator.name}", f"{quantity}.{actuator.joint}"
         runs = [run for run in recording.runs if command in run.inputs and channel in run.channels]
@@ -613,6 +624,7 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
     channel_table = meta.get("channels", {}).get(channel, {})
     position_column = (_list_columns(channel_table) or [channel])[0]
     best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
+    # The first log with the position decides.
     for log in _iterate_logs(description):
         if position_column not in log.list_columns():
             continue

@@ -31,6 +31,9 @@ def correct_description(
 ) -> dict[str, Any]:
     """Return the content of a description file with the conventions of the log corrected.
 
+    The differences change columns, units, scales and offsets in the tables of the signals; late
+    commands change the offset of the time stamps. The present content is not changed.
+
     Args:
         meta: Content of the present description file.
         declared: Simulator of the robot, with the units of its signals.
@@ -67,7 +70,9 @@ def _move_to_column(
 ) -> dict[str, Any]:
     """Return the description table of a signal after its values were taken from another column.
 
-    `change.source` names that column or the signal that has it; `tables` are the present tables.
+    The source of a change is another signal, whose table is taken over (if joints are exchanged),
+    or a column of the log that the description does not use. A table without ``column`` means the
+    column with the signal's name.
 
     Args:
         tables: Tables of the description by signal.
@@ -130,10 +135,8 @@ def list_changed_tables(
         declared: Simulator of the robot, with the units of its signals.
         differences: Differences to correct.
     """
-    corrected, unchanged = (
-        correct_description(meta, declared, differences),
-        correct_description(meta, declared, ()),
-    )
+    corrected = correct_description(meta, declared, differences)
+    unchanged = correct_description(meta, declared, ())
     for kind in KINDS:
         names = [
             name
@@ -167,8 +170,9 @@ def write_corrected(
 ) -> list[Path]:
     """Write the corrected description to a new file.
 
-    If the recording has a table with the name of its description, a copy of it is written next to
-    the new description, with the new name.
+    A description refers to its model and its table by relative paths and by name. So the path of
+    the model is adapted; a table with the name of the description is copied next to the new one,
+    with the new name.
 
     Args:
         recording: Table or description of the recording.
@@ -208,8 +212,9 @@ def write_corrected(
     if table.exists():
         contents[path.with_suffix(".csv")] = table.read_bytes()
     elif path.parent.resolve() != description.parent.resolve():
-        where = f"expected a file in {description.parent}, where the log's files are"
-        raise InputError(f"{path}: {where}")
+        raise InputError(
+            f"{path}: expected a file in {description.parent}, where the log's files are"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_files(contents)
     return list(contents)

@@ -198,7 +198,7 @@ class Hypothesis:
         return {s.name: self.scale * _get_unit_gain(s, unit) / s.gain for s, unit in pairs}
 
     def make_error(self, file: str, before: float | None, after: float | None) -> RecordingFault:
-        """Return the hypothesis as a fault of the recording, with the lines to change.
+        """Return the hypothesis as a fault of the recording, with the lines that correct it.
 
         Args:
             file: Name of the description file.
@@ -215,13 +215,13 @@ class Hypothesis:
                 keys.append(f"scale = {self._get_corrected_scale(signal):.9g}")
             lines.append(f"[{signal.kind}.{toml_key(signal.name)}] {', '.join(keys)}")
         return RecordingFault(
-            tuple(signal.name for signal in self.signals),
-            factors[self.signals[0].name],
-            self.units[0] if self.units[0] != self.signals[0].specified_unit else None,
-            self._format_correction(file, factors),
-            tuple(lines),
-            before,
-            after,
+            signals=tuple(signal.name for signal in self.signals),
+            factor=factors[self.signals[0].name],
+            unit=self.units[0] if self.units[0] != self.signals[0].specified_unit else None,
+            says=self._format_correction(file, factors),
+            lines=tuple(lines),
+            error_before=before,
+            error_after=after,
         )
 
     def _get_corrected_scale(self, signal: Signal) -> float:
@@ -231,8 +231,10 @@ class Hypothesis:
     def _format_correction(self, file: str, factors: Mapping[str, float]) -> str:
         """Write what seems wrong with a unit, sign or scale, and how the user corrects it.
 
-        `file` is the name of the description file. `factors` has, by signal name, the factor by
-        which the recorded values have to be multiplied; it is shown for a wrong unit.
+        Args:
+            file: name of the description file.
+            factors: factor by which the recorded values have to be multiplied, by signal; shown for
+                a wrong unit.
         """
         first_signal, unit = self.signals[0], self.units[0]
         names = join_first_names([signal.signal_text for signal in self.signals], MAX_NAMED_SIGNALS)
@@ -462,7 +464,16 @@ def find_imitated_unit(
             PARAMETER_AT_BOUND_TEXT.format(name)
             for name in _list_parameters_at_bounds(evaluator, base)
         )
-        return RecordingFault((signal.name,), factor, None, message, (), None, None, alternatives)
+        return RecordingFault(
+            signals=(signal.name,),
+            factor=factor,
+            unit=None,
+            says=message,
+            lines=(),
+            error_before=None,
+            error_after=None,
+            alternatives=alternatives,
+        )
     return None
 
 
@@ -606,6 +617,7 @@ def _generate_hypotheses(
                 yield Hypothesis(
                     changed_signals, tuple(actual_units[s.si] for s in changed_signals)
                 )
+        # A conversion to this system that was made twice multiplies all signals by one factor.
         if len({s.si for s in related_signals}) > 1:
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
@@ -617,7 +629,8 @@ def _generate_hypotheses(
 def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
     """Yield hypotheses that signals of one unit have another unit, a reversed sign, or both.
 
-    Factors that undo a conversion that was made twice are tried as well.
+    Factors that undo a conversion that was made twice are tried as well, unless they equal that of
+    a unit. For a quantity without known other units, these are 1000 and 1/1000.
     """
     first = signals[0]
     stated_units = (first.specified_unit,) * len(signals)
@@ -644,6 +657,8 @@ def _generate_reversed_joints(
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses of joints with reversed direction: all their channels change sign.
 
+    Only joints with several channels count; a single channel is tested as a single signal.
+
     Args:
         signals: recorded channels and inputs.
         suspects: names of the joints to check; None for all.
@@ -664,7 +679,7 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
     """Select the hypotheses that are worth a fit, by their misfit without a fit.
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
-    the whole runs.
+    the whole runs. The best of both rankings are returned.
 
     Args:
         subject: recording with its simulator.
@@ -729,6 +744,7 @@ def _fit_rescaled(
     """
     evaluator, noise = _build_rescaled_evaluator(subject, factors)
     is_recorded = np.isfinite(evaluator.observed)
+    # A fit that exceeds this cost at the beginning of the runs is not continued.
     max_cost = np.inf
     if np.isfinite(max_rms):
         max_cost = UNCONVERGED_COST_RATIO * _compute_max_cost(evaluator, noise, max_rms)

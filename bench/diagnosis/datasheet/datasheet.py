@@ -58,8 +58,9 @@ def render_page(
     """
     page, printed_figure = HtmlPage(), None
     if sheet.diagram is not None and diagram_files is not None:
+        image, pdf = diagram_files
         printed_figure = PrintedFigure(
-            *diagram_files, _describe_rest_forces(sheet.diagram), DIAGRAM_NAME
+            image, pdf, alternative=_describe_rest_forces(sheet.diagram), file=DIAGRAM_NAME
         )
         columns = {
             "load": sheet.diagram.load.tolist(),
@@ -89,7 +90,7 @@ def render_page(
 
 
 def _describe_rest_forces(diagram: DriveDiagram) -> str:
-    """Describe the forces at rest in a sentence.
+    """Describe the forces at which a joint at rest starts to move, in sentences.
 
     Args:
         diagram: Drive diagram; its back-drive load is infinite if the joint is self-locking.
@@ -160,11 +161,11 @@ def build_datasheet(
     joint: str | None = None,
     name: str | None = None,
 ) -> DataSheet:
-    """Build the data sheet of a joint or actuator.
+    """Build the data sheet of a joint or actuator: identified numbers and detection limits.
 
     The recording is prepared as for a diagnosis. Detection limits are computed for all absent
     effects that the recorded channels could show; effects that need a drive are only listed for
-    driven joints.
+    driven joints. Stops are not listed, since they show by their position and not by a size.
 
     Args:
         recording: Logs that were explained.
@@ -180,9 +181,11 @@ def build_datasheet(
     assert kind is not None
     subject = make_subject(kind, joint)
     for channel in extended.observe:
-        visible_effects = list(recording.runs[0].channels)
-        if channel not in visible_effects:
-            raise make_unknown_name_error(f"channel of {recording.path}", channel, visible_effects)
+        recorded_channels = list(recording.runs[0].channels)
+        if channel not in recorded_channels:
+            raise make_unknown_name_error(
+                f"channel of {recording.path}", channel, recorded_channels
+            )
     recording = replace(recording, constants={**extended.constants, **recording.constants})
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)
@@ -219,7 +222,8 @@ def build_datasheet(
 def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
     """List effects that can act here but are not in the model.
 
-    Simpler forms of the effects in the model are left out.
+    Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
+    lack Coulomb friction. A coefficient of zero counts as absent.
 
     Args:
         subject: Joint or system of the sheet.

@@ -139,9 +139,9 @@ class _Rows:
         free = [name for name in self.detection_limits.free if name in values]
         indices = [self.detection_limits.free.index(name) for name in free]
         covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
-        for derived in self.subject.kind.system.derived:
+        for quantity in self.subject.kind.system.derived:
             try:
-                value = derived.of(values_by_name)
+                value = quantity.of(values_by_name)
             except (KeyError, ZeroDivisionError):
                 # A constant that differs between runs has no single value.
                 continue
@@ -149,22 +149,23 @@ class _Rows:
             for name in free:
                 step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
                 slopes.append(
-                    (derived.of({**values_by_name, name: values_by_name[name] + step}) - value)
+                    (quantity.of({**values_by_name, name: values_by_name[name] + step}) - value)
                     / step
                 )
             gradient = np.array(slopes)
             half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
-            fitted_value = FittedValue(value, derived.unit, value - half_width, value + half_width)
+            fitted_value = FittedValue(value, quantity.unit, value - half_width, value + half_width)
             row = SheetRow(
-                derived.name, derived.says, "system", "derived", derived.unit, fitted_value
+                quantity.name, quantity.says, "system", "derived", quantity.unit, fitted_value
             )
-            yield replace(row, strongest=derived.strongest)
+            yield replace(row, strongest=quantity.strongest)
 
     def parameters(self) -> Iterator[SheetRow]:
         """Yield the parameters of the system, or the free numbers of the robot's file here.
 
         Of a robot, the names have the form ``effect@place``, or ``effect@place.coefficient`` for
-        one of several coefficients; only places of this joint are shown.
+        one of several coefficients; only numbers at this joint, its actuators and channels are
+        shown.
         """
         if not self.subject.joint:
             for parameter in self.subject.kind.parameters:
@@ -199,9 +200,11 @@ class _Rows:
                 yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
-        """Yield the diagnosed causes; members of a family that may be zero here are not shown.
+        """Yield the diagnosed causes that act at this joint, with their coefficients.
 
-        A cause at all places of a kind (a family) is resolved to the place of this joint.
+        A cause at all places of a kind (a family) is resolved to the place of this joint. Its
+        coefficient here may be zero within its interval although it is not elsewhere: then the row
+        gives a detection limit instead.
         """
         for name, coefficients in self.extended.effects.items():
             local_coefficients = list(self.subject.localise_effect(name, coefficients))
@@ -239,16 +242,17 @@ class _Rows:
             effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             parameter: name of its coefficient, by which the half widths are stored.
         """
-        half_width, file_value = (
-            self.detection_limits.prediction_half_widths.get(parameter),
-            self.subject.get_model_file_value(effect),
-        )
+        half_width = self.detection_limits.prediction_half_widths.get(parameter)
+        file_value = self.subject.get_model_file_value(effect)
         if half_width is None or file_value is None:
             return replace(row, prediction_half_width=half_width)
         return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
-        """Build the row of a cause at other places that is not shown here.
+        """Build the row of a cause that acts at other places, but is not shown by the data here.
+
+        The row has a detection limit instead of a value: the larger end of the interval of the
+        coefficient.
 
         Args:
             row: row of the cause.
@@ -286,8 +290,14 @@ class _Rows:
     ) -> SheetRow:
         """Build the row of an effect that is not in the model, with its detection limit.
 
-        If the effect changes a number of the model file, the limit is converted to the unit of that
-        number. `label` is the name of the row, and `unit` the unit of the coefficient.
+        If the effect changes a number of the model file, for example by a share of the mass, the
+        limit is converted to the unit of that number.
+
+        Args:
+            effect: name of the effect, with its place.
+            label: name of the row.
+            unit: unit of the coefficient.
+            detection_limit: limit of the coefficient.
         """
         file_value = self.subject.get_model_file_value(effect)
         value = None
@@ -511,19 +521,20 @@ class SheetContent:
                 yield name
 
     def lines(self) -> list[str]:
-        """Format the sheet as text: numbers first, then the effects that are not shown."""
+        """Format the sheet as text for the terminal: numbers first, then effects not detected.
+
+        Only a few of these are named; the files give the detection limit of each.
+        """
         lines = [f"{sanitise(self.name, MAX_LINE_NAME_LENGTH)}: {self.verdict.verdict}"]
         identified = [row for row in self.rows if row.number is not None]
         lines += [
-            f"  {sanitise(r.name, MAX_LINE_NAME_LENGTH)} = {format_fitted_value(r.number)}"
-            for r in identified
-            if r.number
+            f"  {sanitise(row.name, MAX_LINE_NAME_LENGTH)} = {format_fitted_value(row.number)}"
+            for row in identified
+            if row.number
         ]
         all_absent_names = [row.name for row in self.rows if row.number is None]
-        absent_names, unnamed_count = (
-            all_absent_names[:NAMES_IN_TERMINAL],
-            len(all_absent_names) - NAMES_IN_TERMINAL,
-        )
+        absent_names = all_absent_names[:NAMES_IN_TERMINAL]
+        unnamed_count = len(all_absent_names) - NAMES_IN_TERMINAL
         if unnamed_count > 0:
             absent_names = [
                 *absent_names,

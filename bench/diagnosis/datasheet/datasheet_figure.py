@@ -88,8 +88,8 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
 
     The region above the forward boundary is forward motion, below the backward boundary back
-    motion; in between the joint holds. Marks show the break-away force and the load that moves the
-    joint back.
+    motion; in between the joint holds. The dotted diagonal is the force that balances the load.
+    Marks show the break-away force and the load that moves the joint back.
 
     Args:
         axes: Axes to draw on.
@@ -263,6 +263,9 @@ def _draw_effects_not_shown(
 ) -> float:
     """Draw a table, in two columns, of the effects that the data do not show.
 
+    Each row has the name of the effect and its detection limit, which may need several lines. The
+    rows are split so that both columns are about equally high.
+
     Args:
         figure: Page to draw on.
         content: Content of the data sheet.
@@ -277,8 +280,8 @@ def _draw_effects_not_shown(
     names = [format_short_name(row) for row in content.rows if row.number is None]
     name_length = min(max(map(len, names), default=0), _NAME_LETTERS)
     # A character of the monospaced font is 0.602 of its size wide.
-    beside_name = (0.602 * size / POINTS * name_length + 0.12) / A4_INCHES[0]
-    letters = int((_HALF_WIDTH - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
+    limit_offset = (0.602 * size / POINTS * name_length + 0.12) / A4_INCHES[0]
+    letters = int((_HALF_WIDTH - limit_offset) * A4_INCHES[0] * POINTS / (_LETTER * size))
     for row in content.rows:
         if row.number is None:
             confounding = format_confounding(row)
@@ -302,7 +305,7 @@ def _draw_effects_not_shown(
                 x, y, sanitise(name, name_length), va="top", fontsize=size, family="monospace"
             )
             limit_text = "\n".join(lines)
-            figure.text(x + beside_name, y, limit_text, va="top", fontsize=size, linespacing=1.25)
+            figure.text(x + limit_offset, y, limit_text, va="top", fontsize=size, linespacing=1.25)
             y -= line * len(lines)
     heading = "Not detected in these data, with the detection limit (95 %)"
     figure.text(_MARGIN, table_top + 0.018, heading, weight="bold", va="top")

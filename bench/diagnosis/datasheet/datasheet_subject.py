@@ -121,7 +121,10 @@ class SheetSubject:
     def localise_effect(
         self, name: str, coefficients: Mapping[str, FittedValue]
     ) -> Iterator[tuple[str, str, FittedValue]]:
-        """Yield the coefficients that a fitted effect has here.
+        """Yield the coefficients that a fitted effect has at this joint or system.
+
+        An effect at all places (a family) has a coefficient for each place, or one for all; effects
+        at other places yield nothing.
 
         Args:
             name: Name of the effect, possibly of a family.
@@ -136,17 +139,15 @@ class SheetSubject:
                 yield from ((name, key, fitted_value) for key, fitted_value in coefficients.items())
             return
         local_places = [
-            local_place.place
-            for local_place in self.list_effects()
-            if local_place.of == effect_name
+            own_place.place for own_place in self.list_effects() if own_place.of == effect_name
         ]
         for key, fitted_value in coefficients.items():
             coefficient, _, named_place = key.partition("@")
             # A family with one coefficient for all places, such as a delay, has the same value
             # here.
-            for local_place in [named_place] if named_place else local_places:
-                if local_place in self.places:
-                    yield f"{effect_name}@{local_place}", coefficient, fitted_value
+            for own_place in [named_place] if named_place else local_places:
+                if own_place in self.places:
+                    yield f"{effect_name}@{own_place}", coefficient, fitted_value
 
     def get_model_file_value(self, effect: str) -> ModelFileValue | None:
         """Return the value in the model file that an effect changes; None if there is none."""

@@ -208,8 +208,9 @@ def _add_small_gaps(
 ) -> DirectionSet:
     """Add directions of backlash that is smaller than the search tries.
 
-    Otherwise the smallest direction may already be detectable, and the detection limit would be
-    unknown. Each size is half the previous one, `GAP_HALVINGS` times.
+    A direction is the change of the runs by an effect. Backlash is not linear in its size, so each
+    size is simulated. Otherwise the smallest direction may already be detectable, and the detection
+    limit would be unknown. Each size is half the previous one, `GAP_HALVINGS` times.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -229,9 +230,9 @@ def _add_small_gaps(
         ):
             smallest_probes[probe.effect] = probe
     smaller_probes = [
-        replace(p, coefficients=p.coefficients * 0.5**n)
-        for p in smallest_probes.values()
-        for n in range(1, GAP_HALVINGS + 1)
+        replace(probe, coefficients=probe.coefficients * 0.5**halvings)
+        for probe in smallest_probes.values()
+        for halvings in range(1, GAP_HALVINGS + 1)
     ]
     if not smaller_probes:
         return directions
@@ -334,7 +335,8 @@ class _DetectionLimitCalculator:
 
         A shape is a choice of the effect's other coefficients, such as a frequency. A limit or
         backlash does not change the runs in proportion to its size, so its detection limit is the
-        smallest detectable size that was tried.
+        smallest detectable size that was tried. At its best shape, an effect may equal a simpler
+        one that it contains; its next shape is used then.
 
         Args:
             prediction_half_widths: half the 95 % interval of each parameter in a run that is not
@@ -385,11 +387,13 @@ class _DetectionLimitCalculator:
     def _compute_proportional_limit(self, k: int) -> DetectionLimit:
         """Return the detection limit of direction k, whose effect is proportional to its size.
 
-        The limit is half the 95 % interval, 1.96 / sqrt(power) with the power of eq. (1). It is
-        infinite if the data contain no information on the coefficient.
+        The limit is half the 95 % interval of the coefficient, 1.96 / sqrt(power) with the
+        information (power) of eq. (1) of the module docstring. It is infinite if the data contain
+        no information on the coefficient, and marked as unbounded if it exceeds all plausible
+        values.
 
-        With d the whitened derivatives by the coefficient and A those by the parameters, the
-        information is power = d'd - d'A (A'A)^-1 A'd (1).
+        Args:
+            k: index of the direction.
         """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
@@ -438,7 +442,9 @@ class _DetectionLimitCalculator:
     ) -> bool:
         """Return whether a simpler effect that this effect contains has an equivalent coefficient.
 
-        The simpler effect may be in the model or not.
+        Then both change the runs alike (their directions are nearly parallel), and a limit for the
+        richer effect would only repeat that of the simpler one. The simpler effect may be in the
+        model or not.
 
         Args:
             name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
@@ -446,16 +452,21 @@ class _DetectionLimitCalculator:
             best: index of the probe with the best shape, by effect and coefficient index.
         """
         simpler_effects = set(self.evaluator.available_effects[name].contains)
-        other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]
+        other_columns = [
+            self.q + column for (effect, _), column in best.items() if effect in simpler_effects
+        ]
         for effect in simpler_effects & set(self.evaluator.coefficient_slices):
             effect_places = self.evaluator.get_coefficient_indices(effect)
             other_columns += [
-                j for j, place in enumerate(self.free_indices) if place in effect_places
+                column for column, place in enumerate(self.free_indices) if place in effect_places
             ]
-        i = self.q + k
-        for j in other_columns:
-            scale = np.sqrt(self.products[i, i] * self.products[j, j])
-            if scale > 0 and abs(self.products[i, j]) / scale > SAME_COEFFICIENT_CORRELATION:
+        own_column = self.q + k
+        for column in other_columns:
+            scale = np.sqrt(self.products[own_column, own_column] * self.products[column, column])
+            if (
+                scale > 0
+                and abs(self.products[own_column, column]) / scale > SAME_COEFFICIENT_CORRELATION
+            ):
                 return True
         return False
 

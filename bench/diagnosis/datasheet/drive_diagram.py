@@ -113,10 +113,11 @@ class DriveDiagram:
 def compute_drive_diagram(
     subject: SheetSubject, extended: ExtendedSimulator, force_limit: float | None
 ) -> DriveDiagram:
-    """Compute the diagram of a joint.
+    """Compute the diagram of a joint: the drive forces at which it starts to move, for each load.
 
     With the motor's force U, the load P, all other forces f at rest and the friction limit F, the
-    joint moves forward if U - P + f > F(U, P) (1), and back if U - P + f < -F(U, P) (2).
+    joint moves forward if U - P + f > F(U, P) (1), and back if U - P + f < -F(U, P) (2). The
+    boundaries are the zeros of these balances, found by bisection, since F may depend on U and P.
 
     Args:
         subject: Joint or system.
@@ -140,20 +141,23 @@ def compute_drive_diagram(
         return -backward_balance(np.zeros_like(p), p)
 
     return DriveDiagram(
-        "N" if joint.system.kind == "linear" else "N*m",
-        load,
-        _find_roots(lambda u: forward_balance(u, load), search_range, LOAD_POINT_COUNT),
-        _find_roots(lambda u: backward_balance(u, load), search_range, LOAD_POINT_COUNT),
-        float(_find_roots(lambda u: forward_balance(u, zero), search_range, 1)[0]),
-        float(_find_roots(unpowered_balance, search_range, 1)[0]),
-        joint.names,
-        load_range,
-        joint.without,
+        unit="N" if joint.system.kind == "linear" else "N*m",
+        load=load,
+        forward=_find_roots(lambda u: forward_balance(u, load), search_range, LOAD_POINT_COUNT),
+        back=_find_roots(lambda u: backward_balance(u, load), search_range, LOAD_POINT_COUNT),
+        breakaway=float(_find_roots(lambda u: forward_balance(u, zero), search_range, 1)[0]),
+        backdrive=float(_find_roots(unpowered_balance, search_range, 1)[0]),
+        laws=joint.names,
+        axis_limit=load_range,
+        without=joint.without,
     )
 
 
 def _find_roots(function: Callable[[Array], Array], search_range: float, count: int) -> Array:
-    """Find zeros (N,) of increasing functions by bisection; infinite outside the range.
+    """Find zeros (N,) of increasing functions by bisection, all at once.
+
+    A function that is still not positive at the upper end has its zero at infinity; one that is
+    positive at the lower end, at minus infinity.
 
     Args:
         function: values (N,) of N increasing functions at points (N,).

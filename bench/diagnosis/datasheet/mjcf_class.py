@@ -80,8 +80,10 @@ MOTOR_ON_THRESHOLD = 0.5
 def describe_log_for_model(
     sheet: SheetContent, group: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """Yield a description of the log for the model, in which its runs are marked held out.
+    """Yield file name and text of a description of the log, in which its runs are marked held out.
 
+    With it, the exported model can be scored on the same log. Signals get the names of the model.
+    Runs in which the motor is off for a time are not marked, since the model cannot switch it.
     Nothing is yielded for a log of several files.
 
     Args:
@@ -156,6 +158,9 @@ def _compute_friction_limits(
 ) -> Array:
     """Compute the limit (T,) of a friction law at each sample of a run, as one batch.
 
+    The limit is the largest dry friction at that position, velocity and input; its mean replaces a
+    law that MuJoCo lacks.
+
     Args:
         sheet: content of the data sheet.
         group: runs with equal constants.
@@ -172,19 +177,25 @@ def _compute_friction_limits(
     theta = np.array([[group.numbers[p.name] for p in kind.parameters]])
     effect_coefficients = effect.on(system)
     coefficients = [
-        numbers[c.name].value if c.name in numbers else 0.0 for c in effect_coefficients
+        numbers[coefficient.name].value if coefficient.name in numbers else 0.0
+        for coefficient in effect_coefficients
     ]
-    moment = StateSnapshot(
+    state = StateSnapshot(
         system,
         np.repeat(theta, len(position), axis=0),
-        {c.name: np.full(shape, group.numbers[c.name]) for c in kind.constants},
+        {
+            constant.name: np.full(shape, group.numbers[constant.name])
+            for constant in kind.constants
+        },
         (run.times - run.times[0])[:, None],
         position[:, None],
         rate[:, None],
         {name: values[:, None] for name, values in run.inputs.items()},
     )
-    c = np.array(coefficients)[:, None, None]
-    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *shape)), moment)[:, 0]
+    batch_coefficients = np.array(coefficients)[:, None, None]
+    limit: Array = effect().limit(
+        np.broadcast_to(batch_coefficients, (len(batch_coefficients), *shape)), state
+    )[:, 0]
     return limit
 
 
@@ -243,6 +254,9 @@ def _build_robot_files(sheet: SheetContent) -> MjcfFiles:
 def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
     """Build a class, a model and a log description for each group of runs with equal constants.
 
+    A system has no model file, so one is rendered and read as a robot, to which the effects are
+    added as to any robot.
+
     Args:
         sheet: content of the data sheet.
         folder: folder of the sheet, to which the log descriptions refer.
@@ -269,8 +283,8 @@ def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
         if rendered.model:
             files[f"{stem}.xml"] = rendered.model
             files |= describe_log_for_model(sheet, group, model, stem, folder)
-    lines = dict.fromkeys(line for rendered in classes for line in rendered.notes)
-    return MjcfFiles({CLASS_FILE: _format_file(sheet, classes), **files}, tuple(lines))
+    distinct_notes = dict.fromkeys(line for rendered in classes for line in rendered.notes)
+    return MjcfFiles({CLASS_FILE: _format_file(sheet, classes), **files}, tuple(distinct_notes))
 
 
 def _render_model_file(sheet: SheetContent, group: ConstantsGroup) -> RenderedModelFile | None:
@@ -299,6 +313,8 @@ def _render_class(
     notes: Sequence[str] = (),
 ) -> _DefaultClass:
     """Write the fitted effects into a robot's model, and render its joint as a default class.
+
+    The model that uses the class is left out, with a note, if its file cannot be edited.
 
     Args:
         robot: Robot whose model is changed.

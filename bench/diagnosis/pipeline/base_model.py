@@ -100,10 +100,10 @@ class BaseModel:
             return replace(self, fit=fit_wider(self.runs.fitting, self.runs.noise, self.fit))
 
     def freeze_unidentified(self) -> BaseModel:
-        """Freeze free numbers of a robot that the data cannot identify.
+        """Freeze free numbers of a robot that the data cannot identify, at their nominal values.
 
         A system has few parameters, and would have no result without them; there the verdict
-        reports it.
+        reports it. A note to the user names the frozen numbers.
         """
         if not self.is_usable:
             return self
@@ -117,7 +117,10 @@ class BaseModel:
         return replace(self, fit=fit)
 
     def shows_step_errors(self) -> bool:
-        """Return whether the recording shows the discretisation error of the engine's steps."""
+        """Return whether the recording shows the discretisation error of the engine's steps.
+
+        Without a filter of the runs this is not known, and true is returned.
+        """
         runs = self.runs
         if runs.fitting.filtered_runs is None or not self.is_usable:
             return True
@@ -151,7 +154,8 @@ class BaseModel:
     def refit_first_states(self) -> BaseModel:
         """Fit the first states again if the filter follows the runs and the simulation does not.
 
-        A fit to whole runs from the readings may end in a local minimum.
+        A fit to whole runs from the readings may end in a local minimum. The filter lacks no force,
+        so its first states are better starts.
         """
         runs, followed = self.runs, self.runs.fitting.filtered_runs
         if followed is None or followed.has_missing_force or not self.is_usable:
@@ -169,8 +173,12 @@ class BaseModel:
         """Return the duration in seconds of segments that a simulation can follow.
 
         An unstable or chaotic motion amplifies the error of an estimated first state, until no
-        simulation follows it. It is None if the base model follows whole runs, or if they amplify
-        errors little.
+        simulation follows it. Shorter segments begin at new first states. The longest duration with
+        a small amplification is returned; if no duration has one, the shortest.
+
+        Returns:
+            Duration in seconds; None if the base model follows whole runs, or if they amplify
+            errors little.
         """
         followed = self.runs.fitting.filtered_runs
         if followed is None or not self.is_usable:
@@ -184,7 +192,11 @@ class BaseModel:
         return SEGMENT_DURATIONS[-1]
 
     def loses_orientation(self) -> bool:
-        """Return whether the simulated orientation of a recorded floating body is far from it."""
+        """Return whether the simulated orientation of a recorded floating body is far from it.
+
+        Beyond a certain error a fit does not find back; the runs are then divided into shorter
+        segments.
+        """
         names = [
             f"q.{base_name}.{angle}"
             for base_name in self.runs.kind.system.base_orientations
@@ -219,8 +231,10 @@ def _get_starts(runs: SimulatedRuns) -> Array | None:
 def filter_runs(runs: SimulatedRuns) -> None:
     """Filter the runs of a robot with the present model (Kalman filter and smoother).
 
-    The filter provides initial states and starting values of free parameters. If the linearised
-    model diverges, nothing is stored, and causes are searched by simulation.
+    The filter, stored in the evaluators, provides initial states and starting values of free
+    parameters, and later the search by prediction errors. If the linearised model diverges, nothing
+    is stored, and causes are searched by simulation; for a robot in contact, a nonlinear filter
+    then estimates the initial states.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -251,7 +265,11 @@ def filter_runs(runs: SimulatedRuns) -> None:
 
 
 def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
-    """Return the runs, filtered with base parameters from a prediction-error fit."""
+    """Return the runs, filtered with base parameters from a prediction-error fit.
+
+    The fitted parameters are stored in context and evaluator, unless the fit keeps the nominal
+    ones.
+    """
     # These imports are needed for robots only.
     from bench.diagnosis.prediction_error.base_identification import identify_base
     from bench.diagnosis.prediction_error.identification_without_simulation import is_long

@@ -51,10 +51,15 @@ class CauseSearch:
     def search(self, base: BaseModel) -> SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
 
-        A search ends with `SoftFrictionError` if it finds the soft form likelier.
+        A search ends with `SoftFrictionError` if it finds the soft form likelier. If only filters
+        showed this before any fit (`is_preliminary`) and the soft search explains nothing, the
+        search is made with stiff friction after all, without asking for the form again.
 
         Args:
             base: the fitted base model.
+
+        Returns:
+            The result of the last search. Its runs have the form of friction that was used.
         """
         runs = base.runs
         # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
@@ -108,7 +113,7 @@ class CauseSearch:
         Args:
             base: Base model, fitted with stiff friction.
             stiff_search: Search with stiff friction; its results are reused where they are valid.
-            likely: Model that may explain the runs.
+            likely: Model that may explain the runs, which is fitted first; None if there is none.
         """
         stiff_runs, context = base.runs, base.runs.context
         context.say(SOFT_FRICTION)
@@ -123,7 +128,8 @@ class CauseSearch:
         rng = runs.make_rng()
         search = runs.create_search(soft_base.fit, rng)
         # Friction of the file keeps its form unless it is a free number.
-        _take_over(search, stiff_search, likely, not has_dry_friction(evaluator, ()))
+        has_same_base = not has_dry_friction(evaluator, ())
+        _take_over(search, stiff_search, likely, has_same_base)
         return self._find_causes(soft_base, search, rng)
 
     def _find_causes(
@@ -131,7 +137,8 @@ class CauseSearch:
     ) -> SearchResult:
         """Return the finding; without causes if the recording has a wrong unit or sign.
 
-        Every cause would only imitate the wrong unit or sign.
+        Every cause would only imitate the wrong unit or sign. Some are known before the search,
+        others show in its result.
 
         Args:
             base: the fitted base model.
@@ -153,7 +160,8 @@ class CauseSearch:
 def _search_and_decide(search: EffectSearch, runs: SimulatedRuns) -> DiagnosisResult:
     """Run a search and select a verdict.
 
-    For a robot whose runs could be filtered, the search uses prediction errors.
+    For a robot whose runs could be filtered, the search uses prediction errors. Otherwise it is a
+    search by simulation; for a robot in contact, effects at the contacts are tried first.
     """
     if runs.fitting.filtered_runs is None:
         if runs.fitting.is_in_contact:

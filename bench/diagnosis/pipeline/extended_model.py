@@ -10,6 +10,9 @@ from sims.extended_simulator import ExtendedSimulator
 def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
     """Build the extended simulator from the model of the found effects.
 
+    It is the simulator of the recording with fitted parameters, freed constants and added effects,
+    as written to ``extended.toml``.
+
     Args:
         result: result of the search.
     """
@@ -32,14 +35,14 @@ def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
         if effect in model.effects
     }
     return ExtendedSimulator(
-        extend.make_extended_name(recording.system),
-        recording.system,
-        runs.engine,
-        recording.title,
-        base_values,
-        added_effects,
-        {**recording.constants, **freed_constants},
-        evaluator.channels,
-        runs.kind,
-        extend.get_robot_reference(runs.kind),
+        name=extend.make_extended_name(recording.system),
+        system=recording.system,
+        engine=runs.engine,
+        title=recording.title,
+        parameters=base_values,
+        effects=added_effects,
+        constants={**recording.constants, **freed_constants},
+        observe=evaluator.channels,
+        kind=runs.kind,
+        robot=extend.get_robot_reference(runs.kind),
     )

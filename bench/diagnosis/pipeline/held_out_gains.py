@@ -61,8 +61,13 @@ class HeldOutGains:
     def measure(self) -> HeldOutResult | None:
         """Measure by how much the causes improve the prediction of held-out runs.
 
-        Return None if the prediction of the base model failed, or if no runs were predicted with
-        both models.
+        The error of a prediction falls from that of the base model towards the noise floor. If
+        another time step or solver option was chosen, the base model is that of the model file's
+        own.
+
+        Returns:
+            Errors and the share of the gap that is closed, with its interval; None if the
+            prediction of the base model failed, or if no runs were predicted with both models.
         """
         runs, finding = self.result.runs.predicted, self.result.finding
         held_out_fits, names = finding.held_out_fits, finding.model.effects
@@ -100,6 +105,9 @@ class HeldOutGains:
     def get_closed_share(self, names: EffectNames) -> float | None:
         """Return the share of the held-out gap that a model closes; None if it is not measured.
 
+        The gap is the RMS error of the base model above the noise floor. The share is at most 1,
+        and negative if the prediction becomes worse.
+
         Args:
             names: names of the effects of the model.
         """
@@ -119,6 +127,9 @@ class HeldOutGains:
     def compute_share_intervals(self) -> dict[str, tuple[float, float]]:
         """Compute 95 % intervals of the share of the held-out gap that single effects close.
 
+        The intervals are by bootstrap. An effect with a much worse prediction than the base model
+        has none, because its share is cut off.
+
         Returns:
             Low and high end by effect, for effects that were simulated alone on held-out runs.
         """
@@ -127,14 +138,14 @@ class HeldOutGains:
             return {}
         before = held_out_fits[()].simulated
         intervals = {}
-        for names, simulated in held_out_fits.items():
+        for names, held_out_fit in held_out_fits.items():
             share = self.get_closed_share(names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
                 continue
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
             rng = make_rng("held-out share", *names)
-            result = self._compute_gain(runs, before, simulated.simulated, rng)
+            result = self._compute_gain(runs, before, held_out_fit.simulated, rng)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 intervals[names[0]] = result.low, result.high
         return intervals

@@ -14,9 +14,10 @@ MAX_LEFT_OUT_SHARE = 0.25
 
 
 def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:
-    """Leave out segments that no simulation predicts.
+    """Leave out segments that no simulation predicts: those that not even a filter follows.
 
-    At least half of the segments for fitting and of those for measuring are kept.
+    If the filter does not follow most of the segments for fitting, the model may be wrong instead,
+    and all of them are kept; likewise those for measuring.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.candidate_responses import FollowedRuns

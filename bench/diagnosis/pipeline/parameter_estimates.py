@@ -42,7 +42,11 @@ class ParameterEstimates:
 
     @cached_property
     def values(self) -> dict[int, FittedValue]:
-        """Estimates by index in the parameter vector; unfitted ones have no interval."""
+        """Estimates by index in the parameter vector, with 95 % intervals where the data give some.
+
+        Unfitted parameters, those at a bound of their range, and all of an unfinished fit have no
+        interval. An estimate outside its plausible range is marked with this range.
+        """
         evaluator, model = self.search.evaluator, self.model
         intervals = compute_intervals(self.search, model)
         if not self.is_finished:
@@ -73,9 +77,9 @@ class ParameterEstimates:
             estimates[index] = FittedValue(
                 value,
                 parameter.unit,
-                low if is_bounded else None,
-                high if is_bounded else None,
-                at_bound,
+                low=low if is_bounded else None,
+                high=high if is_bounded else None,
+                at_bound=at_bound,
                 usual_range=exceeded_range,
             )
         if evaluator.kind.has_model:
@@ -92,8 +96,12 @@ class ParameterEstimates:
     def _add_totals(self, numbers: dict[int, FittedValue]) -> None:
         """Add to each fitted number of a robot the model file's value and the resulting value.
 
-        Numbers of effects that change no number of the file remain as they are. `numbers` is by
-        index in the parameter vector.
+        An effect corrects a number of the file, for example by a share of the mass; readers need
+        the corrected mass. Effects that change no number of the file, or change it by zero, remain
+        as they are.
+
+        Args:
+            numbers: fitted numbers by index in the parameter vector; they are replaced.
         """
         kind: Any = self.search.evaluator.kind
         # This import is needed for robots only.
@@ -121,7 +129,8 @@ class ParameterEstimates:
     def _iterate_fitted_effects(self) -> Iterator[tuple[type[Effect], list[int]]]:
         """Yield each fitted effect at one place, with the indices of its coefficients in theta.
 
-        An effect that acts at all places is divided into its members.
+        These are the effects of the numbers that the user freed, then those of the model. An effect
+        that acts at all places is divided into its members.
         """
         evaluator, kind = self.search.evaluator, cast(Any, self.search.evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
@@ -153,8 +162,8 @@ class ParameterEstimates:
     def build_cause(self, evidence: CauseEvidence) -> Cause:
         """Build a cause of the verdict from an effect found by the search.
 
-        Its description names the soft form of dry friction (MuJoCo's `frictionloss`) with the
-        solver parameters if the friction has it.
+        It has the effect's description and fitted coefficients. The description names the soft form
+        of dry friction (MuJoCo's `frictionloss`) with the solver parameters if the friction has it.
 
         Args:
             evidence: the effect and its evidence.
@@ -176,12 +185,12 @@ class ParameterEstimates:
         if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, fitted_values):
             description = GRAVITY_COMPENSATED
         return Cause(
-            evidence.effect,
-            evidence.alternatives,
-            description,
-            fitted_values,
-            evidence.p_value,
-            friction_form,
+            effect=evidence.effect,
+            alternatives=evidence.alternatives,
+            says=description,
+            coefficients=fitted_values,
+            p_value=evidence.p_value,
+            form=friction_form,
         )
 
     def are_results(self, effects: Iterable[str]) -> bool:

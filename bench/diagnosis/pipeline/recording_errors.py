@@ -43,8 +43,14 @@ class RecordingErrorCheck:
     def _find_in_unexplained(self, result: SearchResult) -> tuple[RecordingFault, ...]:
         """Test for a wrong unit or sign of a robot's recording, if no effect explains the residual.
 
+        Nothing is tested if the effects explain most of the discrepancy: with a wrong unit or sign
+        they would not.
+
         Args:
             result: result of the search.
+
+        Returns:
+            The wrong units and signs; empty if there are none or if nothing was tested.
         """
         is_over = result.runs.context.search_control.is_over()
         if not _is_checked_late(result.runs) or result.is_explained or is_over:
@@ -64,6 +70,9 @@ class RecordingErrorCheck:
 
 def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     """Refuse a robot's recording whose conventions differ from those of its model file.
+
+    Conventions are signs, zeros, units and frames of the signals. The test compares forces of the
+    linear model, so it is left out where contacts make these wrong, and with ``--force``.
 
     Raises:
         InputError: The conventions differ; the message names the change to make.

@@ -48,6 +48,9 @@ A model with a wrong number may prefer either kind of command by less.
 def prepare_runs(sources: Sequence[RecordingSource], context: DiagnosisContext) -> SimulatedRuns:
     """Load and check recordings, and build their run evaluators, before any fit.
 
+    The runs are thinned, cut and given noise where needed; lost commands are filled; segments that
+    no simulation predicts are left out. What is changed is noted for the user.
+
     Args:
         sources: paths of tables, or recordings in memory, which are joined.
         context: options of the diagnosis; it receives the notes on what is changed.
@@ -56,6 +59,7 @@ def prepare_runs(sources: Sequence[RecordingSource], context: DiagnosisContext) 
         InputError: The recording or the simulator cannot be used for a diagnosis.
     """
     options = context.options
+    # The function given is applied to each recording before its runs are divided.
     recording, kind = load_joined(
         sources,
         options.system,
@@ -106,7 +110,11 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
 def _add_contact_effects(
     recording: Recording, kind: type[SystemSimulator]
 ) -> type[SystemSimulator]:
-    """Return the simulator of a robot with effects at the contacts of the recording."""
+    """Return the simulator of a robot with effects at the contacts of the recording.
+
+    Only pairs of geoms that touch in the recorded motion get effects such as contact friction.
+    Without any, and for a system, the simulator is returned as it is.
+    """
     if not kind.has_model:
         return kind
     # These imports are needed for robots only.
@@ -146,7 +154,8 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     """Interpolate the commands of lost rows of a robot unless they were clearly held.
 
     A logger may have lost a row whose command was sent, or the controller may have sent none, so
-    that the previous command was held. The innovations of the filter tell them apart.
+    that the previous command was held. A filter is run with both; the more likely one shows which.
+    Held commands must be clearly likelier, by a log-likelihood for each filled row.
     """
     if not runs.kind.has_model:
         return runs
@@ -154,8 +163,8 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     if not note:
         return runs
     count = sum(
-        new.times.size - old.times.size
-        for new, old in zip(filled.runs, runs.recording.runs, strict=True)
+        filled_run.times.size - run.times.size
+        for filled_run, run in zip(filled.runs, runs.recording.runs, strict=True)
     )
     filled_runs = SimulatedRuns.build(runs.context, runs.kind, filled)
     before, after = runs.nominal_filter.log_likelihood, filled_runs.nominal_filter.log_likelihood
@@ -194,7 +203,8 @@ def _check_sample_count(runs: SimulatedRuns) -> None:
 def _check_sizes(runs: SimulatedRuns) -> None:
     """Refuse values that are too large by orders of magnitude, which no fit could follow.
 
-    Their unit must be wrong.
+    Their unit must be wrong. They are compared with the typical size of the channel,
+    `channel.scale`.
     """
     for c, channel in enumerate(runs.fitting.simulator.channels):
         largest = max(

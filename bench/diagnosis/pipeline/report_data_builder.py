@@ -53,6 +53,7 @@ def build_report_data(
         notes: Further notes, one sentence each.
     """
     evaluator, recording, finding = result.runs.fitting, result.runs.recording, result.finding
+    # Before and after: the fitted base model, and the model with the causes.
     before, after = finding.base.fit.simulated, finding.model.fit.simulated
     # The noise is that of the finding, because a good model estimates it better.
     gains = HeldOutGains(result)
@@ -67,22 +68,24 @@ def build_report_data(
         consistency = _assess_consistency(result)
     return DiagnosisReportData(
         # A recording without a title is identified by its file name.
-        recording.title or recording.path.stem,
-        recording.path,
-        verdict,
-        _list_channels(result.runs, sigma),
-        residual_analysis.build_data_split(evaluator, before, after),
-        held_out,
-        (
+        title=recording.title or recording.path.stem,
+        path=recording.path,
+        verdict=verdict,
+        channels=_list_channels(result.runs, sigma),
+        fitting=residual_analysis.build_data_split(evaluator, before, after),
+        held_out=held_out,
+        gap_locations=(
             *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
             *held_out_locations,
         ),
-        tuple(residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)),
-        changes,
-        unexplained,
-        reasons,
-        finding.unidentified_parameters,
-        residual_analysis.get_robot(evaluator),
+        profiles=tuple(
+            residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)
+        ),
+        parameters=changes,
+        lack_of_fit=unexplained,
+        why=reasons,
+        unidentified_parameters=finding.unidentified_parameters,
+        robot=residual_analysis.get_robot(evaluator),
         identifiability=_assess_identifiability(result.search),
         consistency=consistency,
         track=_read_track_figure(recording),
@@ -94,7 +97,11 @@ def build_report_data(
 
 
 def _read_track_figure(recording: Recording) -> bytes:
-    """Return the PNG figure that film tracking saved next to the recording; empty if none."""
+    """Return the PNG figure that film tracking saved next to the recording; empty if none.
+
+    A recording is from a film if it has the columns of the tracked ball. A file that is too large
+    or not a PNG is left out, because any file may have that name.
+    """
     path = recording.path.with_suffix(".png")
     if not recording.extra.keys() >= TRACK_COLUMNS:
         return b""
@@ -128,7 +135,9 @@ def _estimate_parameters_by_group(
 ) -> tuple[ParameterConsistency, ...]:
     """Return the estimates by run, log or load of the best effect other than a single cause.
 
-    They let the report compare how consistent the cause and its best competitor are.
+    They let the report compare how consistent the cause and its best competitor are: a wrong effect
+    needs another coefficient in each group. Effects that are part of the diagnosis are not
+    competitors. The result is empty without a competitor, or if there is not exactly one cause.
     """
     if len(finding.causes) != 1:
         return ()
@@ -176,6 +185,8 @@ def _summarise_held_out(
 ) -> tuple[DataSplit | None, list[GapLocation]]:
     """Return the held-out runs and their gap locations; None and empty if not measured.
 
+    A gap location is a run with its RMS residual before and after the causes are added.
+
     Args:
         result: result of the search.
         sigma: (C,) standard deviation of the noise of each channel.
@@ -201,16 +212,16 @@ def _list_channels(runs: SimulatedRuns, sigma: Array) -> tuple[ChannelInfo, ...]
 
     `sigma` (C,) is the noise standard deviation of each channel in its unit.
     """
-    floor = runs.floor
+    noise_floor = runs.floor
     rows = zip(
         runs.fitting.simulator.channels,
         sigma.tolist(),
-        floor.is_stated.tolist(),
-        floor.quantisation_step.tolist(),
+        noise_floor.is_stated.tolist(),
+        noise_floor.quantisation_step.tolist(),
         strict=True,
     )
     return tuple(
-        ChannelInfo(c.name, c.unit, noise_sigma, is_stated, step)
+        ChannelInfo(c.name, c.unit, sigma=noise_sigma, stated=is_stated, step=step)
         for c, noise_sigma, is_stated, step in rows
     )
 
@@ -228,22 +239,26 @@ def _list_parameter_changes(result: SearchResult) -> Iterator[ParameterChange]:
         parameter = evaluator.parameters[i]
         is_free = i not in result.base.fit.fixed_parameters
         yield ParameterChange(
-            parameter.name,
-            parameter.unit,
-            _get_value_and_interval(before[i]),
-            _get_value_and_interval(after[i]),
-            is_free,
-            (before[i].at_bound, after[i].at_bound),
-            format_file_change(after[i]),
+            name=parameter.name,
+            unit=parameter.unit,
+            before=_get_value_and_interval(before[i]),
+            after=_get_value_and_interval(after[i]),
+            is_sensitive=is_free,
+            bounds=(before[i].at_bound, after[i].at_bound),
+            in_file=format_file_change(after[i]),
         )
 
 
 def _list_unexplained(result: SearchResult) -> Iterator[str]:
-    """Yield sentences on what the extended model does not explain, and on fixed parameters."""
+    """Yield sentences on the residual of the extended model, and on parameters kept nominal.
+
+    These are channels above the noise, the dependence of an unmodelled force, and parameters that
+    the data do not identify.
+    """
     evaluator, lack_of_fit = result.runs.fitting, result.finding.lack_of_fit
     for channel in lack_of_fit.channels_above_noise:
-        times = lack_of_fit.excess[evaluator.channels.index(channel)]
-        yield f"the residual of channel {channel} is {times:.3g} times its noise"
+        noise_multiple = lack_of_fit.excess[evaluator.channels.index(channel)]
+        yield f"the residual of channel {channel} is {noise_multiple:.3g} times its noise"
     # Without a result of the test for unmodelled forces there is no dependence to report.
     if lack_of_fit.has_structure and lack_of_fit.where:
         yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
@@ -258,7 +273,11 @@ def _list_unexplained(result: SearchResult) -> Iterator[str]:
 
 
 def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
-    """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
+    """Yield a warning for each base parameter whose fitted value is at a bound of its range.
+
+    The value may then be wrong, and a cause may compensate for it. One warning is given for each
+    parameter, for the base fit if both fits end at a bound.
+    """
     for parameter in changes:
         values = parameter.before[0], parameter.after[0]
         for fit_text, value, bound in zip(

@@ -77,7 +77,8 @@ class SearchResult:
     def list_competing_models(self) -> list[FittedModel]:
         """Return the models with an alternative in place of the strongest cause that has some.
 
-        The most plausible alternative comes first.
+        The alternatives explain the data as well, and an experiment should distinguish them. The
+        most plausible one comes first. The list is empty if no cause has alternatives.
         """
         for cause in self.finding.causes:
             others = {name for name in self.finding.model.effects if name != cause.effect}

@@ -117,6 +117,9 @@ class SimulatedRuns:
     ) -> SimulatedRuns:
         """Build run evaluators, noise floor and validation.
 
+        The validation predicts held-out runs; if there are none but several folds, it is
+        cross-validation.
+
         Args:
             context: what all steps of the diagnosis share.
             kind: class of the simulator.
@@ -126,6 +129,7 @@ class SimulatedRuns:
         def build_evaluator(runs: Sequence[Run]) -> RunEvaluator:
             """Build the run evaluator of some runs, with the same effects at the same indices."""
             engine, free = choose_engine(kind, context.options), list_free(kind, context.options)
+            # Hat effects are the forces of any shape by which unmodelled forces are detected.
             evaluator = RunEvaluator(kind, recording, runs, engine, list_hat_effects(kind), free)
             context.adopt(evaluator)
             return evaluator
@@ -211,15 +215,15 @@ class SimulatedRuns:
             rng: random numbers of the search, such as those of surrogate data.
             attributes: further fields of the search.
         """
-        kind = EffectSearch
+        search_class = EffectSearch
         if self.fitting.filtered_runs is not None:
             # This import is needed for robots only.
             from bench.diagnosis.prediction_error.prediction_error_search import (
                 PredictionErrorSearch,
             )
 
-            kind = PredictionErrorSearch
-        search = kind(
+            search_class = PredictionErrorSearch
+        search = search_class(
             self.fitting,
             self.noise,
             base.fixed_parameters,
@@ -233,15 +237,22 @@ class SimulatedRuns:
 
     @contextmanager
     def record_widened_ranges(self) -> Iterator[None]:
-        """Report the ranges of base parameters that the block widens, and use them for all runs."""
-        previous = {p.name: p.bounds for p in self.fitting.parameters}
+        """Report the ranges of base parameters that the block widens, and use them for all runs.
+
+        A fit inside the block may widen ranges of the evaluator for fitting. Held-out runs must
+        accept the same values. The context keeps the first and the last range of each parameter for
+        the report.
+        """
+        bounds_before = {p.name: p.bounds for p in self.fitting.parameters}
         yield
-        wider = {p.name: p.bounds for p in self.fitting.parameters if p.bounds != previous[p.name]}
+        widened = {
+            p.name: p.bounds for p in self.fitting.parameters if p.bounds != bounds_before[p.name]
+        }
         for evaluator in self.evaluators[1:]:
-            use_bounds(evaluator, wider)
-        for name, (low, high) in wider.items():
+            use_bounds(evaluator, widened)
+        for name, (low, high) in widened.items():
             self.context.say(f"{name} ends at a bound of its range: widened to {low:g} to {high:g}")
-            declared, _ = self.context.wider.get(name, (previous[name], None))
+            declared, _ = self.context.wider.get(name, (bounds_before[name], None))
             self.context.wider[name] = declared, (low, high)
 
 

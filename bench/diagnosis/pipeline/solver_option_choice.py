@@ -53,7 +53,10 @@ class RatedOptions(NamedTuple):
 
     @classmethod
     def rate(cls, model: BaseModel) -> RatedOptions:
-        """Rate a base model."""
+        """Rate how well a base model explains the fitted runs and predicts the held-out ones.
+
+        The latter is zero without validation.
+        """
         search = model.runs.create_search(model.fit)
         rated = search.base_model
         held_out = 0.0
@@ -72,8 +75,8 @@ class RatedOptions(NamedTuple):
     def is_better_than(self, other: RatedOptions) -> bool:
         """Return whether these options explain the recording better than others, on their own.
 
-        They must close half of the gap, and predict the held-out runs better. Only another value of
-        an option that has been changed already needs no part of the gap.
+        They must close half of the gap, and predict the held-out runs better. If the same options
+        are changed, only to other values, a clearly higher likelihood is enough.
         """
         # This import is needed for robots only.
         from sims.robot.integrator_settings import list_changed_options
@@ -106,8 +109,8 @@ class SolverOptionChoice:
         """Choose the options of the base model: those of the file, or others.
 
         Other options are used before the search if they alone close the gap down to the noise, and
-        if no effect comes near with the file's options. Other options that are better than the
-        file's are compared with the result of the search.
+        if no effect comes near with the file's options. Otherwise, options that are better than the
+        file's are kept for `reconsider`, which compares them with the result of the search.
 
         Args:
             model: base model with the options of the file.
@@ -132,6 +135,9 @@ class SolverOptionChoice:
 
     def reconsider(self, result: SearchResult, cause_search: CauseSearch) -> SearchResult:
         """Return the result with other options, if they explain the data better, or this result.
+
+        The other options are those that `choose` kept. They are searched for causes only if they
+        alone are better than the present result, or if that result does not explain the data.
 
         Args:
             result: result with the options and the time step of the model file.
@@ -171,6 +177,9 @@ class SolverOptionChoice:
 def _improve_options(rated: RatedOptions) -> RatedOptions:
     """Return the best options, changed one after the other while the base model improves.
 
+    In each round, a fast estimate ranks the alternatives, and the base model is fitted with the
+    best few.
+
     Args:
         rated: The options of the model file.
     """
@@ -201,8 +210,10 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
 def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> bool:
     """Return whether an effect may explain the recording as other options of the solver do.
 
-    Far from the noise, only effects at contacts are tried: others would not imitate an option. Laws
-    with many shapes are not tried, because an option is the simpler explanation.
+    The gain of the effects, by a scan of their coefficients or by linear scores, is compared with
+    that of the options. Far from the noise, only effects at contacts are tried: others would not
+    imitate an option. Laws with many shapes are not tried, because an option is the simpler
+    explanation.
 
     Args:
         options: the other solver options, with the base model fitted to them.
@@ -222,9 +233,9 @@ def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> 
     exclude_laws_with_many_shapes(search)
     model = search.base_model
     squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
-    gains = (
+    effect_gains = (
         float(search.observed_mask.sum()) * float(np.log(squares / lowest_squares)),
         float(search.score_missing_effects(model).score.max(initial=0.0)),
     )
     option_gain = options.log_likelihood - file_options.log_likelihood
-    return max(gains) > MIN_COMPETING_GAIN_SHARE * option_gain
+    return max(effect_gains) > MIN_COMPETING_GAIN_SHARE * option_gain

@@ -50,7 +50,9 @@ class TimeStepChoice:
     def choose(self, model: BaseModel) -> BaseModel:
         """Choose the step of the base model: the file's own, or a finer one.
 
-        A finer step is used if it alone closes a large part of the gap.
+        A finer step is used if it alone closes a large part of the gap. Steps are tried from coarse
+        to fine; a step must be so accurate that its error is far below the residual that remains
+        with it.
 
         Args:
             model: base model with the file's own step.
@@ -60,34 +62,36 @@ class TimeStepChoice:
 
         runs = model.runs
         (self._refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
-        file_log_likelihood, residual = model.rate()
-        gap = residual - 1.0
+        file_log_likelihood, residual_rms = model.rate()
+        gap = residual_rms - 1.0
         for refinement in copy(self._refinements):
             # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
-            if not refinement.is_accurate_enough(residual):
+            if not refinement.is_accurate_enough(residual_rms):
                 continue
             runs = runs.with_kind(refinement.kind)
             if runs.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 filter_runs(runs)
             finer = model.refit(runs)
-            log_likelihood, residual = finer.rate()
+            log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
-            if not is_finer_step_better(gain, gap, residual - 1.0):
+            if not is_finer_step_better(gain, gap, residual_rms - 1.0):
                 # Another missing effect may affect both models: they are compared again with it.
                 if refinement.is_accurate_enough(0.0):
                     break
-                residual = 0.0
-            elif refinement.is_accurate_enough(residual):
+                residual_rms = 0.0
+            elif refinement.is_accurate_enough(residual_rms):
                 return self._use(refinement, gain, model, finer)
         return model
 
     def reconsider(self, result: SearchResult, cause_search: CauseSearch) -> SearchResult:
         """Return the result with another step, if that explains the data better, or this result.
 
-        The other step is compared with the effects of this result or some of them. Models are
-        compared by penalised log-likelihood and residual, and a finer step must be clearly better:
-        data that MuJoCo made with the file's own step must not be explained by another.
+        If `choose` took a finer step, the file's own step is tested; if not, a step that is
+        accurate enough for any residual is. The other step is compared with the effects of this
+        result or some of them. Models are compared by penalised log-likelihood and residual, and a
+        finer step must be clearly better: data that MuJoCo made with the file's own step must not
+        be explained by another. If the other step wins, causes are searched again.
 
         Args:
             result: result with the present step.
@@ -124,7 +128,8 @@ class TimeStepChoice:
     ) -> BaseModel:
         """Use a finer step, and record that the file's own step is too coarse.
 
-        A URDF specifies no step, so that a finer one corrects nothing in it.
+        A URDF specifies no step, so that a finer one corrects nothing in it: nothing is recorded
+        then, and the step is not reconsidered.
 
         Args:
             refinement: the finer step and integrator.
@@ -150,6 +155,7 @@ class TimeStepChoice:
 def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float, float]:
     """Fit subsets of the effects of a result to runs with another step, and rate the best model.
 
+    With another step, some effects may be needless, because they imitated the error of the step.
     All subsets are fitted if there are only few effects; otherwise only all together.
 
     Args:
@@ -172,9 +178,9 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     fits = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters).fit_models(
         starts, MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS
     )
-    models = runs.create_search(base)
+    search = runs.create_search(base)
     best = max(
-        (models.add_fit(subset_fit) for subset_fit in fits),
+        (search.add_fit(subset_fit) for subset_fit in fits),
         key=lambda model: model.penalised_log_likelihood,
     )
-    return rate_model(models, best)
+    return rate_model(search, best)

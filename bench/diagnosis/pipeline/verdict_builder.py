@@ -21,7 +21,11 @@ from bench.diagnosis.verdict import Candidate, Cause, Verdict
 
 
 def build_verdict(result: SearchResult) -> Verdict:
-    """Build the verdict from the result of a search."""
+    """Build the verdict from the result of a search.
+
+    It has the causes with coefficients, the base parameters, the held-out gain, all candidates with
+    their scores, and the proposed next experiment.
+    """
     runs, evaluator, finding = result.runs, result.runs.fitting, result.finding
     numbers = result.estimates.values
     causes = build_causes(result)
@@ -35,17 +39,17 @@ def build_verdict(result: SearchResult) -> Verdict:
     candidates = _list_candidates(result.search, gains)
     next_run = _propose_next_run(result)
     return Verdict(
-        finding.verdict,
-        runs.recording.system,
-        runs.engine or "its own",
-        causes,
-        parameters,
-        heldout,
-        candidates,
-        next_run,
-        int(simulations),
-        time.perf_counter() - runs.context.started,
-        finding.early_stop,
+        verdict=finding.verdict,
+        system=runs.recording.system,
+        engine=runs.engine or "its own",
+        causes=causes,
+        parameters=parameters,
+        heldout=heldout,
+        candidates=candidates,
+        next_experiment=next_run,
+        simulations=int(simulations),
+        seconds=time.perf_counter() - runs.context.started,
+        cut=finding.early_stop,
         recording_faults=result.errors,
         recording_notes=runs.recording.notes,
     )
@@ -75,7 +79,8 @@ def _is_refuted(result: SearchResult) -> bool:
 
     This is so if no fitted model with effects has a higher penalised log-likelihood than the base
     model, or none predicts the held-out runs better. In closed loops and at rest, derivatives may
-    predict a gain that no fit achieves.
+    predict a gain that no fit achieves. A visible structure of the residual, or a large held-out
+    gap, is not refuted.
     """
     search, finding = result.search, result.finding
     if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
@@ -102,8 +107,9 @@ def _is_refuted(result: SearchResult) -> bool:
 def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candidate, ...]:
     """List all effects of the library with their scores about the base model, best first.
 
-    A score is reduced by the price of each coefficient beyond the first, so that an effect precedes
-    more general effects that contain it.
+    The score is twice the gain in log-likelihood, by the linear score test or by a fit if that
+    gains more. It is reduced by the price of each coefficient beyond the first, so that an effect
+    precedes more general effects that contain it.
 
     Args:
         search: the search, with the scores about the base model.
@@ -120,8 +126,10 @@ def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candida
         single_effect_model = search.models.get(frozenset({effect}))
         if single_effect_model is not None:
             score = max(score, float(single_effect_model.likelihood.value - base))
-        beyond_chance = np.array([score - scores.null_quantiles[i]])
-        p_value = float(np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0))
+        score_above_null = np.array([score - scores.null_quantiles[i]])
+        p_value = float(
+            np.clip(estimate_tail_p_value(scores.null_scores, score_above_null), 0.0, 1.0)
+        )
         share = gains.get_closed_share((effect,))
         coefficient_slice = search.evaluator.coefficient_slices[effect]
         score -= search.parameter_penalty * (coefficient_slice.stop - coefficient_slice.start - 1)

@@ -64,7 +64,12 @@ def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
 def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
     """Group effects that share a name or a place, and format one text for each group.
 
-    `conjunction` is the conjunction, such as "or".
+    First the places of one effect are collected: ``drag at joints a and b``. Effects that then
+    stand alone at the same place share a text: ``drag or friction at joint a``.
+
+    Args:
+        names: names of effects, with places such as ``drag.linear@elbow``.
+        conjunction: ``and`` or ``or`` between nouns, and between places.
     """
     by_effect: dict[str, list[str]] = {}
     for name in names:
@@ -83,6 +88,9 @@ def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
 
 def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     """Format effects of one name at several places, or several effects at one place.
+
+    For example ``drag at joint a or b``. A family (all places, ``@*``) among single places comes
+    last: ``drag at joint a or at every joint``.
 
     Args:
         group: names of the effects with their places, such as ``drag.linear@elbow``.
@@ -107,7 +115,9 @@ def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
 def format_missing_causes(causes: Sequence[Cause]) -> str:
     """Format what a simulation lacks and has wrong; causes with alternatives come last.
 
-    For example ``lacks wind, and linear drag or Coulomb friction``.
+    For example ``lacks wind, and linear drag or Coulomb friction``. Some causes are missing
+    effects, others are wrong values of the model file; if the alternatives of a cause are of both
+    kinds, the text is ``either lacks ... or has ...``.
     """
     missing_texts: list[str] = []
     wrong_value_texts: list[str] = []
@@ -149,7 +159,8 @@ def format_causes(causes: Sequence[Cause]) -> str:
 def format_number_error(cause: Cause) -> str:
     """Format how wrong a value of the model file is, as a clause; empty for other causes.
 
-    For example ``the mass of body forearm is 12 % larger than the model file states``.
+    For example ``the mass of body forearm is 12 % larger than the model file states``. A clause
+    about the time step, or gravity compensation, is returned too.
     """
     base, place = split_effect_name(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:
@@ -286,7 +297,10 @@ _STEP_ERROR_TEXTS = {
 
 
 def list_values(cause: Cause) -> list[tuple[str, str]]:
-    """List the coefficients of a cause by name, with their intervals and units."""
+    """List the coefficients of a cause by name, with their intervals and units.
+
+    The list is empty for a chosen option of the integrator, which is a word and not an estimate.
+    """
     # The corrected step was chosen, not estimated, and some options are words.
     if cause.effect in ("numerics.integrator", "numerics.cone", "numerics.solver"):
         return []
@@ -325,7 +339,7 @@ def has_placed_causes(report: DiagnosisReportData) -> bool:
 
 
 def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
-    """List the diagnosed places, to be marked on the robot.
+    """List the diagnosed places, to be marked on the drawing of the robot.
 
     Args:
         report: Data of the report.
@@ -339,6 +353,7 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
         for name in (cause.effect, *cause.alternatives):
             noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
             for place in _list_places(report, name, cause):
+                # The coefficients are those of the cause, not of its alternatives.
                 size = _format_coefficient(cause, name, place) if name == cause.effect else ""
                 # A family and one of its places give the same mark, which is kept once.
                 marks.setdefault(
@@ -350,7 +365,8 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
 def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
     """List the places at which an effect acts, for marks on the drawing of the robot.
 
-    An effect at all places has those of its coefficients, or all places of its kind.
+    An effect at all places (``@*``) has those of its coefficients; if these name none, it has all
+    joints, actuators or bodies of the robot.
 
     Args:
         report: content of the report, with the robot.
@@ -425,7 +441,9 @@ def get_candidate_status(report: DiagnosisReportData, effect: str) -> str:
 def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     """List all candidates as entries, the highest score first.
 
-    Without places each candidate is an entry. Otherwise each effect and each cause is one entry.
+    If effects act at places, such as joints, an effect would appear once for each of them. So it is
+    one entry: its best place, with the others in `elsewhere`. Each diagnosed cause has its own
+    entry.
 
     Args:
         report: Data of the report.
@@ -460,7 +478,11 @@ def _choose_representative(group: list[Candidate]) -> Candidate:
 
 
 def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
-    """Select the candidates to show, the highest score first; diagnosed causes are included."""
+    """Select the candidates to show, the highest score first; diagnosed causes are included.
+
+    At most `MAX_SHOWN_CANDIDATES` are shown, unless there are more causes: candidates that are not
+    needed are left out, those with the lowest scores first.
+    """
     ordered_candidates = [entry.best for entry in rank_candidates(report)]
     # A diagnosed cause is shown even with a low score.
     unneeded_candidates = [

@@ -120,13 +120,14 @@ AGREEMENT_COLUMNS = ("model", "number", "unit", "by", "group", "value", "low", "
 
 
 def format_consistency(report: DiagnosisReportData) -> list[str]:
-    """Format sentences about the consistency of the parameters.
+    """Format sentences on whether groups of runs (runs, logs or loads) agree on each parameter.
 
-    They report which parameters differ between groups, which are consistent with the causes only,
-    and which drift.
+    They report which parameters are consistent with the causes only, whether another effect would
+    be less consistent than the cause, which parameters differ between groups, and which drift from
+    log to log.
 
     Args:
-        report: Report data.
+        report: Report data, with the estimates of each parameter by group (a spread).
     """
     before = {(spread.number, spread.by): spread for spread in report.consistency.before}
     after = report.consistency.after
@@ -298,19 +299,20 @@ def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
     """
     rows = []
     for spread in sorted(report.consistency.after, key=lambda spread: spread.p_value):
-        halves = [(part.value, Z95 * part.error) for part in spread.group_estimates]
+        # Value and half of the 95 % interval of each group.
+        estimates = [(part.value, Z95 * part.error) for part in spread.group_estimates]
         rows.append(
             AgreementRow(
-                spread.number,
-                spread.is_consistent,
-                _format_interval(spread, spread.error),
-                _format_interval(spread, spread.prediction_sigma),
-                f"{len(halves)} {_pluralise_group(spread.by)}",
-                spread.p_value,
-                draw_intervals(
+                name=spread.number,
+                is_consistent=spread.is_consistent,
+                fitted=_format_interval(spread, spread.error),
+                predicted=_format_interval(spread, spread.prediction_sigma),
+                groups=f"{len(estimates)} {_pluralise_group(spread.by)}",
+                p_value=spread.p_value,
+                drawing=draw_intervals(
                     [
                         ("after", value, value - half_width, value + half_width)
-                        for value, half_width in halves
+                        for value, half_width in estimates
                     ],
                     (spread.value - Z95 * spread.error, spread.value + Z95 * spread.error),
                     distance=8,

@@ -228,6 +228,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
         share = candidate.heldout_gain
         if share is None:
             continue
+        # Very negative shares are drawn at the edge; the text has the value.
         position = max(share, LOWEST_SHARE)
         text = format_percent(share)
         interval = report.share_intervals.get(candidate.effect)
@@ -330,6 +331,9 @@ def _format_p_value(p_value: float) -> str:
 def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
     """Format the notes below the figure: numbers of runs and samples, meaning of p-values.
 
+    P-values are printed next to bars only if they are neither tiny nor insignificant; the notes
+    give the bound for the others.
+
     Args:
         report: content of the report.
         candidates: candidates that the figure shows.
@@ -341,18 +345,20 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
         counts += f"; held out: {_format_split_size(report.held_out)}"
     notes = [f"{counts}."]
     p_value_note = "p: p-value of the score"
-    certain_p_values = [c.p_value for c in candidates if c.p_value <= MAX_UNPRINTED_P_VALUE]
-    chance_p_values = [c.p_value for c in candidates if _is_insignificant(report, c)]
-    if certain_p_values:
+    tiny_p_values = [c.p_value for c in candidates if c.p_value <= MAX_UNPRINTED_P_VALUE]
+    insignificant_p_values = [c.p_value for c in candidates if _is_insignificant(report, c)]
+    if tiny_p_values:
         bars = (
             "for all shown"
-            if len(certain_p_values) == len(candidates)
+            if len(tiny_p_values) == len(candidates)
             else "for grey or coloured bars"
         )
-        p_value_note += f"; {_format_p_value(max(certain_p_values)).replace('=', '≤')} {bars}"
-    if chance_p_values:
-        bars = "for all shown" if len(chance_p_values) == len(candidates) else "for white bars"
-        p_value_note += f"; {_format_p_value(min(chance_p_values)).replace('=', '≥')} {bars}"
+        p_value_note += f"; {_format_p_value(max(tiny_p_values)).replace('=', '≤')} {bars}"
+    if insignificant_p_values:
+        bars = (
+            "for all shown" if len(insignificant_p_values) == len(candidates) else "for white bars"
+        )
+        p_value_note += f"; {_format_p_value(min(insignificant_p_values)).replace('=', '≥')} {bars}"
     notes.append(f"{p_value_note}.")
     unsimulated_count = sum(candidate.heldout_gain is None for candidate in candidates)
     if 0 < unsimulated_count < len(candidates):
@@ -485,6 +491,7 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
             rendered[name] = RenderedFigure(
                 png, pdf, figure_output.render_svg(figure) if is_pdf_wanted() else None
             )
+        # The page highlights joints on the drawing of the robot, so it needs their positions.
         if report.robot is not None and "robot" in rendered:
             positions = tuple(
                 compute_joint_positions(
@@ -499,6 +506,9 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
 
 def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, float]:
     """Return recorded joint positions at the sample of a run that is farthest from its start.
+
+    In this pose the drawing of the robot shows more than at rest. Only joints with recorded
+    positions are returned; the result is empty if there are none.
 
     Args:
         report: Report data.
@@ -530,7 +540,7 @@ def _draw_robot(report: DiagnosisReportData) -> Figure:
 def _draw_overview(report: DiagnosisReportData) -> Figure:
     """Draw the run with the largest residual: each channel over time, and its residual below.
 
-    For a robot, the figure of `joint_figure` is drawn instead.
+    For a robot, the figure of `joint_figure`, joint by joint, is drawn instead.
     """
     view = select_worst_run(report)
     if is_robot(report):
@@ -689,10 +699,8 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     Args:
         report: Data of the report.
     """
-    locations, profiles = (
-        select_gap_locations(report.gap_locations),
-        select_informative_profiles(report.profiles),
-    )
+    locations = select_gap_locations(report.gap_locations)
+    profiles = select_informative_profiles(report.profiles)
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
     names = place_names(locations)

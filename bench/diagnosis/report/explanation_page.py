@@ -92,7 +92,8 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 def build_candidate_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per candidate, the highest score first.
 
-    `set` numbers the candidates that the data cannot distinguish.
+    `set` numbers the candidates that the data cannot distinguish; `shown` says which rows are
+    visible at first: of an effect that acts at several places, only the best one.
 
     Args:
         report: Data of the report.
@@ -246,16 +247,17 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         value_label = format_label(label, units.get(profile.channel, "1"), 60)
         panels.append(
             Panel(
-                _format_profile_name(profile),
-                RESIDUAL_PROFILE_TABLE,
-                "at",
-                tuple(series),
-                Axis(
+                title=_format_profile_name(profile),
+                table=RESIDUAL_PROFILE_TABLE,
+                x="at",
+                series=tuple(series),
+                across=Axis(
                     format_label(shorten_name(sanitise(variable), MAX_LABEL_LENGTH), profile.unit),
                     scales=("linear",),
                 ),
-                Axis(value_label, scales=("linear",), holds=(0.0,)),
-                {"residual of": _format_profile_name(profile)},
+                # The axis always contains zero.
+                up=Axis(value_label, scales=("linear",), holds=(0.0,)),
+                facets={"residual of": _format_profile_name(profile)},
                 height=230,
             )
         )
@@ -406,12 +408,14 @@ def _format_cause(cause: Cause) -> str:
 def _format_set(report: DiagnosisReportData, cause: Cause) -> str:
     """Format the members of a set of indistinguishable causes, with scores and held-out gains.
 
+    Scores are left out if effects act at places: such sets are large, and the table has their
+    scores.
+
     Args:
         report: content of the report, with the scores.
         cause: the cause and its alternatives.
     """
     names = [cause.effect, *cause.alternatives]
-    # The members of a large set have their scores in the table of candidates.
     if any("@" in name for name in names):
         return f"{format_effect_set(names, 'and')}. Each of them explains these runs equally well."
     by_effect = {c.effect: c for c in report.verdict.candidates}
@@ -442,6 +446,9 @@ class Bar(NamedTuple):
 
 def _make_bars(report: DiagnosisReportData) -> Iterator[Bar]:
     """Yield bars of the held-out error before and after, and of the noise floor.
+
+    The noise floor is the error that a perfect model would have. Widths are in percent of the
+    longest bar.
 
     Args:
         report: Data of the report; without held-out runs there are no bars.
@@ -564,10 +571,10 @@ def _list_error_rows(report: DiagnosisReportData) -> list[tuple[str, DataSplit, 
 def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
     """List each channel with its noise, the source of the noise, and its RMS errors.
 
-    `columns` has one array (C,) of errors for each combination of runs and model; see
-    `_list_error_rows`.
+    There is one error for each combination of runs and model, in the order of `_list_error_rows`.
     """
-    columns = [
+    # Column 0 of the errors is before, column 1 after the causes were added.
+    errors_by_combination = [
         compute_channel_errors(split)[:, int(model_suffix == " after")]
         for _, split, model_suffix in _list_error_rows(report)
     ]
@@ -576,7 +583,10 @@ def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
         source = "stated" if channel.stated else "estimated"
         source += f", steps of {format_number(channel.step)}" if channel.step else ""
         noise = append_unit(format_number(channel.sigma), channel.unit)
-        errors = [append_unit(format_number(float(column[i])), channel.unit) for column in columns]
+        errors = [
+            append_unit(format_number(float(column[i])), channel.unit)
+            for column in errors_by_combination
+        ]
         rows.append(ChannelRow(channel.name, noise, source, errors))
     return rows
 
@@ -610,6 +620,9 @@ class ParameterRow(NamedTuple):
 def _make_parameter_row(p: ParameterChange) -> ParameterRow:
     """Return a table row with a base parameter before and after the causes were added.
 
+    The base model bends its parameters to imitate a missing effect: the row says whether the
+    parameter had absorbed part of the gap in this way.
+
     Args:
         p: Parameter with its estimates and intervals in the base and the extended model.
     """
@@ -622,8 +635,8 @@ def _make_parameter_row(p: ParameterChange) -> ParameterRow:
     drawing = draw_intervals([("before", *p.before), ("after", *p.after)])
     return ParameterRow(
         p.name,
-        format_tuned_value(p, 0),
-        format_tuned_value(p, 1),
+        format_tuned_value(p, 0),  # before
+        format_tuned_value(p, 1),  # after
         f"{format_shift(p)}, {reason}",
         drawing,
     )

@@ -93,6 +93,9 @@ def has_extended_model(report: DiagnosisReportData) -> bool:
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     """Select the runs, channels and phases with the largest gaps, in their original order.
 
+    A gap location is such a part of the data with its RMS residual. Those without samples are left
+    out.
+
     Args:
         places: Gap locations with their RMS residual before the causes are added.
     """
@@ -271,8 +274,9 @@ def format_profile_label(profile: ResidualProfile) -> str:
 def draw_profile_panel(
     axis: Axes, profile: ResidualProfile, unit: str, extended: bool, *, one_channel: bool = False
 ) -> None:
-    """Draw the mean residual of a channel against a variable.
+    """Draw the mean residual of a channel against a variable, without and with the causes.
 
+    A perfect model has means near zero; a trend shows on which variable the missing force depends.
     Bars are two standard errors of the mean to either side.
 
     Args:

@@ -144,7 +144,7 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
     count = len({split_effect_name(row.effect)[0] for row in identifiable_rows})
     ordered_rows = sorted(rows, key=lambda row: _STATUSES.index(row.status))
     without_place = [row for row in rows if not _get_place(row)]
-    columns = [s for s in _STATUSES if any(row.status == s for row in without_place)]
+    columns_without_place = [s for s in _STATUSES if any(row.status == s for row in without_place)]
     return IdentifiabilitySection(
         counts=format_counts(report),
         free=[
@@ -154,8 +154,8 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
         ],
         legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present_statuses),
         matrices=_build_matrices(unclear_rows),
-        family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
-        families=_build_family_table(without_place, columns),
+        family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns_without_place],
+        families=_build_family_table(without_place, columns_without_place),
         identifiable_heading=(
             f"{count} {'more ' * bool(unclear_rows)}effects that can be identified at every place"
         ),
@@ -194,6 +194,7 @@ def format_counts(report: DiagnosisReportData) -> str:
     """
     rows = _list_rows(report)
     statuses = [str("identifiable" if r.status == "found" else r.number.word) for r in rows]
+    # The first two statuses are those of causes that the verdict names.
     counts = {s: statuses.count(s) for s in _STATUSES[2:]}
     sentence = (
         f"Of {len(rows)} causes, each considered alone, this recording can identify "
@@ -244,6 +245,8 @@ def _get_place(row: _Row) -> str:
 
 def _build_matrix(rows: Sequence[_Row], kind: str) -> Matrix:
     """Build the matrix of effects by places of one kind.
+
+    Effects that are identifiable at more places come first.
 
     Args:
         rows: causes at places of this kind.

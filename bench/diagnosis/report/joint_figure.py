@@ -93,7 +93,9 @@ def is_robot(report: DiagnosisReportData) -> bool:
 def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
     """List a row for each joint, in the order of the channels, then one for each sensor.
 
-    Channels are named ``quantity.joint``, such as ``q.elbow`` for its position.
+    Channels are named ``quantity.joint``, such as ``q.elbow`` for its position. A row has all
+    channels of its joint; its motion is the position, or else the velocity or torque. Other
+    channels are sensors.
 
     Args:
         report: Data of the report of a robot.
@@ -128,7 +130,10 @@ def _list_quantities(report: DiagnosisReportData) -> list[str]:
 
 
 def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
-    """Draw a run joint by joint.
+    """Draw a run joint by joint: motion and residuals of each joint in a row.
+
+    Joints with the largest residuals are selected if there are many. Residuals of one quantity,
+    such as position, have a common scale. Names of joints that the diagnosis names are highlighted.
 
     Args:
         report: Report data.
@@ -344,6 +349,8 @@ def _unify_scale(
     quantity: str,
 ) -> None:
     """Give the residuals of one quantity (a column) the same scale, to compare joints.
+
+    The scale contains nearly all residuals of the base model; a quantile leaves out single peaks.
 
     Args:
         panels: axes of the column.

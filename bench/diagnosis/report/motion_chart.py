@@ -83,7 +83,10 @@ class MotionTable(NamedTuple):
 
 
 def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) -> MotionTable:
-    """Build the table of samples to show.
+    """Build the table of samples that the interactive chart shows.
+
+    The rows are divided among the runs and channels. If there are too many runs, the best ones are
+    left out; if runs have too many samples, only the extremes of short parts are shown.
 
     Args:
         report: Report data.
@@ -126,6 +129,7 @@ def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
             gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
             title = f"{sanitise(name, 40)}{split_note}: RMS residual {format_number(gap, 2)} σ"
             runs.append(ShownRun(split, row, title, gap))
+    # The printed figure shows the worst run, so the chart begins with it.
     first_run = (id(worst_run.data_split), worst_run.row)
     return sorted(runs, key=lambda run: ((id(run.data_split), run.row) != first_run, -run.gap))
 
@@ -144,7 +148,7 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
 
 
 def _format_rows(
-    report: DiagnosisReportData, run: ShownRun, c: int, max_rows: int
+    report: DiagnosisReportData, run: ShownRun, channel_index: int, max_rows: int
 ) -> list[list[str]]:
     """Format the samples of a channel of a run as columns of text for the chart's table.
 
@@ -153,18 +157,19 @@ def _format_rows(
     Args:
         report: content of the report.
         run: run of the page: its label, and its place in the data.
-        c: index of the channel.
+        channel_index: index of the channel.
         max_rows: maximum number of samples.
     """
-    split, channel = run.data_split, report.channels[c]
+    split, channel = run.data_split, report.channels[channel_index]
     times = split.times[run.row]
     models = ("before", "after") if has_extended_model(report) else ("before",)
-    observed = split.observed[run.row, : len(times), c]
-    simulated = [getattr(split, model)[run.row, : len(times), c] for model in models]
+    observed = split.observed[run.row, : len(times), channel_index]
+    simulated = [getattr(split, model)[run.row, : len(times), channel_index] for model in models]
     residuals = [(observed - signal) / channel.sigma for signal in simulated]
     rows = np.arange(len(times))
     if len(times) > max_rows:
         rows = select_extreme_samples([observed, *residuals], _count_parts(report, max_rows))
+    # Decimals, so that the noise has at least a few digits.
     digits = (
         int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
         if channel.sigma > 0
@@ -228,17 +233,20 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
             panels += _make_panels(report, run, c, {"run": run.says, **facets}, is_wide)
     toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
     return MotionChart(
-        table,
-        panels,
-        2 if is_wide else 1,
-        ("Left", "Right") if is_wide else ("Above", "Below"),
-        toggles,
-        {toggles[0]: _list_hidden(report, places, toggles[0])},
+        table=table,
+        panels=panels,
+        columns=2 if is_wide else 1,
+        sides=("Left", "Right") if is_wide else ("Above", "Below"),
+        toggles=toggles,
+        off={toggles[0]: _list_hidden(report, places, toggles[0])},
     )
 
 
 def _list_switches(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
-    """Return the switches of each channel; for a robot, joint and quantity.
+    """Return the switches of each channel, by which readers show and hide its panels.
+
+    A robot has two switches, joint and quantity (position, velocity, ...); sensors are a quantity
+    of their own. Other systems have one switch, the channel.
 
     Args:
         report: Data of the report.
@@ -262,7 +270,8 @@ def _list_hidden(
 ) -> tuple[str, ...]:
     """Return the channels or joints that are hidden at first, if there are many.
 
-    Those with the largest residuals stay visible.
+    Those with the largest residuals stay visible, until `MAX_INITIAL_CHANNELS` panels are visible;
+    at least one does.
 
     Args:
         report: content of the report, with the residual of each channel.
@@ -345,26 +354,24 @@ def _make_panels(
         else (_MOTION_HEIGHT, _RESIDUAL_HEIGHT)
     )
     motion_panel = Panel(
-        name,
-        MOTION_TABLE_NAME,
-        "t",
-        tuple(series),
-        time_axis,
-        value_axis,
-        facets,
-        (),
-        (),
-        tooltip_lines,
-        heights[0],
+        title=name,
+        table=MOTION_TABLE_NAME,
+        x="t",
+        series=tuple(series),
+        across=time_axis,
+        up=value_axis,
+        facets=facets,
+        tells=tooltip_lines,
+        height=heights[0],
     )
     residual_panel = Panel(
-        f"{name}: residual",
-        MOTION_TABLE_NAME,
-        "t",
-        tuple(residuals),
-        time_axis,
-        residual,
-        facets,
+        title=f"{name}: residual",
+        table=MOTION_TABLE_NAME,
+        x="t",
+        series=tuple(residuals),
+        across=time_axis,
+        up=residual,
+        facets=facets,
         spans=noise_band,
         tells=tooltip_lines,
         height=heights[1],

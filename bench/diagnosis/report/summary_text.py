@@ -91,14 +91,14 @@ def format_summary(report: DiagnosisReportData) -> list[str]:
 
 
 def format_details(report: DiagnosisReportData) -> Iterator[str]:
-    """Yield the paragraphs below the headline.
+    """Yield the paragraphs below the headline of the summary.
 
     Args:
         report: Data of the report.
 
     Returns:
         Paragraphs on causes, reasons, largest gaps, parameters, consistency, residual and next
-        experiment.
+        experiment. For a recording with a wrong unit or sign, only the number of simulations.
     """
     verdict = report.verdict.verdict
     if report.verdict.recording_faults:
@@ -292,13 +292,13 @@ def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
     all.
     """
     # Each list is the fallback of the previous one, because at least one parameter must be named.
-    unbounded = [
+    without_interval = [
         p.name for p in report.parameters if p.is_sensitive and not np.isfinite(p.before).all()
     ]
     insensitive = [p.name for p in report.parameters if not p.is_sensitive]
     names = (
         list(report.unidentified_parameters)
-        or unbounded
+        or without_interval
         or insensitive
         or [p.name for p in report.parameters]
     )
@@ -353,15 +353,18 @@ def _format_unit_errors(errors: Sequence[RecordingFault]) -> Iterator[str]:
             "With this correction the error of the tuned simulation on the fitted runs falls "
             f"{before}to {format_number(likeliest_fault.error_after)} times the noise."
         )
-    for text in (*likeliest_fault.alternatives, *(fault.says for fault in further_faults)):
-        yield format_sentence(f"{'or' if text in likeliest_fault.alternatives else 'also'}: {text}")
+    for text in likeliest_fault.alternatives:
+        yield format_sentence(f"or: {text}")
+    for fault in further_faults:
+        yield format_sentence(f"also: {fault.says}")
     yield "No causes were searched, since each would only imitate this. Correct it and run again."
 
 
 def format_gain(report: DiagnosisReportData) -> str:
     """Format the held-out error before and after, and the noise floor.
 
-    Without held-out runs, the text says that the gain was not measured.
+    The noise floor is the error of a perfect model. Without held-out runs, the text says that the
+    gain was not measured.
     """
     held_out = report.verdict.heldout
     if held_out is None:
@@ -440,7 +443,8 @@ def _format_fitted_gain(report: DiagnosisReportData) -> str:
 def get_held_out_unit(report: DiagnosisReportData) -> str:
     """Return the unit of the held-out errors.
 
-    It is the specified unit, or that of the channels whose combined noise is the noise floor.
+    It is the stored unit. For a result without one, it is found by comparison: the noise floor is
+    the RMS noise of all channels with one unit.
     """
     held_out = report.verdict.heldout
     if held_out is not None and held_out.unit:
@@ -514,10 +518,8 @@ def _select_worst_of_each_kind(
     worst_by_kind: dict[str, tuple[ChannelInfo, float]] = {}
     for channel, size in sizes:
         kind = channel.name.partition(".")[0]
-        if (
-            kind not in worst_by_kind
-            or size / channel.sigma > worst_by_kind[kind][1] / worst_by_kind[kind][0].sigma
-        ):
+        worst_channel, worst_size = worst_by_kind.setdefault(kind, (channel, size))
+        if size / channel.sigma > worst_size / worst_channel.sigma:
             worst_by_kind[kind] = channel, size
     return list(worst_by_kind.values())
 
@@ -597,7 +599,10 @@ def format_coefficients(cause: Cause) -> str:
 
 
 def format_largest_gap(report: DiagnosisReportData, kind: str) -> str:
-    """Format the run, channel or phase with the largest gap, if there are several.
+    """Format the run, channel or phase with the largest gap; empty if there are not several.
+
+    For example ``channel q (3.2 before, 1.1 after)``: RMS residuals in units of the noise, without
+    and with the causes.
 
     Args:
         report: Report data.
@@ -617,9 +622,10 @@ def format_largest_gap(report: DiagnosisReportData, kind: str) -> str:
 
 
 def format_parameter_shifts(report: DiagnosisReportData) -> str:
-    """Format how far the parameters move once the cause is in the model.
+    """Format how far the parameters move once the causes are in the model.
 
-    A few get a sentence each; more are listed without intervals, which the page contains.
+    A missing effect biases the base parameters, which absorb part of the gap. A few parameters get
+    a sentence each; more are listed without intervals, which the page contains.
 
     Args:
         report: Report data.

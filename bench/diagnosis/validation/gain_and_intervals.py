@@ -80,14 +80,14 @@ def compute_central_jacobian(
     Returns:
         The fit with the new Jacobian.
     """
-    q = fit.free_indices.size
+    parameter_count = fit.free_indices.size
     runs, state_count = fit.initial_states.shape
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
     # Derivatives by initial states from a linearisation are not one-sided differences.
     if evaluator.has_linearisation:
-        steps = steps[:q]
+        steps = steps[:parameter_count]
     theta, states = _displace_both_sides(fit, steps, bounds)
 
     # One call simulates both sides and all runs, because the engine steps a batch at once.
@@ -98,14 +98,20 @@ def compute_central_jacobian(
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.
-    lower, upper = theta[:, :q, fit.free_indices]
+    lower, upper = theta[:, :parameter_count, fit.free_indices]
     parameter_widths = np.diagonal(upper - lower)
-    widths = np.concatenate([parameter_widths, 2.0 * steps[q:]])
+    widths = np.concatenate([parameter_widths, 2.0 * steps[parameter_count:]])
     jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
     # A simulation that failed on one side gives no slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    state_jacobian = fit.jacobian[..., q:] if evaluator.has_linearisation else jacobian[..., q:]
-    return replace(fit, jacobian=np.concatenate([jacobian[..., :q], state_jacobian], axis=3))
+    state_jacobian = (
+        fit.jacobian[..., parameter_count:]
+        if evaluator.has_linearisation
+        else jacobian[..., parameter_count:]
+    )
+    return replace(
+        fit, jacobian=np.concatenate([jacobian[..., :parameter_count], state_jacobian], axis=3)
+    )
 
 
 def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
@@ -128,8 +134,9 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
 def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
     """Build the parameters (2, n, P) and initial states (2, n, R, s) of the central differences.
 
-    The first axis is the lower and the upper side. Row j of the first n parameters and states has
-    number j moved by its step.
+    The first axis is the lower and the upper side. Row j has number j of the n parameters and
+    initial states moved by its step, and all others unchanged. A row is simulated to get one column
+    of the Jacobian.
 
     Shapes: R runs, P parameters.
 
@@ -138,7 +145,7 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
         steps: (n,) steps of the q parameters, then of the s initial states.
         bounds: (q, 2) bounds of the parameters.
     """
-    q = fit.free_indices.size
+    parameter_count = fit.free_indices.size
     theta = np.tile(fit.theta, (2, len(steps), 1))
     initial_states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
@@ -147,8 +154,8 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
             displaced_value = fit.theta[index] + shifts[j]
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
             theta[side, j, index] = np.clip(displaced_value, *bounds[j])
-        for j, shift in enumerate(shifts[q:]):
-            initial_states[side, q + j, :, j] += shift
+        for j, shift in enumerate(shifts[parameter_count:]):
+            initial_states[side, parameter_count + j, :, j] += shift
     return theta, initial_states
 
 
@@ -197,9 +204,10 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
 
 
 def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
-    """Invert the curvature after elimination of the initial states.
+    """Invert the curvature after elimination of the initial states, which gives the covariance.
 
-    Directions that the data do not identify get a huge variance.
+    Directions that the data do not identify get a huge variance. Parameters are scaled by their own
+    curvature before, so that the threshold for this does not depend on units.
 
     Shapes: q fitted parameters.
 
@@ -211,8 +219,8 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     # Parameters of any unit are scaled alike, so that the cut-off below means the same for each.
     diagonal = np.diagonal(parameter_curvature)
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
-    units = np.outer(scale, scale)
-    scaled = schur_complement / units
+    unit_products = np.outer(scale, scale)
+    scaled = schur_complement / unit_products
     inverse = np.linalg.pinv(scaled, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True)
     values, vectors = np.linalg.eigh(scaled)
     is_unidentified = values < MIN_EIGENVALUE
@@ -220,7 +228,7 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     if is_unidentified.any():
         unidentified = vectors[:, is_unidentified]
         inverse = inverse + (unidentified * UNIDENTIFIED_VARIANCE) @ unidentified.T
-    result: Array = inverse / units  # (2)
+    result: Array = inverse / unit_products  # (2)
     return result
 
 
@@ -261,7 +269,10 @@ def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
 def compute_fisher_blocks_from_jacobian(
     evaluator: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
 ) -> FisherBlocks:
-    """Compute the curvature blocks from a Jacobian.
+    """Compute the curvature blocks of eq. (2) of the module docstring from a Jacobian.
+
+    The derivatives are whitened, so that their products are information in units of the noise. The
+    prior of the initial states is added to their block.
 
     Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
@@ -274,25 +285,28 @@ def compute_fisher_blocks_from_jacobian(
     observed_mask = np.isfinite(evaluator.observed)
     jacobian = whiten(np.where(observed_mask[..., None], jacobian, 0.0), observed_mask, noise)
     runs, *_, size = jacobian.shape
-    j = jacobian.reshape(runs, -1, size)
-    normal = np.matmul(j.transpose(0, 2, 1), j)
+    flat_jacobian = jacobian.reshape(runs, -1, size)
+    normal = np.matmul(flat_jacobian.transpose(0, 2, 1), flat_jacobian)
     precision = 1.0 / compute_state_prior(evaluator) ** 2
     # In an unstable motion the derivatives by all initial states may be collinear.
     powers = np.einsum("rii->ri", normal[:, q:, q:])
     ridge = STATE_REGULARISATION * powers[:, :, None] * np.eye(powers.shape[1])
     # A known initial state is not fitted, so it is not eliminated.
-    inner, cross = hold_known_states(
+    state_block, cross = hold_known_states(
         normal[:, q:, q:] + np.diag(precision) + ridge,
         normal[:, :q, q:],
         evaluator.known_state_mask,
     )
-    return FisherBlocks(noise, j, normal[:, :q, :q], cross, inner)
+    return FisherBlocks(noise, flat_jacobian, normal[:, :q, :q], cross, state_block)
 
 
 def compute_intervals(
     models: ModelSet, model: FittedModel
 ) -> dict[int, tuple[float, float, float]]:
-    """Compute the 95 % interval of each fitted parameter.
+    """Compute the 95 % interval of each fitted parameter from the covariance of the fit.
+
+    An interval that is wider than a share of the plausible range says nothing, and is replaced by
+    NaN.
 
     Args:
         models: Models with the run evaluator.
@@ -370,11 +384,12 @@ def compute_held_out_gain(
         channels: Indices of the channels that count; they share a unit.
         floor: RMS of the noise over these channels.
         rng: Random generator of the resampling.
-        resamples_segments: Resample segments of the runs; two or three runs are too few to
-            resample.
+        resamples_segments: Whether the bootstrap draws segments of the runs instead of whole runs;
+            two or three runs are too few to draw from.
     """
     sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
     total_sums = sums.sum(axis=0)
+    # Squared errors before and after, and number of samples.
     before_sum, after_sum, count = total_sums
     rms_before = float(np.sqrt(before_sum / count))
     rms_after = float(np.sqrt(after_sum / count))
@@ -400,8 +415,8 @@ def _sum_squared_errors(
 ) -> Array:
     """Sum up the squared errors of two models over each run or segment, for the bootstrap.
 
-    Each row (n, 3) has the sum of squares of the base model, that of the extended model, and the
-    number of samples.
+    The bootstrap draws rows and adds them, so that no error is computed again. Each row (n, 3) has
+    the sum of squares of the base model, that of the extended model, and the number of samples.
 
     Shapes: R runs, T samples, C channels.
 
@@ -435,11 +450,14 @@ def _list_resampled_parts(
 ) -> list[tuple[int, slice]]:
     """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
 
-    Each is the index of the run and the slice of its samples.
+    Whole runs are better, because neighbouring segments depend on each other.
 
     Args:
         evaluator: the predicted runs.
         resamples_segments: whether the parts are segments even if there are several runs.
+
+    Returns:
+        Index of the run and slice of its samples, for each part.
     """
     count = len(evaluator.prepared_runs)
     if count > 1 and not resamples_segments:
@@ -448,7 +466,7 @@ def _list_resampled_parts(
     for run, length in enumerate(evaluator.lengths.tolist()):
         samples = np.linspace(0, length, SINGLE_RUN_SEGMENTS + 1).astype(int).tolist()
         # A run of few samples has empty segments.
-        parts += [(run, slice(a, b)) for a, b in pairwise(samples) if b > a]
+        parts += [(run, slice(begin, end)) for begin, end in pairwise(samples) if end > begin]
     return parts
 
 

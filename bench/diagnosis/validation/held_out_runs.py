@@ -134,9 +134,13 @@ class HeldOutRuns:
     ) -> list[HeldOutFit]:
         """Simulate the runs with each parameter vector (P,) and fit their initial states.
 
-        Least squares may converge to a different minimum for similar models, and chance would then
-        decide between them. Models far from the nearest one are therefore fitted again from its
-        initial states, and the better fit counts.
+        1. Fit the initial states of all models, over ever longer parts of the runs. For filtered
+           runs, whose initial states are known well, one stage is tried first.
+        2. If the motion has left the range of its linearisation, continue with derivatives at the
+           best fit.
+        3. Least squares may converge to a different minimum for similar models, and chance would
+           then decide between them. Models far from the nearest one (the one with the lowest cost)
+           are therefore fitted again from its initial states, and the better fit counts.
 
         Shapes: P parameters.
 
@@ -144,6 +148,9 @@ class HeldOutRuns:
             thetas: parameters of each model.
             is_staged: whether to fit ever longer parts of the runs even if a fit to whole runs
                 comes near the noise.
+
+        Returns:
+            The prediction of the runs by each model.
         """
         guess = self.evaluator.initial_state_guesses
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
@@ -181,9 +188,12 @@ class HeldOutRuns:
     ) -> list[TrajectoryFit]:
         """Fit only the initial states of the runs, first to their beginning, then to longer parts.
 
+        A whole run has many local minima if its motion amplifies errors of the initial state; its
+        beginning has not.
+
         Args:
             starts: model, parameters and first initial states of each fit.
-            stages: share of the runs and maximum number of iterations, one after another.
+            stages: share of the runs and maximum number of iterations, one stage after another.
         """
         fits: list[TrajectoryFit] = []
         if not starts:
@@ -203,8 +213,10 @@ class HeldOutRuns:
     def _leaves_linear_range(self, fit: TrajectoryFit) -> bool:
         """Return whether the motion has left the range of its linearisation by the initial states.
 
-        For a robot this linearisation is computed once for all models. A chaotic motion leaves its
-        range even if the initial guess is off by no more than the noise.
+        For a robot this linearisation is computed once for all models, which is faster than
+        differences. It is tested by a prediction: a simulation from the first guess should differ
+        from that of the fit as the linearisation says. A chaotic motion leaves its range even if
+        the guess is off by no more than the noise.
         """
         evaluator = self.evaluator
         if not evaluator.has_linearisation or not np.isfinite(fit.cost):
@@ -269,7 +281,8 @@ class HeldOutRuns:
     def _predict_runs(self, fit: TrajectoryFit) -> HeldOutFit:
         """Return the prediction of a fit with its merit, the penalised log-likelihood.
 
-        A failed fit has the merit -infinity, so that any other model is preferred.
+        A failed fit has NaN as prediction and the merit -infinity, so that any other model is
+        preferred.
         """
         if not np.isfinite(fit.cost):
             no_prediction = np.full_like(self.evaluator.observed, np.nan)
@@ -285,10 +298,11 @@ class HeldOutRuns:
 def find_first_states(
     evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
 ) -> FitStart | None:
-    """Return a start with better first states of fitted runs, None if there are none.
+    """Return a start with better first states of fitted runs; None if there are none.
 
     They are fitted to ever longer parts of the runs, as those of held-out runs, with the parameters
-    of the fit. A robot on the ground keeps its first states, those with settled contacts.
+    of the fit, and must reduce the sum of squares. A robot on the ground keeps its first states,
+    those with settled contacts.
 
     Args:
         evaluator: the fitted runs.
@@ -396,7 +410,7 @@ class CrossValidation:
         runs do not support is switched off for the prediction.
 
         Args:
-            fits: Models as fitted to all runs.
+            fits: models as fitted to all runs, from which the refits start.
 
         Returns:
             Predictions of all runs by each model.
@@ -410,8 +424,8 @@ class CrossValidation:
                 f"cross-validation, fold {number + 1} of {len(self._run_folds)}"
             )
             thetas = self._refit_fold(fold, fits)
-            predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
-            for model_index, prediction in enumerate(predicted):
+            predictions = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
+            for model_index, prediction in enumerate(predictions):
                 simulated[model_index, fold.rows, : prediction.simulated.shape[1]] = (
                     prediction.simulated
                 )
@@ -465,7 +479,10 @@ class CrossValidation:
         return folds
 
     def _make_evaluator(self, rows: Indices) -> RunEvaluator:
-        """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones.
+        """Make a run evaluator of some runs, which are the fitted or the left-out ones of a fold.
+
+        It takes over what was computed for all runs: the correction of the discretisation error,
+        and the derivatives by initial states.
 
         Args:
             rows: Indices of the runs.
@@ -484,6 +501,8 @@ class CrossValidation:
 
     def _refit_fold(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
         """Refit each model to the runs of a fold that are not left out.
+
+        The refit starts from the fit to all runs, with its derivatives, so it needs few steps.
 
         Shapes: P parameters.
 
@@ -531,13 +550,13 @@ class CrossValidation:
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not removals:
             return thetas
-        runs = len(evaluator.prepared_runs)
+        run_count = len(evaluator.prepared_runs)
         thetas_without = np.stack([fits[i].theta for i, _ in removals])
         for theta_without, (_, name) in zip(thetas_without, removals, strict=True):
             theta_without[evaluator.get_coefficient_indices(name)] = 0.0
         simulated_without = evaluator.simulate(
-            np.repeat(thetas_without, runs, axis=0),
-            np.tile(np.arange(runs), len(removals)),
+            np.repeat(thetas_without, run_count, axis=0),
+            np.tile(np.arange(run_count), len(removals)),
             np.concatenate([fits[i].initial_states for i, _ in removals]),
         ).reshape(len(removals), *evaluator.observed.shape)
         observed_mask = np.isfinite(evaluator.observed)

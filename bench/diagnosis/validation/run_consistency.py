@@ -117,8 +117,9 @@ def classify_constant(evaluator: RunEvaluator, name: str) -> CovariateKind:
 def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariate]:
     """Yield the covariates of each run that do not depend on its motion.
 
-    They are the order of the runs, the root mean square of each command, and the mean of each
-    recorded signal that the simulator does not use, such as a temperature.
+    A covariate is a quantity that may explain why a parameter differs between runs. They are the
+    order of the runs, the root mean square of each command, and the mean of each recorded signal
+    that the simulator does not use, such as a temperature.
 
     Args:
         evaluator: Run evaluator of the recording.
@@ -140,8 +141,9 @@ def _compute_motion_covariates(
 ) -> Iterator[RunCovariate]:
     """Yield covariates of the simulated motion of each run, at the joint of a parameter.
 
-    They are the amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1),
-    and the mean position.
+    A covariate is a quantity that may explain why a parameter differs between runs. They are the
+    amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1), and the mean
+    position. Nothing is yielded if the position is not recorded.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -151,19 +153,28 @@ def _compute_motion_covariates(
     system = evaluator.simulator.system
     if not system.coordinates:
         return
-    joint = f"q.{number.partition('@')[2]}"
-    name = joint if joint in system.coordinates else system.coordinates[system.primary]
+    joint_coordinate = f"q.{number.partition('@')[2]}"
+    name = (
+        joint_coordinate
+        if joint_coordinate in system.coordinates
+        else system.coordinates[system.primary]
+    )
     if name not in evaluator.channels:
         return
     column = evaluator.channels.index(name)
     run_covariates = []
     for run_data, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
         times = run_data.scenario.times
-        place = simulated[: times.size, column]
-        rate = np.gradient(place, times)
-        mean_direction = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))
+        positions = simulated[: times.size, column]
+        velocities = np.gradient(positions, times)
+        mean_direction = float(velocities.sum() / max(np.abs(velocities).sum(), 1e-300))
         run_covariates.append(
-            (float(place.std()), float(np.sqrt(np.mean(rate**2))), mean_direction, place.mean())
+            (
+                float(positions.std()),
+                float(np.sqrt(np.mean(velocities**2))),
+                mean_direction,
+                positions.mean(),
+            )
         )
     amplitude, speed, direction, position = np.array(run_covariates).T
     yield RunCovariate("amplitude", "the amplitude", amplitude)
@@ -299,6 +310,11 @@ class _RunGrouping:
 def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterConsistency, ...]:
     """Assess the consistency of each parameter of a fitted model between runs, logs and loads.
 
+    A correct model needs the same parameters in every group of runs. For each grouping and
+    parameter, the estimates of the groups are compared; where they differ significantly (with
+    Bonferroni's correction for the number of tests), the covariate is sought with which they
+    change.
+
     Args:
         models: Models of the runs.
         model: Model that is fitted to all runs.
@@ -339,8 +355,9 @@ def _find_trend_covariate(
 ) -> TrendCovariate | None:
     """Find the covariate, such as load or temperature, with which a parameter changes.
 
-    It is the one with a significant linear trend and the smallest scatter about the line. Return
-    None if no trend is significant.
+    Groups by a constant have this constant as their covariate. For runs and logs, a line is fitted
+    for every covariate; the one with a significant trend and the smallest scatter about the line is
+    returned, with others that fit about as well. Return None if no trend is significant.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -451,12 +468,10 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
     """Compute the normal equations of the q parameters for each run.
 
-    They are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the
-    run are eliminated: eq. (1) of the module docstring.
-
-    With the whitened derivatives A_r by parameters and B_r by initial states and S_r = B_r'B_r +
-    diag sigma_0^-2, H_r = A_r'A_r - A_r'B_r S_r^-1 B_r'A_r and g_r = A_r'e_r - A_r'B_r S_r^-1
-    (B_r'e_r + prior) (1).
+    They show by how much each run alone would change the joint fit, without fitting it again. They
+    are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the run
+    are eliminated: eq. (1) of the module docstring, where the derivatives of the parameters, A, and
+    of the initial states, B, are defined.
 
     Shapes: R runs.
 
@@ -539,16 +554,17 @@ def _test_parameters(
             _fit_trend(group_estimates, np.array(covariate_values)) if grouping.numbers else None
         )
         yield ParameterConsistency(
-            parameter.name,
-            parameter.unit,
-            grouping.by,
-            value,
-            error,
-            tuple(group_estimates),
-            scatter,
-            p_value,
-            True,
-            trend,
+            number=parameter.name,
+            unit=parameter.unit,
+            by=grouping.by,
+            value=value,
+            error=error,
+            group_estimates=tuple(group_estimates),
+            scatter=scatter,
+            p_value=p_value,
+            # The level depends on the number of all tests, so the caller decides.
+            is_consistent=True,
+            trend=trend,
         )
 
 
@@ -603,8 +619,8 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     spread = float(weights @ centred**2)
     slope = float(weights @ (centred * values)) / spread
     residual = values - weights @ values / weights.sum() - slope * centred
-    freedom = len(group_estimates) - 2
-    mean_square = float(weights @ residual**2) / freedom
+    degrees_of_freedom = len(group_estimates) - 2
+    mean_square = float(weights @ residual**2) / degrees_of_freedom
     error = float(np.sqrt(max(mean_square, 1.0) / spread))
     # If the scatter agrees with the errors, these are known; otherwise they are estimated.
     t_statistic = abs(slope) / error
@@ -613,7 +629,7 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
         error,
         erfc(t_statistic / sqrt(2.0))
         if mean_square <= 1.0
-        else _compute_student_p_value(t_statistic, freedom),
+        else _compute_student_p_value(t_statistic, degrees_of_freedom),
     )
 
 
