@@ -161,6 +161,11 @@ def _diagnose(
 def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     """Fit the base model, search for causes, and build the verdict and the report data.
 
+    1. Refuse a recording whose conventions contradict the model file.
+    2. Fit the base model, for a robot with the time step and solver options that the data support.
+    3. Search for causes, and reconsider the step and the options with them.
+    4. Build the explanation.
+
     Args:
         runs: the prepared runs.
         may_divide: whether the runs are cut into shorter segments if no simulation follows them.

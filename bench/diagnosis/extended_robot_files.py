@@ -64,10 +64,10 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
         before = ""
     after = written_files.xml if written_files.urdf is None else written_files.urdf
     return ExtendedRobotFiles(
-        _collect_written_files(written_files),
-        (*left_out, *written_files.notes),
-        before,
-        strip_heading(after or ""),
+        contents=_collect_written_files(written_files),
+        notes=(*left_out, *written_files.notes),
+        before=before,
+        after=strip_heading(after or ""),
     )
 
 
@@ -77,8 +77,9 @@ def select_written_causes(
 ) -> tuple[dict[str, Mapping[str, FittedValue]], tuple[str, ...]]:
     """Select the causes that a model file may contain.
 
-    Numbers at a bound of their range, or without an interval, are not results and are left out.
-    So are effects at the coordinates of a floating body, which the file does not have.
+    Numbers at a bound of their range, or without an interval, are not results and are left out. So
+    are effects at the coordinates of a floating body, which the file does not have. Options of the
+    integrator are always written.
 
     Args:
         causes: Coefficients by effect.
@@ -121,6 +122,8 @@ def _leave_out_base_effects(
     causes: Mapping[str, Mapping[str, FittedValue]], base_joints: Collection[str]
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Leave out effects at the coordinates of floating bodies, and return a line for each.
+
+    A floating body has one free joint in MuJoCo, without friction or damping of single coordinates.
 
     Args:
         causes: fitted coefficients by effect.
@@ -207,7 +210,8 @@ _NAME = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
 def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, ...]:
     """Find the changed lines of a model file, in its order.
 
-    For a rewritten file, these are the elements with a comment.
+    The files are compared element by element. If hardly anything is equal, the file was rewritten
+    (for example from another format): then the elements with a comment are the changes.
 
     Args:
         before: Text of the file; empty if there is none of the same format.
@@ -218,9 +222,11 @@ def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, .
     if matcher.ratio() < MIN_UNCHANGED_SHARE:
         return tuple(_list_commented_elements(new_elements))
     changes: list[ModelFileChange] = []
-    for kind, i1, i2, j1, j2 in matcher.get_opcodes():
+    for kind, old_begin, old_end, new_begin, new_end in matcher.get_opcodes():
         if kind != "equal":
-            changes += _compare_blocks(old_elements[i1:i2], new_elements[j1:j2])
+            changes += _compare_blocks(
+                old_elements[old_begin:old_end], new_elements[new_begin:new_end]
+            )
     return tuple(changes)
 
 
@@ -232,12 +238,14 @@ def _split_into_elements(text: str) -> list[str]:
 def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
     """Yield the changes of a block of elements, each with the comments before it.
 
+    With equal counts, each new element replaces the old one at its position. Otherwise the first
+    new element stands for all old ones; a block without new elements was removed.
+
     Args:
         old: lines of the block in the user's file, one for each element.
         new: lines of the block in the extended file, with comments before elements.
     """
     elements = list(_pair_with_comments(new))
-    # With equal counts, each new element replaces the old one at its position.
     if len(old) != len(elements):
         for i, (line, comment) in enumerate(elements):
             yield ModelFileChange(

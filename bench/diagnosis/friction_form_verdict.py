@@ -70,7 +70,9 @@ def get_friction_form(evaluator: RunEvaluator, name: str) -> str | None:
 def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) -> str:
     """Add the soft form to the description of an effect, before the place in brackets at its end.
 
-    For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
+    For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``. The numbers
+    are the parameters of MuJoCo's constraint solver for the friction of the joint, since the soft
+    form depends on them.
 
     Args:
         evaluator: Run evaluator with the effect.
@@ -137,9 +139,15 @@ def choose_friction_form(
 def _refit_with_other_form(
     evaluator: RunEvaluator, models: ModelSet, model: FittedModel
 ) -> FittedModel:
-    """Fit the effects of a model with `evaluator`, which has the other form of dry friction.
+    """Fit the effects of a model with the other form of dry friction, stiff or soft.
 
-    Both forms can then be compared by their likelihoods.
+    Both forms can then be compared by their likelihoods. If the discretisation error of the
+    integrator was corrected for the model, it is corrected for the refit, too.
+
+    Args:
+        evaluator: the same runs, with a simulator of the other form.
+        models: models of the present form.
+        model: fitted model of these.
     """
     names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
@@ -189,6 +197,9 @@ def replace_by_stateless_friction(
 ) -> tuple[tuple[str, ...], Array]:
     """Replace effects with a state by the dry friction that they contain.
 
+    Some friction laws have an internal state, such as the bend of bristles. Only laws without one
+    exist in both forms, stiff and soft.
+
     Shapes: P parameters.
 
     Args:
@@ -201,11 +212,11 @@ def replace_by_stateless_friction(
     """
     theta, stateless_names = theta.copy(), dict[str, None]()
     for name in names:
-        friction = get_stateless_friction(evaluator, name)
-        stateless_names[friction] = None
-        if friction != name:
+        stateless_name = get_stateless_friction(evaluator, name)
+        stateless_names[stateless_name] = None
+        if stateless_name != name:
             # The first coefficient of both effects is the limit of the friction force.
-            theta[evaluator.get_coefficient_indices(friction)[0]] += theta[
+            theta[evaluator.get_coefficient_indices(stateless_name)[0]] += theta[
                 evaluator.get_coefficient_indices(name)[0]
             ]
             theta[evaluator.get_coefficient_indices(name)] = 0.0

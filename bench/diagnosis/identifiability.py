@@ -155,7 +155,8 @@ class _IdentifiabilityAssessment:
     def _project_out_states(self, columns: Array) -> Array:
         """Project the initial states of each run out of columns (R, n, k); return (N, k).
 
-        Shapes: R runs.
+        What a change of the initial states could explain gives no information on a parameter. There
+        are N = R n samples in R runs; the prior of the initial states limits their change.
         """
         state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
@@ -170,13 +171,11 @@ class _IdentifiabilityAssessment:
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance (D'D)^-1, eq. (1).
 
-        The columns of D, `self.parameters` (samples, parameters), are first scaled to unit length,
-        so that D'D is a matrix of correlations. Combinations of parameters that the data do not
-        determine (its eigenvalues below `MIN_EIGENVALUE`) get the variance `UNIDENTIFIED_VARIANCE`
-        instead of that of the pseudoinverse, which is zero. A parameter without any influence has
-        an infinite variance.
-
-        With the whitened derivatives D by the parameters, the covariance is (D'D)^-1 (1).
+        The columns of D, the whitened derivatives `self.parameters` (samples, parameters), are
+        first scaled to unit length, so that D'D is a matrix of correlations. Combinations of
+        parameters that the data do not determine (its eigenvalues below `MIN_EIGENVALUE`) get the
+        variance `UNIDENTIFIED_VARIANCE` instead of that of the pseudoinverse, which is zero. A
+        parameter without any influence has an infinite variance.
         """
         columns = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
@@ -215,11 +214,11 @@ class _IdentifiabilityAssessment:
             assessments.append(
                 _classify_parameter(
                     parameter.name,
-                    True,
-                    parameter.unit,
-                    Z95 * standard_error,
-                    (low, high),
-                    confounders,
+                    free=True,
+                    unit=parameter.unit,
+                    half_width=Z95 * standard_error,
+                    bounds=(low, high),
+                    confounders=confounders,
                 )
             )
         # The fit has frozen parameters to which the runs are insensitive.
@@ -229,7 +228,12 @@ class _IdentifiabilityAssessment:
             parameter = self.evaluator.parameters[index]
             assessments.append(
                 _classify_parameter(
-                    parameter.name, True, parameter.unit, np.inf, parameter.bounds, ()
+                    parameter.name,
+                    free=True,
+                    unit=parameter.unit,
+                    half_width=np.inf,
+                    bounds=parameter.bounds,
+                    confounders=(),
                 )
             )
         return assessments
@@ -237,9 +241,12 @@ class _IdentifiabilityAssessment:
     def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
 
-        Effects that act at all places are represented by their members at single places. `norms`
-        (k,) has the norm of each direction, in units of the noise, after the part that the
-        parameters can reproduce is projected out.
+        1. Project initial states and parameters out of the direction of each coefficient. The norm
+           of the rest, in units of the noise, is the information on the coefficient.
+        2. Select the shape with the largest norm for each coefficient.
+        3. Compute its interval, and its correlations with the coefficients of other effects.
+
+        Effects that act at all places are represented by their members at single places.
         """
         evaluator = self.evaluator
         probes = [
@@ -293,7 +300,12 @@ class _IdentifiabilityAssessment:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
                 identifiability = _classify_parameter(
-                    label, False, parameter.unit, 0.0, parameter.bounds, confounders
+                    label,
+                    free=False,
+                    unit=parameter.unit,
+                    half_width=0.0,
+                    bounds=parameter.bounds,
+                    confounders=confounders,
                 )
                 assessments.append(
                     replace(
@@ -303,7 +315,12 @@ class _IdentifiabilityAssessment:
                 continue
             assessments.append(
                 _classify_parameter(
-                    label, False, parameter.unit, half_width, parameter.bounds, confounders
+                    label,
+                    free=False,
+                    unit=parameter.unit,
+                    half_width=half_width,
+                    bounds=parameter.bounds,
+                    confounders=confounders,
                 )
             )
         return assessments
@@ -328,6 +345,9 @@ def _classify_parameter(
 ) -> ParameterIdentifiability:
     """Classify a parameter by the width of its 95 % interval as a share of its plausible range.
 
+    It is identifiable, weak or not identifiable. Parameters that are strongly correlated with it
+    are named.
+
     Args:
         name: Name of the parameter or cause.
         free: Whether it is a free parameter of the model, not a possible cause.
@@ -345,6 +365,7 @@ def _classify_parameter(
     strong_confounders = sorted(
         (m for m in confounders if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1]
     )
+    # Of several entries with one name, the strongest remains: it is the last in reversed order.
     named_confounders = tuple(dict(strong_confounders[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
     return ParameterIdentifiability(
         name, free, unit, float(half_width), low, high, level, named_confounders
@@ -380,7 +401,10 @@ def format_identifiability(
 
 
 def _format_parameter(number: ParameterIdentifiability) -> str:
-    """Format one parameter with its level, interval, range and confounded parameters."""
+    """Format one parameter with its level, interval, range and confounded parameters.
+
+    A limit or backlash has no interval (NaN), and a parameter without influence an infinite one.
+    """
     interval_text = (
         f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
         if np.isfinite(number.half)
@@ -449,7 +473,8 @@ def freeze_unidentified_parameters(
         evaluator: Run evaluator of the runs.
         noise: Noise of each channel.
         base: Fitted base model.
-        searching: Function that begins a search from a base model, which gives its covariance.
+        searching: function that begins a search from a base model; the search shows which
+            parameters the data identify.
 
     Returns:
         The base model, fitted without these numbers.

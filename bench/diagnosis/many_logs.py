@@ -323,9 +323,16 @@ def _format_error(error: object) -> str:
 
 
 def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, LogResult]:
-    """Load the results of an earlier call in the folder `out`, to explain only what has changed.
+    """Load the results of an earlier call in an output folder, to explain only what has changed.
 
     A result is reused if its log and all settings are the same and it has no error.
+
+    Args:
+        out: output folder of the batch; a folder with other files is refused.
+        logs: logs of the batch.
+
+    Returns:
+        Results by log.
     """
     path = out / BATCH_STATE_FILE
     if not path.exists():

@@ -235,17 +235,17 @@ def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCha
         logs: Table of `many_logs.build_log_table`.
         numbers: Table of `many_logs.build_number_table`.
     """
-    across = _make_log_axis(logs)
+    log_axis = _make_log_axis(logs)
     # Column "number" counts from 1. An axis of names counts from 0, an axis of numbers from 1.
-    offset = 1 if across.names else 0
+    offset = 1 if log_axis.names else 0
     errors = logs[["number", "log", "before", "after"]]
     tables = {
         "found": numbers.assign(place=numbers["number"] - offset),
         "held-out": errors.assign(place=errors["number"] - offset),
     }
-    number_panels = _make_number_panels(numbers, across)
-    held_out_panels = _make_held_out_panels(logs, across)
-    return SummaryCharts(number_panels, held_out_panels, tables, bool(across.names))
+    number_panels = _make_number_panels(numbers, log_axis)
+    held_out_panels = _make_held_out_panels(logs, log_axis)
+    return SummaryCharts(number_panels, held_out_panels, tables, bool(log_axis.names))
 
 
 def _make_log_axis(logs: pd.DataFrame) -> Axis:
@@ -266,14 +266,28 @@ def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
     panels = []
     for label_with_cause in dict.fromkeys(numbers["what"].astype(str)):
         name, _, label = label_with_cause.rpartition(": ")
+        # A point with its interval for each log; the columns are those of the table "found".
         series = (
             Series(
-                "each log", "value", _AFTER, {"what": label_with_cause}, "low", "high", "points"
+                "each log",
+                "value",
+                _AFTER,
+                where={"what": label_with_cause},
+                low="low",
+                high="high",
+                draw="points",
             ),
         )
-        value_axis = Axis(label, scales=("linear",))
         panels.append(
-            Panel(name, "found", "place", series, across, value_axis, {"number": label_with_cause})
+            Panel(
+                title=name,
+                table="found",
+                x="place",
+                series=series,
+                across=across,
+                up=Axis(label, scales=("linear",)),
+                facets={"number": label_with_cause},
+            )
         )
     return panels
 

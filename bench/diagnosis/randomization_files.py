@@ -66,7 +66,11 @@ def comment(texts: str | Sequence[str], indent: str = "") -> str:
 
 
 def identifiers(names: Iterable[str]) -> Iterator[str]:
-    """Yield an identifier for each name that differs from all earlier ones."""
+    """Yield an identifier for each name, as valid in Python, that differs from all earlier ones.
+
+    Other characters than letters and digits become underscores; a number is appended to a repeated
+    identifier.
+    """
     used_identifiers: set[str] = set()
     for name in names:
         base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
@@ -169,7 +173,13 @@ def _build_terms(
 ) -> tuple[list[Term], list[RandomizationRange]]:
     """Build the Isaac Lab event terms, and list the ranges for which Isaac Lab has no term.
 
-    `sentences` has the comment for each range.
+    A term is a call of a randomisation function for one joint or body. The effects are handled one
+    after another; what remains in `by_effect` has no term.
+
+    Args:
+        ranges: ranges to write.
+        sentences: comment for each range.
+        robot: model of the robot.
     """
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
     for number_range in ranges.ranges:
@@ -240,7 +250,9 @@ def _make_gain_terms(
 ) -> Iterator[Term]:
     """Yield the terms that randomise stiffness and damping of the actuators at each joint.
 
-    Isaac Lab has one damping for each joint, so that of actuators and of the joint itself is added.
+    Isaac Lab defines the gains of a drive at its joint, so gains of actuators are converted by
+    their gear and added. It has one damping for each joint, so that of actuators and of the joint
+    itself is added.
 
     Args:
         by_effect: ranges by effect and by place; those that are used are removed.
@@ -321,6 +333,9 @@ def _make_gravity_term(
     robot: Any,
 ) -> Iterator[Term]:
     """Yield the term that randomises the gravity vector, if its size or direction has a range.
+
+    Isaac Lab draws each component of the vector from its own interval. Components without a range
+    keep the value of the model file.
 
     Args:
         by_effect: ranges by effect and by place; those of gravity are removed.

@@ -146,6 +146,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
         for name, numbers in collect_causes(extended).items()
         if not name.startswith("numerics.")
     }
+    # Each cause at one place, whether the user freed it, and whether it gets a range.
     causes = [
         (cause, name in freed_effects, name in freed_effects or name in unambiguous_effects)
         for name, numbers in causes_by_name.items()
@@ -205,9 +206,11 @@ class _Totals:
         ]
 
     def at(self, number: int, coefficient: str, value: float) -> tuple[float | None, float, str]:
-        """Return the file's number before and after, and its unit, for one changed coefficient.
+        """Return the file's number before and after one coefficient is changed, and its unit.
 
-        If the file has no such number, they are None and the coefficient itself.
+        An interval of a coefficient is converted to an interval of the number in this way, with all
+        other effects applied. If the file has no such number, the result is None and the
+        coefficient itself.
 
         Args:
             number: Index of the cause.
@@ -224,9 +227,9 @@ class _Totals:
         ]
         effect = self.effects[number]
         index = [c.name for c in effect.coefficients].index(coefficient)
-        reading = compute_file_totals(self.robot, fitted)[number][index]
-        if reading is not None:
-            return reading.stated, reading.total, reading.unit
+        number_total = compute_file_totals(self.robot, fitted)[number][index]
+        if number_total is not None:
+            return number_total.stated, number_total.total, number_total.unit
         return None, value, effect.coefficients[index].units[0] or "1"
 
 
@@ -245,7 +248,8 @@ def _convert_to_range(
 ) -> RandomizationRange:
     """Convert the interval of a fitted coefficient to a range of the number in the model file.
 
-    Its operation says whether a simulator sets, adds or multiplies with the random value.
+    Its operation says whether a simulator sets the random value (``abs``), adds it (``add``) or
+    multiplies by it (``scale``); minimum and maximum are for this operation.
 
     Args:
         robot: model of the robot.
@@ -272,20 +276,20 @@ def _convert_to_range(
     elif operation == "scale" and nominal:
         minimum, maximum = sorted((low / nominal, high / nominal))
     return RandomizationRange(
-        cause.name,
-        entry.coefficient,
-        entry.is_free,
-        effect.at,
-        cause.place,
-        own_fields,
-        unit,
-        nominal,
-        value,
-        low,
-        high,
-        operation,
-        minimum,
-        maximum,
+        cause=cause.name,
+        coefficient=entry.coefficient,
+        is_free=entry.is_free,
+        kind=effect.at,
+        name=cause.place,
+        fields=own_fields,
+        unit=unit,
+        nominal=nominal,
+        value=value,
+        low=low,
+        high=high,
+        operation=operation,
+        minimum=minimum,
+        maximum=maximum,
     )
 
 

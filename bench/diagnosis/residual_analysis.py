@@ -51,7 +51,9 @@ def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> Da
 def compute_gap_locations(
     evaluator: RunEvaluator, before: Array, after: Array, sigma: Array, mark: str = ""
 ) -> list[GapLocation]:
-    """Compute the RMS residual in units of the noise, by run, channel and phase.
+    """Compute the RMS residual in units of the noise, by run, channel and phase of the motion.
+
+    They show where the simulation is wrong. 1 is the noise itself.
 
     Shapes: R runs, T samples, C channels.
 
@@ -69,12 +71,12 @@ def compute_gap_locations(
         # A run or phase without samples has no RMS.
         if not mask.any():
             continue
-        sizes = []
+        rms_values = []
         for residual in residuals:
             square = np.square(residual[mask]).mean()
-            sizes.append(float(np.sqrt(square)))
+            rms_values.append(float(np.sqrt(square)))
         samples = int(mask.sum())
-        locations.append(GapLocation(kind, label, samples, *sizes))
+        locations.append(GapLocation(kind, label, samples, *rms_values))
     return locations
 
 
@@ -96,12 +98,12 @@ def _list_parts(
     runs, _, channels = observed_mask.shape
     data_parts: list[tuple[str, str, Mask]] = []
     for r, run_data in enumerate(evaluator.prepared_runs):
-        is_run = np.arange(runs) == r
-        mask = observed_mask & is_run[:, None, None]
+        is_this_run = np.arange(runs) == r
+        mask = observed_mask & is_this_run[:, None, None]
         data_parts.append(("run", run_data.name + mark, mask))
     for c, name in enumerate(evaluator.channels):
-        is_channel = np.arange(channels) == c
-        data_parts.append(("channel", name, observed_mask & is_channel))
+        is_this_channel = np.arange(channels) == c
+        data_parts.append(("channel", name, observed_mask & is_this_channel))
     # Phases come from the simulation, because noise of a measured speed would cause false ones.
     for phase, phase_mask in detect_phases(evaluator, simulated).items():
         data_parts.append(("phase", phase, observed_mask & phase_mask[:, :, None]))
@@ -160,11 +162,11 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     for name in recorded_coordinates:
         values = simulated[:, :, evaluator.channels.index(name)]
         for run_index, run_data in enumerate(evaluator.prepared_runs):
-            size = len(run_data.observed)
+            sample_count = len(run_data.observed)
             # A single sample has no slope.
-            if size > 1:
-                slope = np.gradient(values[run_index, :size], run_data.scenario.times)
-                squares[run_index, :size] += np.square(slope)
+            if sample_count > 1:
+                slope = np.gradient(values[run_index, :sample_count], run_data.scenario.times)
+                squares[run_index, :sample_count] += np.square(slope)
     return np.sqrt(np.nan_to_num(squares)) if recorded_coordinates else None
 
 
@@ -182,6 +184,8 @@ def _find_lasting_stretches(mask: Mask) -> Mask:
 
 def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
     """Return the mask (R, T) of the samples around each minimum of the simulated height.
+
+    A ball touches the ground there; a few samples on either side are included.
 
     Shapes: R runs, T samples, C channels.
 
@@ -231,8 +235,9 @@ def compute_residual_profiles(
 ) -> list[ResidualProfile]:
     """Compute the profiles of the residual against time, position, speed and inputs.
 
-    The channel is the one that sensor effects act on. For a robot it is the one with the largest
-    gap, against the variables of its joint.
+    A profile is the mean residual of a channel in bins of such a variable, and shows on what a
+    missing force depends. The channel is the one that sensor effects act on. For a robot it is the
+    one with the largest gap, against the variables of its joint.
 
     Shapes: R runs, T samples, C channels.
 

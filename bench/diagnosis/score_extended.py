@@ -104,12 +104,12 @@ def score_model(
         _, squares, sigma = scored
         return float((squares / np.square(sigma)).sum())
 
-    scores = [score(recording_used)]
+    scored_versions = [score(recording_used)]
     if kind.has_model:
         filled, note = fill_lost_commands(recording_used)
         # Commands of lost rows were held or sent; the smaller error tells which.
-        scores += [score(filled)] if note else []
-    evaluator, squares, sigma = min(scores, key=compute_cost)
+        scored_versions += [score(filled)] if note else []
+    evaluator, squares, sigma = min(scored_versions, key=compute_cost)
     if not np.isfinite(squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
     return _summarise_errors(evaluator, squares, sigma)
@@ -141,7 +141,12 @@ def _load_robot(
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
     """Load a robot from its model file as a simulator, without fitted parameters and added effects.
 
-    `reference` has the actuators and the engine that the description of the recording specifies.
+    The description of the recording may add actuators that the file does not have.
+
+    Args:
+        model: the model file.
+        reference: actuators and engine that the description of the recording specifies; None
+            without a description.
     """
     from sims.robot.parsing.read_model_file import read_robot
 
@@ -156,7 +161,18 @@ def _load_robot(
     if model.suffix != ".urdf":
         engine = {key: engine[key] for key in ("recorded_bases",) if key in engine}
     kind = cast(type[SystemSimulator], make_robot_simulator(model, missing_actuators, engine))
-    return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
+    extended = ExtendedSimulator(
+        name=kind.name,
+        system=kind.name,
+        engine=None,
+        title="",
+        parameters={},
+        effects={},
+        constants={},
+        observe=(),
+        kind=kind,
+    )
+    return extended, kind
 
 
 def _get_system_name(
@@ -203,7 +219,10 @@ def _check_channels(
 
 
 def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
-    """Build the parameter vector (P,) of an extended simulator; missing numbers are nominal.
+    """Build the parameter vector (P,) of an extended simulator.
+
+    Missing parameters are nominal, and missing coefficients are zero, so that their effects are
+    off.
 
     Shapes: P parameters.
 
@@ -211,7 +230,6 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
         evaluator: Run evaluator with the effects of the extended simulator.
         extended: Extended simulator.
     """
-    # Missing parameters are nominal, and missing coefficients are off.
     theta = evaluator.get_nominal_theta()
     base_parameters = evaluator.parameters[: evaluator.system_parameter_count]
     for index, parameter in enumerate(base_parameters):

@@ -304,19 +304,21 @@ class Verdict:
         # Older files do not have this key.
         early_stop = document.get("cut")
         return cls(
-            document["verdict"],
-            document["system"],
-            document["engine"],
-            tuple(Cause.from_document(cause) for cause in document["causes"]),
-            _read_estimates(document["parameters"]),
-            HeldOutResult(**heldout) if heldout is not None else None,
-            tuple(Candidate(**candidate) for candidate in document["candidates"]),
-            DiscriminatingRun(**next_run) if next_run is not None else None,
-            document["simulations"],
-            document["seconds"],
-            EarlyStop.from_document(early_stop) if early_stop is not None else None,
-            tuple(RecordingFault.of(fault) for fault in document.get("recording_faults", ())),
-            tuple(document.get("recording_notes", ())),
+            verdict=document["verdict"],
+            system=document["system"],
+            engine=document["engine"],
+            causes=tuple(Cause.from_document(cause) for cause in document["causes"]),
+            parameters=_read_estimates(document["parameters"]),
+            heldout=HeldOutResult(**heldout) if heldout is not None else None,
+            candidates=tuple(Candidate(**candidate) for candidate in document["candidates"]),
+            next_experiment=DiscriminatingRun(**next_run) if next_run is not None else None,
+            simulations=document["simulations"],
+            seconds=document["seconds"],
+            cut=EarlyStop.from_document(early_stop) if early_stop is not None else None,
+            recording_faults=tuple(
+                RecordingFault.of(fault) for fault in document.get("recording_faults", ())
+            ),
+            recording_notes=tuple(document.get("recording_notes", ())),
         )
 
     def __repr__(self) -> str:

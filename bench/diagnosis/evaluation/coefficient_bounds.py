@@ -156,8 +156,9 @@ def _compute_fit_bounds(
 ) -> tuple[float, float]:
     """Return the range in which a fit may move a coefficient, without its physical limits.
 
-    It is the plausible range, widened by a factor. Times and frequencies are adapted to the length
-    of the runs, because the data cannot show slower changes.
+    It is the plausible range, widened by a factor, since data count more than plausibility. Times
+    and frequencies are adapted to the length of the runs, because the data cannot show slower
+    changes. A shape parameter, such as a frequency, keeps its plausible range.
 
     Args:
         parameter: the coefficient as a parameter, with its unit and plausible range.

@@ -232,14 +232,18 @@ class ForkedWorkerPool:
         3. Receive replies. If a worker has died, its item is processed again.
         4. Raise the first error of a task, after all other items are finished.
 
-        `unprocessed` has the numbers of these items, `busy` the item number of each working pipe,
-        and `idle` the idle pipes. `evaluator_index` is the index by which the workers know the run
-        evaluator.
+        Args:
+            evaluator: first argument of the task, which the workers have inherited.
+            task: a module-level function.
+            items: further arguments of each call.
         """
+        # Error and traceback by item number.
         errors: dict[int, tuple[Exception, str]] = {}
+        # Numbers of the items, the next one last; working pipes with their item; idle pipes.
         unprocessed = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
         idle = [worker.pipe for worker in self._workers]
+        # Workers know the run evaluator by its index.
         evaluator_index = next(
             i for i, inherited in enumerate(self._inherited_evaluators) if inherited is evaluator
         )
@@ -415,10 +419,8 @@ def _run_worker(
             evaluator_index, task, item = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):
             return
-        evaluator, deadline = (
-            evaluators[evaluator_index],
-            evaluators[evaluator_index].search_control.deadline,
-        )
+        evaluator = evaluators[evaluator_index]
+        deadline = evaluators[evaluator_index].search_control.deadline
         evaluator.search_control = SearchControl(stop=lambda: stop_flag[0] != 0)
         evaluator.search_control.deadline = deadline
         # 3. Task.

@@ -146,7 +146,10 @@ def add_minimal_noise(recording: Recording, channels: Sequence[str]) -> tuple[Re
 
 
 def _compute_added_noise(recording: Recording, name: str) -> float:
-    """Return the standard deviation of noise to add; 0 for noisy, quantised or constant channels.
+    """Return the standard deviation of noise to add to a channel; 0 if it needs none.
+
+    A channel that is noisy, quantised or constant needs none. A noise-free one (from a simulation)
+    would make every tiny integration error significant.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -166,9 +169,13 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
 
 
 def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
-    """Add white noise with the standard deviations `sizes`, by channel, to a run.
+    """Add white noise with given standard deviations to the channels of a run.
 
     The noise depends only on the names of run and channel, so it is the same every time.
+
+    Args:
+        run: the run.
+        sizes: standard deviation by channel; other channels stay as they are.
     """
 
     def noise(name: str, values: Array) -> Array:

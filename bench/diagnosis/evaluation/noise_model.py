@@ -221,10 +221,10 @@ def _maximise_channel_likelihood(
 
 
 def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
-    """Return the AR(1) correlations at which the likelihood of a channel is computed.
+    """Return the AR(1) correlations φ at which the likelihood of a channel is computed.
 
     They are near the sample correlation of the residual, where the maximum is. Zero (white noise)
-    is always included.
+    is always included, so that it wins if the likelihood hardly differs.
 
     Shapes: R runs, T samples.
 
@@ -286,9 +286,13 @@ def compute_portmanteau_p_value(
 def _compute_ljung_box_sum(w: Array, count: int) -> float:
     """Return the sum Σ r_k² / (n - k) of the Ljung-Box test of `compute_portmanteau_p_value`.
 
-    `w` (R, T) has the whitened values of a channel, and `count` is n, the number of samples.
+    r_k is the autocorrelation of the whitened values at lag k.
 
     Shapes: R runs, T samples.
+
+    Args:
+        w: (R, T) whitened values of a channel, zero where no sample exists.
+        count: n, the number of samples.
     """
     runs, length = w.shape
     power = max(float((w * w).sum()), MIN_VARIANCE)

@@ -90,14 +90,14 @@ def prepare_run(
     return RunData(
         name=run.name,
         scenario=Scenario(
-            run.times,
-            other_initial_values,
-            run.inputs,
-            constants,
-            run.linear,
-            run.offset,
-            run.before,
-            run.off,
+            times=run.times,
+            initial=other_initial_values,
+            inputs=run.inputs,
+            constants=constants,
+            linear=run.linear,
+            offset=run.offset,
+            before=run.before,
+            off=run.off,
         ),
         observed=np.stack(columns, axis=1),
         initial_state_guess=np.array([guesses[name] for name in states]),
@@ -187,7 +187,8 @@ def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
 def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
     """Estimate value and slope at the first time from a parabola through the first samples.
 
-    They are guesses of the initial position and velocity.
+    They are guesses of the initial position and velocity, from which fits start. With few samples a
+    line is used, and with fewer the first value and slope zero.
 
     Args:
         times: (T,) times, s.
@@ -223,7 +224,8 @@ def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) ->
     """Return a coefficient with a plausible range that fits the time scale of a recording.
 
     The range of an effect is for typical recordings of seconds. A slow recording can show longer
-    delays and decays, and one with few samples shows only low frequencies.
+    delays and decays, and one with few samples shows only low frequencies. Coefficients without a
+    time in their unit are returned as they are.
 
     Args:
         parameter: coefficient, with the range that its effect states.
@@ -282,7 +284,9 @@ class SimulationCache:
     def fill(
         self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
     ) -> None:
-        """Store new results, and write those of all elements to an output array.
+        """Store new results, and write those of all elements, new and cached, to an output array.
+
+        The oldest results are removed if the memory limit is exceeded.
 
         Shapes: T samples, C channels.
 

@@ -233,6 +233,7 @@ class RunEvaluator:
         recorded_channels = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded_channels]
         default_settings = self._engine_settings
+        # Engines other than the batch engine have no settings, and no finer copy.
         fine_settings = default_settings and {
             **default_settings,
             "time_step": MAX_TIME_STEP_FILTERED,
@@ -327,7 +328,8 @@ class RunEvaluator:
     def _find_delaying_coefficients(self) -> tuple[Indices, Indices]:
         """Return the indices of coefficients that shift sample times or need fine steps.
 
-        Batch elements with such coefficients are simulated separately.
+        All elements of one engine call have the same time steps, so elements with such coefficients
+        are simulated separately.
 
         Returns:
             The indices in theta of coefficients that shift sample times, and of those that need
@@ -514,6 +516,7 @@ class RunEvaluator:
         """Return a run evaluator of the same runs with another simulator of the same system.
 
         Parameters keep their indices, so that fitted models can be compared between the simulators.
+        What a filter has estimated, such as initial states, is taken over.
 
         Args:
             kind: Simulator class, for example with another integrator.
@@ -580,7 +583,9 @@ class RunEvaluator:
         return self.kind.has_model or self.engine == "batch"
 
     def _make_scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
-        """Return the scenarios of batch elements with their freed constants.
+        """Return the scenarios (times, inputs, constants) of batch elements with freed constants.
+
+        A freed constant is fitted like a parameter, but passed to the simulator as a constant.
 
         Shapes: P parameters.
 
@@ -591,8 +596,8 @@ class RunEvaluator:
         """
         if share not in self._shortened_scenarios:
             self._shortened_scenarios[share] = [
-                take_first_samples(t.scenario, int(np.ceil(share * len(t.observed))))
-                for t in self.prepared_runs
+                take_first_samples(run_data.scenario, int(np.ceil(share * len(run_data.observed))))
+                for run_data in self.prepared_runs
             ]
         # Elements of one run share its scenario object, so the simulator prepares it only once.
         scenarios = [self._shortened_scenarios[share][run] for run in runs]
@@ -633,6 +638,9 @@ class RunEvaluator:
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
     ) -> Array:
         """Simulate batch elements in scenarios that are not recorded, such as proposed experiments.
+
+        As for recorded runs, elements that need the same time steps are simulated together, in
+        calls that fit in memory.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 
@@ -686,7 +694,7 @@ class RunEvaluator:
     ) -> SystemSimulator:
         """Return a simulator with other channels than the recorded ones, and given effects.
 
-        The caller must close it.
+        It shows quantities that were not recorded, such as forces. The caller must close it.
 
         Args:
             observe: names of the channels.

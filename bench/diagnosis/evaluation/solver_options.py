@@ -130,7 +130,8 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
 def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings]:
     """Yield finer time steps and other integrators than the robot's own, the cheapest first.
 
-    The cost of a step depends on the integrator (`RELATIVE_RK4_COST`).
+    The cost of a setting is the number of steps times the relative cost of the integrator
+    (`RELATIVE_RK4_COST`).
 
     Args:
         model_settings: Time step, integrator and options of the model file.
@@ -367,14 +368,14 @@ def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSett
     present = settings.to_model_options()
     for name in ("cone", "impratio", "noslip_iterations", "solver", "iterations"):
         present.setdefault(name, read_option(kind.robot, name))
-    values = {
+    values_by_option = {
         "cone": list(CONE_IDS.values()),
         "impratio": IMPEDANCE_RATIOS,
         "noslip_iterations": NOSLIP_ITERATIONS,
         "integrator": list(INTEGRATOR_IDS.values()),
     }
-    for name, numbers in values.items():
-        for number in numbers:
+    for name, option_values in values_by_option.items():
+        for number in option_values:
             if number != present[name]:
                 yield settings.replace_options({name: number})
     for solver in (present["solver"], *SOLVER_IDS.values()):

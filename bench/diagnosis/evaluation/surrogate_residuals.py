@@ -59,6 +59,10 @@ def draw_surrogates(
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
 
+    They contain no effect, so their scores show which scores noise alone reaches. Each channel is
+    an autoregression with the innovations of the residual in random order. A fit makes noise look
+    less correlated; this bias is estimated from a first set of surrogates (pilots) and corrected.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -165,9 +169,12 @@ def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) 
 def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     """Turn innovations (T, ...) into autocorrelated noise by the autoregression (1), in place.
 
-    `weights` (p,) has the a_k; without weights the noise stays white.
-
     The autoregression is e_t = sum_k a_k e_{t-k} + u_t (1).
+
+    Args:
+        weights: (p,) weights a_k, that of the previous sample first; without weights the noise
+            stays white.
+        innovations: (T, ...) independent u_t; they are replaced by e_t.
     """
     order = weights.size
     if not order:
@@ -232,9 +239,14 @@ def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Ar
 def _estimate_autocovariances(filled: Array, observed_mask: Mask, max_order: int) -> Array:
     """Estimate the autocovariances (max_order + 1,) of values (R, T) at the lags 0 to `max_order`.
 
-    Missing samples are zero in `filled`; only pairs of available samples (`observed_mask`) count.
+    The autocovariance at a lag is the mean product of two samples that are so far apart.
 
     Shapes: R runs, T samples.
+
+    Args:
+        filled: values, zero where no sample exists.
+        observed_mask: mask of available samples; only pairs of these count.
+        max_order: largest lag.
     """
     length = observed_mask.shape[1]
     covariances = []

@@ -61,7 +61,8 @@ class StatedLimits:
 def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
     """Read the limits of commands, positions, velocities and forces from a robot's model file.
 
-    Proposed runs must stay within them. A system without a model file has none.
+    Proposed runs must stay within them. A system without a model file has none. A force is
+    unlimited here if the simulation itself limits that of every actuator of the joint.
 
     Args:
         evaluator: Evaluator of the recorded runs.
@@ -95,6 +96,7 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
     """Compute the range of an actuator's command that respects all limits of actuator and joint.
 
     It is in the unit of the command: a force for a motor, a position or velocity for a servo.
+    Limits of the joint are converted by gear and gain.
 
     Args:
         robot: model of the robot.
@@ -112,8 +114,9 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
         interval = _intersect(interval, _divide_interval(actuator.force, gain))
         # Several motors of a joint may act at the same time.
         motors = [a for a in robot.actuators if a.joint == joint.name and a.kind == "motor"]
+        force_per_control = gear * gain * len(motors)
         return _intersect(
-            interval, _divide_interval(_get_effort_limit(robot, joint), gear * gain * len(motors))
+            interval, _divide_interval(_get_effort_limit(robot, joint), force_per_control)
         )
     # The set point of a servo is the gear times the desired value at the joint.
     if actuator.kind in ("position", "pid"):
@@ -323,11 +326,12 @@ class RigModel:
     def _iterate_initial_states(self) -> Iterator[tuple[str, float]]:
         """Yield other initial states for a proposed run, each as the name of a state and its value.
 
-        They are multiples of the usual initial coordinates. Except for robots, which start at rest,
-        they are also the largest initial rates that were recorded, in both directions.
+        They are multiples of the recorded initial coordinates. Except for robots, which start at
+        rest, they are also the largest initial rates that were recorded, in both directions. States
+        that are specified in all runs are not changed.
         """
         system, evaluator = self.evaluator.simulator.system, self.evaluator
-        unobserved_states = {
+        known_states = {
             evaluator.state_names[i] for i in np.flatnonzero(evaluator.known_state_mask.all(axis=0))
         }
         for name in system.coordinates:
@@ -337,8 +341,10 @@ class RigModel:
                 for share in INITIAL_STATE_FACTORS
             ]
             # Outside its range a joint begins at the limit, which is tried only once.
-            reachable = dict.fromkeys(self._clip_to_joint_range(name, value) for value in values)
-            for value in reachable if name not in unobserved_states else ():
+            reachable_values = dict.fromkeys(
+                self._clip_to_joint_range(name, value) for value in values
+            )
+            for value in reachable_values if name not in known_states else ():
                 yield name, value
         if evaluator.kind.has_model:
             return
@@ -347,7 +353,7 @@ class RigModel:
                 np.abs(evaluator.initial_state_guesses[:, evaluator.state_names.index(name)]).max()
             )
             for value in (
-                (fastest, -fastest) if fastest > REST_RATE and name not in unobserved_states else ()
+                (fastest, -fastest) if fastest > REST_RATE and name not in known_states else ()
             ):
                 yield name, value
 
@@ -472,7 +478,8 @@ An empty one is computed by `_compute_command`.
 def _compute_command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
     """Compute the command signal (T,) of a form, such as a chirp or steps, with magnitude one.
 
-    The caller scales it to the size of the recorded commands.
+    The caller scales it to the size of the recorded commands. Frequencies follow from duration and
+    sampling interval.
 
     Args:
         form: name of the form, a key of `COMMAND_FORMS`, or one of those that are computed here.
@@ -498,7 +505,7 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     fast_frequency = max(
         min(MAX_PROBE_FREQUENCY, MAX_CYCLES_PER_SAMPLE / step), 2.0 * slow_frequency
     )
-    text = COMMAND_FORMS[form].format(
+    formula = COMMAND_FORMS[form].format(
         slow=slow_frequency, middle=min(1.0, 0.5 * fast_frequency), fast=fast_frequency
     )
-    return evaluate_signal(text, times, rng)
+    return evaluate_signal(formula, times, rng)

@@ -108,7 +108,9 @@ def propose_discriminating_run(
     ]
     # A run that cannot be simulated with both models is not proposed.
     runs_by_discrimination = [
-        (size, run) for size, run in runs_by_discrimination if np.isfinite(size) and size > 0.0
+        (discrimination, run)
+        for discrimination, run in runs_by_discrimination
+        if np.isfinite(discrimination) and discrimination > 0.0
     ]
     runs_by_discrimination.sort(key=lambda entry: -entry[0])
     # 2. The most different run within the limits.
@@ -146,6 +148,8 @@ def _find_first_within_limits(
     """Return the first run that stays within the limits of a robot, whichever model is right.
 
     A proposed run must not damage the robot. For a system without a model file it is the first run.
+    The search ends at the first run that does not discriminate the models, because the following
+    ones do not either.
 
     Args:
         evaluator: Evaluator of the recorded runs.
@@ -273,7 +277,8 @@ def _change_initial_states(
 ) -> Iterator[_Run]:
     """Yield runs that differ from a recorded run in one initial state.
 
-    The initial velocities of a robot are not changed, because it starts at rest.
+    A state is multiplied by several factors; a state of zero gets the factors as values. The
+    initial velocities of a robot are not changed, because it starts at rest.
 
     Args:
         evaluator: evaluator of the recorded runs.
@@ -306,7 +311,8 @@ def _change_initial_states(
 def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
     """Yield runs that differ from a recorded run in the amplitude of one input.
 
-    An input is never scaled beyond the limits of its command.
+    An input is never scaled beyond the limits of its command. Factors near one are left out,
+    because they change too little.
 
     Args:
         evaluator: evaluator of the recorded runs.

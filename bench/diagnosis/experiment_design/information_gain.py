@@ -163,7 +163,7 @@ class RunRanker:
 
         If models compete, the value of a run is their discrimination T to first order, eq. (1) of
         the module docstring. Otherwise it is the information gain D about uncertain parameters, eq.
-        (2).
+        (2). Runs that cannot be simulated, or are too sensitive to the initial state, are left out.
         """
         diagnosed_model = self.information[0].model
         allowed_runs = [
@@ -201,13 +201,13 @@ class RunRanker:
         if not self.pairs:
             value = _compute_information_gain(slopes[0], self.information[0])
             return RunValue(run, np.array([value]), value)
-        values = np.zeros((len(slopes), len(slopes)))
+        discrimination = np.zeros((len(slopes), len(slopes)))
         for true_index, competing_index in self.pairs:
-            gap = slopes[true_index].centre - slopes[competing_index].centre
-            values[true_index, competing_index] = _compute_remaining_difference(
-                gap, slopes[competing_index], self.information[competing_index]
+            difference = slopes[true_index].centre - slopes[competing_index].centre
+            discrimination[true_index, competing_index] = _compute_remaining_difference(
+                difference, slopes[competing_index], self.information[competing_index]
             )[0]
-        return RunValue(run, values, _sum_discrimination(values))
+        return RunValue(run, discrimination, _sum_discrimination(discrimination))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
         """Compute the discrimination T exactly, as the competing model may be far from linear.
@@ -234,17 +234,18 @@ class RunRanker:
     def _select_distinct_runs(self, runs: Sequence[CandidateRun]) -> list[CandidateRun]:
         """Select the runs of a robot with the largest difference of the models before any refit.
 
-        The exact evaluation of a robot's run is slow.
+        The exact evaluation of a robot's run is slow. With a single model, the size of its motion
+        is used instead.
         """
-        sizes = []
+        differences = []
         for run in runs:
             thetas = [information.model.fit.theta for information in self.information]
             whitened = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
-            gaps = [whitened[b] - whitened[a] for a, b in combinations(range(len(whitened)), 2)]
+            gaps = [other - one for one, other in combinations(whitened, 2)]
             gaps = gaps or [whitened[0] - whitened[0].mean()]
             size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
-            sizes.append(size if np.isfinite(size) else -np.inf)
-        order = np.argsort(-np.array(sizes), kind="stable")
+            differences.append(size if np.isfinite(size) else -np.inf)
+        order = np.argsort(-np.array(differences), kind="stable")
         return [runs[index] for index in order[:MAX_EVALUATED_RUNS].tolist()]
 
     # -- one run
@@ -324,10 +325,8 @@ class RunRanker:
             return None
         # 3. Whitening.
         whitened = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
-        parameter_responses, state_responses = (
-            whitened[1 : 1 + len(free_indices)],
-            whitened[1 + len(free_indices) :],
-        )
+        parameter_responses = whitened[1 : 1 + len(free_indices)]
+        state_responses = whitened[1 + len(free_indices) :]
         return _LinearisedRun(
             whitened[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE
         )
@@ -354,11 +353,9 @@ class RunRanker:
         fit = competing_model.model.fit
         simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
         target = self._whiten(simulated)[0]
-        theta, initial_state, deviation = (
-            fit.theta.copy(),
-            run.states.copy(),
-            np.zeros(fit.free_indices.size),
-        )
+        theta = fit.theta.copy()
+        initial_state = run.states.copy()
+        deviation = np.zeros(fit.free_indices.size)
         linearisation, damping = self._linearise_run(run, competing_model, theta), FIRST_DAMPING
         if linearisation is None or not np.isfinite(target).all():
             return 0.0
@@ -390,13 +387,11 @@ class RunRanker:
                 damping *= DAMPING_INCREASE
                 continue
             is_converged = lowest_cost - cost < MIN_RELATIVE_DECREASE * lowest_cost
-            theta, initial_state, deviation, linearisation, lowest_cost = (
-                trial_theta,
-                trial_states,
-                deviation + step,
-                trial_linearisation,
-                cost,
-            )
+            theta = trial_theta
+            initial_state = trial_states
+            deviation = deviation + step
+            linearisation = trial_linearisation
+            lowest_cost = cost
             damping /= DAMPING_DECREASE
             if is_converged:
                 break
@@ -404,11 +399,11 @@ class RunRanker:
 
 
 def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _ParameterInformation:
-    """Compute the covariance C of a model's parameters from the present runs, for eqs. (1) and (2).
+    """Compute the information on a model's parameters from the present runs, for eqs. (1) and (2).
 
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
-    its bounds: otherwise the step of a parameter that the data hardly determine would be too large
-    for a derivative.
+    its bounds: the unit is also the step of finite differences, which would be too large for a
+    parameter that the data hardly determine.
 
     Args:
         models: Fitted models with noise and run evaluator.
@@ -418,7 +413,6 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Paramete
     bounds = np.array(
         [models.evaluator.parameters[i].bounds for i in model.fit.free_indices]
     ).reshape(-1, 2)
-    # At most a tenth of the range, because derivatives are finite differences with this step.
     max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)
     inverse = np.asarray(np.linalg.pinv(covariance / np.outer(spread, spread), hermitian=True))
@@ -445,8 +439,8 @@ def _compute_remaining_difference(
     """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
     T is min over delta, z of |d - J delta - B z|^2 + delta' C^-1 delta, in units of the noise: the
-    difference of the models that remains after the competing model has adapted to the run. Returned
-    are T, the step delta of the parameters and the step z of the initial state.
+    difference of the models that remains after the competing model has adapted to the run. It is a
+    linear least-squares problem, solved by its normal equations.
 
     Shapes: q fitted parameters.
 
@@ -457,17 +451,20 @@ def _compute_remaining_difference(
         deviation: (q,) difference of the parameters from their present estimates, in units of
             `spread`.
         damping: Levenberg-Marquardt damping of the step.
+
+    Returns:
+        T, the step delta (q,) of the parameters and the step z of the initial state.
     """
     parameter_count = len(information.spread)
     deviation = np.zeros(parameter_count) if deviation is None else deviation
     columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
-    normal, pull = columns.T @ columns, columns.T @ gap
+    normal, right_hand_side = columns.T @ columns, columns.T @ gap
     normal[:parameter_count, :parameter_count] += information.inverse
-    pull[:parameter_count] -= information.inverse @ deviation
+    right_hand_side[:parameter_count] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
-    step = np.linalg.solve(damped, pull)
+    step = np.linalg.solve(damped, right_hand_side)
     initial_cost = float(gap @ gap + deviation @ information.inverse @ deviation)
-    minimum_cost = initial_cost - 2.0 * float(pull @ step) + float(step @ normal @ step)
+    minimum_cost = initial_cost - 2.0 * float(right_hand_side @ step) + float(step @ normal @ step)
     return max(minimum_cost, 0.0), step[:parameter_count], step[parameter_count:]
 
 

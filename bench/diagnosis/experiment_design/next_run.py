@@ -159,6 +159,9 @@ def design_next_run(
 def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
     """Return whether a longer run may distinguish models that the best run does not.
 
+    The discrimination of a pair grows about in proportion to the duration, and here by up to twice
+    as much.
+
     Args:
         best: the best run, with the discrimination of each pair of models.
         length_factor: duration of the longest allowed run, in durations of this run.
@@ -177,7 +180,9 @@ def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
 def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValue]:
     """Evaluate the most valuable runs exactly, and sort all runs by value.
 
-    Linearised values tend to be too high, so a run is proposed only after an exact evaluation.
+    Linearised values tend to be too high, so a run is proposed only after an exact evaluation. The
+    best run that is only linearised is evaluated next; its value then usually falls, and another
+    run is the best one.
 
     Args:
         ranker: evaluates runs exactly, by fits of the competing models.
@@ -185,7 +190,7 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     """
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
-        best_estimated = next(
+        next_index = next(
             (
                 k
                 for k, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
@@ -193,11 +198,9 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
             ),
             None,
         )
-        if best_estimated is None or (
-            ranked[0].is_exact and ranked[0].value >= ranker.max_total_value
-        ):
+        if next_index is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_total_value):
             break
-        ranked[best_estimated] = ranker.evaluate_exactly(ranked[best_estimated])
+        ranked[next_index] = ranker.evaluate_exactly(ranked[next_index])
         ranked.sort(key=get_sort_key)
     # Runs that are evaluated exactly come before those that are only linearised.
     return sorted(ranked, key=lambda run_value: (not run_value.is_exact, *get_sort_key(run_value)))
@@ -263,19 +266,24 @@ def _iterate_connected_groups(
 ) -> Iterator[tuple[str, ...]]:
     """Yield connected groups of names that are linked by pairs that are not distinguished.
 
+    Models of different groups would be distinguished by the run; those of one group might not be.
+
     Args:
         names: names of N models.
         discrimination: (N, N) discrimination of each pair.
     """
     remaining = list(range(len(names)))
     while remaining:
-        group, newly_connected = [], [remaining[0]]
+        connected, newly_connected = [], [remaining[0]]
         while newly_connected:
-            group += newly_connected
+            connected += newly_connected
             remaining = [index for index in remaining if index not in newly_connected]
             newly_connected = [
-                b
-                for b in remaining
-                if any(discrimination[a, b] <= DISCRIMINATION_THRESHOLD for a in newly_connected)
+                other
+                for other in remaining
+                if any(
+                    discrimination[member, other] <= DISCRIMINATION_THRESHOLD
+                    for member in newly_connected
+                )
             ]
-        yield tuple(names[index] for index in sorted(group))
+        yield tuple(names[index] for index in sorted(connected))

@@ -125,7 +125,8 @@ class RigLimits:
     ) -> list[Mapping[str, Array]]:
         """Simulate runs with a model, and return all channels that have limits, (T,) by name.
 
-        Channels that are not recorded are simulated too.
+        Channels that are not recorded are simulated too, because a run can damage a robot at a
+        joint without a sensor.
 
         Shapes: T samples, s states of a run.
 
@@ -207,7 +208,8 @@ class RigLimits:
     def _is_within_limits(self, channels: Mapping[str, Array]) -> bool:
         """Return whether a simulated run stays within the limits of all monitored channels.
 
-        A run of a robot must not touch bodies that did not touch each other in the present runs.
+        A run of a robot must also not touch bodies that did not touch each other in the present
+        runs.
 
         Args:
             channels: (T,) simulated values by channel. A run with NaN or infinity is rejected.

@@ -161,6 +161,9 @@ def fit_base_model(
 def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
     """Return the base model of a robot, corrected for the discretisation error and fitted again.
 
+    The error of the integrator's steps would otherwise be explained by effects. It is estimated at
+    the fitted model; if it is too large to be corrected, the model is returned as it is.
+
     Args:
         evaluator: the runs of a robot; the correction is stored in it.
         noise: noise of each channel.
@@ -199,9 +202,11 @@ def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Ar
     # A simulator may have no parameters; its base fit only fits initial states.
     if not parameters:
         return starts
-    for shares in spread_start_points(GRID_STARTS, len(parameters)):
+    for position_shares in spread_start_points(GRID_STARTS, len(parameters)):
         theta = nominal.copy()
-        for index, parameter, share in zip(evaluator.base_indices, parameters, shares, strict=True):
+        for index, parameter, share in zip(
+            evaluator.base_indices, parameters, position_shares, strict=True
+        ):
             theta[index] = _interpolate_bounds(parameter, share)
         starts.append(theta)
     return starts
@@ -249,7 +254,9 @@ def compute_start_costs(
 ) -> Array:
     """Return the sum of squares of each start over the first samples of the runs, without a fit.
 
-    It selects the starts that are worth a fit.
+    It selects the starts that are worth a fit. Residuals are in units of the noise. By default a
+    sample that cannot be simulated has a large finite residual, so that starts that fail late are
+    better than those that fail early.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
@@ -295,8 +302,8 @@ def _is_sensitive(
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
     # Count only available samples.
     available_change = change[np.isfinite(evaluator.observed)]
-    sigmas = np.sqrt(np.square(available_change).sum())
-    return float(sigmas) > MIN_SENSITIVITY_SIGMAS
+    change_norm = np.sqrt(np.square(available_change).sum())
+    return float(change_norm) > MIN_SENSITIVITY_SIGMAS
 
 
 Bounds = tuple[float, float]
@@ -316,18 +323,18 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
         evaluator: the runs, with the present range of each parameter.
         base: fit of the base model within these ranges.
     """
-    places = []
+    indices_at_bounds = []
     for parameter_index in evaluator.base_indices.tolist():
         if parameter_index in base.fixed_parameters:
             continue
         low, high = evaluator.parameters[parameter_index].bounds
-        end = bound_of(float(base.fit.theta[parameter_index]), low, high)
+        bound = bound_of(float(base.fit.theta[parameter_index]), low, high)
         lower, upper = widen_range(
             evaluator.parameters[parameter_index], get_physical_limits(evaluator, parameter_index)
         )
-        if (end == "low" and lower < low) or (end == "high" and upper > high):
-            places.append(parameter_index)
-    return places
+        if (bound == "low" and lower < low) or (bound == "high" and upper > high):
+            indices_at_bounds.append(parameter_index)
+    return indices_at_bounds
 
 
 def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
@@ -399,6 +406,9 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
 
 def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
+
+    For example, a mass cannot be negative. A robot's free number is a correction of a number in its
+    model file; without an upper limit it is limited to a multiple of its plausible range.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
@@ -515,7 +525,7 @@ def find_start_with_tuner(
         InputError: the tuner does not exist, or must be trained first.
     """
     channels = evaluator.observed.shape[2]
-    # A tuner accepts one table, so the runs are concatenated, all padded to the same length.
+    # A tuner accepts one table (R T, C), so the runs are concatenated, padded to equal length.
     observed = evaluator.observed.reshape(-1, channels)
     parameters = [evaluator.parameters[i] for i in evaluator.base_indices]
     problem = StandaloneProblem(

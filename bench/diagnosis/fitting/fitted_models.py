@@ -220,7 +220,7 @@ class ModelSet:
         is_racing: bool = True,
         iterations: int = MAX_ITERATIONS,
     ) -> None:
-        """Fit models from their starts, and store those that are better than known fits.
+        """Fit models from their starts, and store in `models` those that beat the known fits.
 
         1. With `is_staged`, reduce the starts by fits to the beginnings of the runs.
         2. Fit all of them in parallel; with `is_racing`, fits that fall far behind are stopped.
@@ -298,7 +298,8 @@ class ModelSet:
     def refine_jacobian(self, model: FittedModel) -> FittedModel:
         """Return the model with derivatives at its own parameters, computed at most once.
 
-        This is needed if the fit ended with derivatives from a nearby point.
+        This is needed if the fit ended with derivatives from a nearby point, for example for
+        confidence intervals. A fit with zero iterations computes them.
         """
         if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
             return model

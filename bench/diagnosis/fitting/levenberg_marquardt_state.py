@@ -295,14 +295,14 @@ class FitState:
         """Return the best point so far as a fitted model."""
         point = self.point
         return TrajectoryFit(
-            point.start.effects,
-            point.start.theta,
-            point.start.initial_states,
-            self.free_indices,
-            point.simulated,
-            point.jacobian,
-            point.cost,
-            self.has_own_jacobian,
+            effects=point.start.effects,
+            theta=point.start.theta,
+            initial_states=point.start.initial_states,
+            free_indices=self.free_indices,
+            simulated=point.simulated,
+            jacobian=point.jacobian,
+            cost=point.cost,
+            is_own_jacobian=self.has_own_jacobian,
         )
 
     def compute_inward_steps(self, theta: Array) -> Array:
@@ -368,9 +368,9 @@ class FitState:
     def accept_step(self, decrease: float, cost: float, is_own_jacobian: bool) -> None:
         """Update the damping and the convergence state after a step that has decreased the cost.
 
-        With the gain ratio rho, the damping becomes lambda max(0.1, 1 - (2 rho - 1)^3), and its
-        growth factor nu = 2, eq. (2). The fit ends if it has converged, stagnates far from the
-        data, or if the cost is too rough to predict.
+        With the gain ratio rho (actual by predicted decrease), the damping becomes lambda max(0.1,
+        1 - (2 rho - 1)^3), and its growth factor nu = 2, eq. (2). The fit ends if it has converged,
+        stagnates far from the data, or if the cost is too rough to predict.
 
         Args:
             decrease: decrease of the cost by this step.
@@ -378,17 +378,17 @@ class FitState:
             is_own_jacobian: whether the derivatives were computed at the point where the step
                 began.
         """
-        ratio = decrease / max(self.predicted_decrease, 1e-300)  # (1)
+        gain_ratio = decrease / max(self.predicted_decrease, 1e-300)  # (1)
         self.is_jacobian_stale = (
-            not self.has_own_jacobian and abs(ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
+            not self.has_own_jacobian and abs(gain_ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
         )
-        factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, MIN_DAMPING)  # (2)
         self.growth = INITIAL_DAMPING_GROWTH
-        is_stagnant = ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
+        is_stagnant = gain_ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
-        is_predicted = abs(ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
+        is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
         largest = max(decrease, self.predicted_decrease)
         if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
             self.is_finished = True

@@ -196,11 +196,13 @@ def compute_gauss_newton_step(
     runs, size = len(residual), jacobian.shape[3]
     run_jacobians = jacobian.reshape(runs, -1, size)
     run_residuals = residual.reshape(runs, -1)
+    # 1. Equations.
     equations = _apply_damping(
         _assemble_normal_equations(run_jacobians, run_residuals, q, drift, prior),
         damping,
         known_mask,
     )
+    # 2. Solution.
     parameter_step, state_steps = equations.solve(blocked_mask)
     return GaussNewtonStep(
         parameter_step,
@@ -336,7 +338,8 @@ def build_displaced_inputs(
     """Return the parameters and initial states to simulate for a finite-difference Jacobian.
 
     The first entry is not displaced. Each further entry has one unknown displaced by its step. An
-    initial state is displaced in all runs at once, because it influences only its own run.
+    initial state is displaced in all runs at once, because it influences only its own run: one
+    simulation of all runs gives all its derivatives.
 
     Shapes: R runs, P parameters, q fitted parameters, s states of a run.
 
@@ -354,8 +357,6 @@ def build_displaced_inputs(
     states = np.tile(start.initial_states, (1 + q + state_count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
-    # An initial state influences only its own run, so one batch element per run gives all
-    # derivatives.
     for j, place in enumerate(state_indices):
         states[1 + q + j, :, place] += steps[q + place]
     return theta, states
@@ -364,7 +365,11 @@ def build_displaced_inputs(
 def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) -> Array:
     """Return steps (q + s,) that change the observations by `TARGET_RESPONSE_SIGMAS` of the noise.
 
-    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
+    The steps are for q parameters and s initial states. With smaller steps, rounding dominates the
+    difference quotient; with larger ones, curvature does. The responses come from the previous
+    Jacobian.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters.
 
     Args:
         jacobian: (R, T, C, q + s) derivatives from earlier finite differences.
@@ -378,6 +383,5 @@ def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) 
     # An unknown without any response gets the maximum step.
     with np.errstate(divide="ignore"):
         target_steps = TARGET_RESPONSE_SIGMAS / np.where(responses > 0, responses, 1e-300)
-    # Below the minimum step rounding dominates, above the maximum step curvature.
     steps: Array = np.clip(target_steps, MIN_STEP_RATIO * largest, largest)
     return steps

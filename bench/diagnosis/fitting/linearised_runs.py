@@ -23,8 +23,10 @@ def compute_effect_responses(
 ) -> Array:
     """Compute how the runs of a robot change to first order if one effect is added, for K effects.
 
-    Linearised dynamics cost much less than a simulation for each effect. The result has single
-    precision, because it is by far the largest array of an explanation and only a derivative.
+    Linearised dynamics cost much less than a simulation for each effect. Series effects (joints in
+    series) cannot be linearised; they are simulated, and the result is cached. The result has
+    single precision, because it is by far the largest array of an explanation and only a
+    derivative.
 
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
@@ -116,6 +118,8 @@ def compute_initial_state_derivatives(
     evaluator: RunEvaluator, theta: Array, states: Array
 ) -> Array:
     """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
+
+    Each run is linearised in a worker. Derivatives that are not finite are set to zero.
 
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
@@ -214,13 +218,14 @@ def correct_discretisation(
     effects = [*evaluator.library, *evaluator.extra_effects]
     run_count = len(evaluator.prepared_runs)
     scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
-    lanes = np.tile(theta, (run_count, 1))
+    thetas = np.tile(theta, (run_count, 1))
     initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
     half_step_kind = evaluator.kind.with_half_step()
-    simulated = [evaluator.simulator.simulate_batch(lanes, scenarios, initial_states)]
+    # Motions with the usual step, half of it and a quarter of it.
+    simulated = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
     for kind in (half_step_kind, half_step_kind.with_half_step()):
         finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
-        simulated.append(finer.simulate_batch(lanes, scenarios, initial_states))
+        simulated.append(finer.simulate_batch(thetas, scenarios, initial_states))
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
     evaluator.simulation_count += 7 * run_count
     correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)

@@ -77,13 +77,13 @@ def _split_run(run: Run) -> list[Run]:
     is_sampled: Mask = np.any(np.isfinite(values), axis=0)
     count = int(np.clip(is_sampled.sum() // MIN_MEAN_SEGMENT_SAMPLES, 1, SEGMENTS_PER_RUN))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
-    parts = [slice(a, b) for a, b in pairwise(edges)]
+    parts = [slice(begin, end) for begin, end in pairwise(edges)]
     # Segments have equal length, but one of them may have too many missing samples.
     if any(
         is_sampled[part].sum() < MIN_MEAN_SEGMENT_SAMPLES // MAX_MISSING_FACTOR for part in parts
     ):
         return [run]
-    return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
+    return [run.part(part, f"{run.name}.{number}") for number, part in enumerate(parts)]
 
 
 def join_segment_fits(evaluator: RunEvaluator, segment_fit: TrajectoryFit) -> FitStart:
@@ -120,12 +120,12 @@ def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivative
     state_influence = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(
         axis=2
     )
-    for run, length in zip(state_influence, evaluator.lengths, strict=True):
-        last_samples = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
+    for influence, length in zip(state_influence, evaluator.lengths, strict=True):
+        last_samples = influence[int((1.0 - RUN_END_SHARE) * length) : int(length)]
         # If all initial states of a run are known, the decay of their influence cannot be measured.
         if (
-            not run.any()
-            or (last_samples.max(axis=0) > MAX_STATE_INFLUENCE * run.max(axis=0)).any()
+            not influence.any()
+            or (last_samples.max(axis=0) > MAX_STATE_INFLUENCE * influence.max(axis=0)).any()
         ):
             return False
     return True

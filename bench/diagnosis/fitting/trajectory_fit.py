@@ -57,13 +57,14 @@ class RacingRound(NamedTuple):
 
 
 def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
-    """Yield the rounds of a fit.
+    """Yield the rounds of a fit: ranges of iterations after which parallel fits are compared.
+
+    The first round is longer, because in the first steps even the right model may be far behind.
 
     Args:
         iterations: total number of iterations; with 0, one empty round is generated.
         is_racing: whether the fits exchange their best cost after each short round, to stop those
-            that are far behind.
-            Otherwise there is only one round.
+            that are far behind; otherwise there is only one round.
     """
     begin = 0
     while begin < iterations or not begin:
@@ -178,12 +179,12 @@ class TrajectoryFitter:
             worker_arguments = [
                 (
                     self._list_worker_arguments(),
-                    [fit_states[i] for i in g],
+                    [fit_states[i] for i in group],
                     racing_round,
                     is_racing,
                     best,
                 )
-                for g in groups
+                for group in groups
             ]
             for number, members in self.evaluator.worker_pool.map_unordered(
                 self.evaluator, _advance_group, worker_arguments
@@ -192,7 +193,7 @@ class TrajectoryFitter:
                     fit_states[i] = fit_state
                     if fit_state.is_finished or racing_round.last >= iterations:
                         finished()
-        return [p.make_fit() for p in fit_states]
+        return [fit_state.make_fit() for fit_state in fit_states]
 
     def _list_worker_arguments(self) -> tuple[Any, ...]:
         """Return all fields except the run evaluator, which workers have already.
@@ -212,9 +213,10 @@ class TrajectoryFitter:
     ) -> list[list[int]]:
         """Split unfinished fits into groups that workers advance in parallel.
 
-        A group simulates about `GROUP_COST_SAMPLES` samples in a step, and has models of one kind
-        as far as possible. There is only one group if large engine calls cost less per batch
-        element.
+        A group simulates about `GROUP_COST_SAMPLES` samples in a step, so that the groups are large
+        enough to be worth a message and small enough to share the work. Models of one kind, which
+        can share an engine call, are in one group as far as possible. There is only one group if
+        large engine calls cost less per batch element.
 
         Args:
             fit_states: states of all fits.
@@ -234,8 +236,8 @@ class TrajectoryFitter:
         element_kinds = evaluator.group_compatible(
             np.stack([fit_states[i].point.start.theta for i in unfinished])
         )
-        order = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
-        groups = np.array_split(order, min(group_count, len(order)))
+        ordered_fits = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
+        groups = np.array_split(ordered_fits, min(group_count, len(ordered_fits)))
         return [part.tolist() for part in groups]
 
     def advance_round(
@@ -460,9 +462,11 @@ class TrajectoryFitter:
         thetas = np.concatenate(
             [np.repeat(theta, run_count, axis=0) for theta, _ in displaced_inputs]
         )
-        states = np.concatenate([begin.reshape(-1, state_count) for _, begin in displaced_inputs])
-        lanes = np.tile(np.arange(run_count), len(thetas) // run_count)
-        simulated = self.evaluator.simulate(thetas, lanes, states, self.share)
+        states = np.concatenate(
+            [begin_states.reshape(-1, state_count) for _, begin_states in displaced_inputs]
+        )
+        run_indices = np.tile(np.arange(run_count), len(thetas) // run_count)
+        simulated = self.evaluator.simulate(thetas, run_indices, states, self.share)
         simulated = simulated.reshape(-1, run_count, *simulated.shape[1:])
 
         # 3. Compute differences and costs.
@@ -672,9 +676,10 @@ class TrajectoryFitter:
                 yield fit_state, next_start
 
     def _propose_trial(self, fit_state: FitState, sample_mask: Mask) -> FitStart | None:
-        """Return the next parameters and initial states to try.
+        """Return the next parameters and initial states to try: one damped Gauss-Newton step.
 
         If no decrease is predicted, mark the fit as finished or waiting, and return None.
+        Parameters at a bound that the data push against do not move.
 
         Shapes: R runs, T samples, C channels.
 
@@ -695,14 +700,13 @@ class TrajectoryFitter:
         step = compute_gauss_newton_step(
             residual,
             jacobian,
-            fit_state.free_indices.size,
-            self._compute_state_deviation(point.start.initial_states),
-            compute_state_prior(self.evaluator),
-            self.evaluator.known_state_mask,
-            fit_state.damping,
-            fit_state.find_blocked_parameters(
-                residual, jacobian
-            ),  # clipping them afterwards would distort the step
+            q=fit_state.free_indices.size,
+            drift=self._compute_state_deviation(point.start.initial_states),
+            prior=compute_state_prior(self.evaluator),
+            known_mask=self.evaluator.known_state_mask,
+            damping=fit_state.damping,
+            # Clipping these parameters after the step would distort it.
+            blocked_mask=fit_state.find_blocked_parameters(residual, jacobian),
         )
         fit_state.predicted_decrease = step.predicted_decrease
         # The fit has converged, no step is short enough, or numbers overflow.
@@ -760,7 +764,8 @@ def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) 
 def compute_state_prior(evaluator: RunEvaluator) -> Array:
     """Return the standard deviations (s,) of the normal priors of the initial states, SI units.
 
-    A state that samples show has such a wide prior that only the samples decide.
+    A state that samples show has such a wide prior that only the samples decide. Other states stay
+    near their guesses. If a filter has estimated the states, its uncertainty is the prior.
 
     Shapes: s states of a run.
 

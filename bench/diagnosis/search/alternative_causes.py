@@ -99,7 +99,8 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
 def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     """Replace each effect by every other effect of the library, and return the best model.
 
-    Unlike `swap_effect`, which refits only the most promising candidates, all are fitted.
+    Unlike `swap_effect`, which refits only the most promising candidates, all are fitted: a cause
+    is reported only if no other effect in its place explains the data better.
 
     Args:
         search: the search; the fitted models are added to it.
@@ -110,9 +111,9 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     submodels = [search.remove_effect(model, name) for name in model.effects]
     search.refit_extensions(submodels, len(search.evaluator.library))
     best = model
-    for key, other_model in search.models.items():
+    for effect_set, other_model in search.models.items():
         # The search has already compared the known models.
-        if key in known_effect_sets or len(key) != size:
+        if effect_set in known_effect_sets or len(effect_set) != size:
             continue
         if other_model.penalised_log_likelihood > best.penalised_log_likelihood:
             best = other_model
@@ -129,17 +130,16 @@ def _make_swapped_start(
 ) -> FitStart:
     """Return a start for a competing model, with all shared effects at the values of the model.
 
-    A law with several coefficients converges to slightly different values each time, which would
-    make equivalent models look different.
+    The models differ in one effect. A law with several coefficients converges to slightly different
+    values each time, which would make equivalent models look different.
 
     Args:
         search: the search, with all fitted models.
         model: fitted model: its effects, parameters, initial states and likelihood.
         other_model: competing model.
     """
-    (added_effect,), (removed_effect,) = (
-        set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
-    )
+    (added_effect,) = set(other_model.effects) - set(model.effects)
+    (removed_effect,) = set(model.effects) - set(other_model.effects)
     coefficient_slices = search.evaluator.coefficient_slices
     added = coefficient_slices[added_effect]
     theta = model.fit.theta.copy()
@@ -279,14 +279,14 @@ class AlternativeFinder:
     def _measure_evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
         """Return the p-value, the gain and the equally good alternatives of an effect.
 
-        The gain is the increase of twice the log-likelihood over the model without the effect
-        (`reduced_model`). An alternative is an effect that, in place of this one, explains the data
-        equally well. `competing_effects` has pairs of distance and name, the effect itself
-        included.
+        The gain is the increase of twice the log-likelihood over the model without the effect. An
+        alternative is an effect that, in place of this one, explains the data equally well. Of
+        these, the one with the most plausible coefficients is preferred.
         """
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._compute_p_value(reduced_model, effect, gain)
+        # Pairs of distance and name, the effect itself included.
         competing_effects = self._list_competing_effects(model, effect)
         # Effects with implausible coefficients come last in their set, the least plausible at the
         # end.
@@ -320,7 +320,8 @@ class AlternativeFinder:
         """Return the p-value of an effect: how probable its gain is if the effect does not act.
 
         The p-value of the gain of the fit and that of the linear score are computed; the smaller
-        one is returned, as either test may be more sensitive.
+        one is returned, as either test may be more sensitive. Both compare with surrogate
+        residuals. Without simulation (`simulates` is false), only a stored p-value is used, or 1.
 
         Args:
             reduced_model: model without the effect.
@@ -477,10 +478,11 @@ class AlternativeFinder:
         return distance
 
     def _compute_comparable_likelihood(self, model: FittedModel) -> float:
-        """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
+        """Return the penalised log-likelihood by which competing models are compared.
 
+        For robots, the penalty for trying many effects is left out for effects with a single shape.
         Two such effects differ, for example, only in a sign constraint: if all commands have the
-        same sign, a dead band is equivalent to a bias.
+        same sign, a dead band is equivalent to a bias, and the penalty must not decide.
         """
         evaluator = self.search.evaluator
         if not evaluator.has_linearisation:
@@ -495,7 +497,8 @@ class AlternativeFinder:
     def _compute_range_excess(self, effect: str) -> float:
         """Return how far the coefficients of an effect are outside their plausible ranges.
 
-        They are those of the model with the effect that has the highest penalised log-likelihood.
+        Of indistinguishable effects, those with plausible coefficients are preferred. The
+        coefficients are those of the likeliest model with the effect.
 
         Returns:
             The largest distance of a coefficient from the middle of its range, in half ranges; 1 if

@@ -263,8 +263,9 @@ def _make_limit_probes(
 ) -> Iterator[CandidateDirection]:
     """Yield limits, dead bands and backlash of several sizes that the motion or the input reaches.
 
-    A smaller or a larger size would change nothing or everything, so the sizes are fractions of the
-    largest value that occurs in the recording.
+    These effects change nothing below or above a size, so they are not linear in it, and several
+    full sizes are simulated. A smaller or a larger size would change nothing or everything, so the
+    sizes are fractions of the largest value that occurs in the recording.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
@@ -310,6 +311,7 @@ def _make_shape_grid(
 ) -> Array:
     """Return the values of a shape parameter at which the response to an effect is computed.
 
+    A shape parameter, such as a frequency, cannot be fitted from zero: all its values are tried.
     Frequencies and periods have a grid fine enough to find any of them, event times are spread over
     the recording, and all other parameters have a geometric grid.
 
@@ -406,11 +408,11 @@ def _make_modifier_probes(
         probes: K single coefficients whose responses were computed.
         acting: (K,) mask of the coefficients that change the runs.
     """
-    leading: dict[str, CandidateDirection] = {}
+    acting_probes: dict[str, CandidateDirection] = {}
     idle_probes: list[CandidateDirection] = []
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
-            leading.setdefault(probe.effect, probe)
+            acting_probes.setdefault(probe.effect, probe)
         # The first shape already shows whether a coefficient acts by itself; members of a family do
         # not modify each other.
         elif (
@@ -422,10 +424,10 @@ def _make_modifier_probes(
     modifiers: dict[str, list[CandidateDirection]] = {}
     for probe in idle_probes:
         # An effect that does not act at all cannot be modified.
-        if probe.effect in leading:
+        if probe.effect in acting_probes:
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
-        yield from _iterate_grid_points(evaluator, leading[name], members)
+        yield from _iterate_grid_points(evaluator, acting_probes[name], members)
 
 
 def _iterate_grid_points(

@@ -79,7 +79,7 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
         [
-            max(level_function(evaluator, t, member) for t in evaluator.prepared_runs)
+            max(level_function(evaluator, run_data, member) for run_data in evaluator.prepared_runs)
             for member in members
         ]
     )
@@ -222,7 +222,8 @@ def generate_neighbouring_end_stops(
 ) -> Iterator[Array]:
     """Yield end stops (k,) on the same side as a given one; nothing for other effects.
 
-    All depths are tried, because the stiffness determines the depth of contact.
+    They are starts of a fit near an end stop with a good score. All depths are tried, because the
+    stiffness determines the depth of contact.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -232,13 +233,17 @@ def generate_neighbouring_end_stops(
     if evaluator.available_effects[name].coefficients[0].of == "stop":
         bound_share = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
         # Simulating a robot costs a hundred times as much, so fewer stops are tried.
-        times, depths = (
+        stiffness_factors, depth_shares = (
             ((1.0,), END_STOP_DEPTH_SHARES[::2])
             if evaluator.has_linearisation
             else (END_STOP_STIFFNESS_FACTORS, END_STOP_DEPTH_SHARES)
         )
         yield from generate_end_stops(
-            evaluator, name, np.sign(c[0]), [bound_share * t for t in times], depths
+            evaluator,
+            name,
+            side=np.sign(c[0]),
+            stiffness_shares=[bound_share * factor for factor in stiffness_factors],
+            depth_shares=depth_shares,
         )
 
 
@@ -247,8 +252,9 @@ def generate_equal_travel_end_stops(
 ) -> Iterator[Array]:
     """Yield softer and harder end stops (k,) with the same turning point as a given one.
 
-    The depth of contact for a motion of equal energy is proportional to k^(-2/5), by eq. (2) of
-    `sims.effects.state_limits`.
+    They are starts for a fit, since stiffness and position of a stop are nearly interchangeable.
+    The depth of contact for a motion of equal energy is proportional to k^(-2/5), with the
+    stiffness k, by eq. (2) of `sims.effects.state_limits`.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -289,9 +295,9 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
         near_midpoints = midpoints[
             np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
         ]
-        for instant in near_midpoints[
-            :: -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
-        ].tolist():
+        # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced.
+        stride = -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
+        for instant in near_midpoints[::stride].tolist():
             coefficients = c.copy()
             coefficients[i] = instant
             yield coefficients
@@ -300,7 +306,7 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
 def generate_frequency_neighbours(
     evaluator: RunEvaluator, fit: TrajectoryFit
 ) -> Iterator[FitStart]:
-    """Yield starts with shifted frequencies, event times and end stops.
+    """Yield starts with shifted frequencies, periods, event times and end stops.
 
     Least squares stops at the nearest of the many local minima that such effects have, so fits
     start from several of them.

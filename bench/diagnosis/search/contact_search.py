@@ -140,16 +140,16 @@ def _search_states_of_base(search: EffectSearch) -> None:
     base = search.base_model
     if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
         return
-    former_states, deviations = search.evaluator.initial_state_guesses, search.evaluator.state_prior
+    states_before, deviations = search.evaluator.initial_state_guesses, search.evaluator.state_prior
     assert deviations is not None
     _search_first_states(search, search.evaluator, base.fit.theta)
     states = search.evaluator.initial_state_guesses
-    if states is former_states:
+    if states is states_before:
         return
     search.models.clear()
     model = search.fit_one(FitStart((), base.fit.theta, states))
     if not model.penalised_log_likelihood > base.penalised_log_likelihood:
-        search.evaluator.begin_at(former_states, deviations)
+        search.evaluator.begin_at(states_before, deviations)
         search.models[frozenset()] = base
 
 
@@ -391,10 +391,10 @@ def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, stat
         samples: (N, P) sets of parameters.
         states: (R, s) initial states.
     """
-    runs, sample_count = len(states), len(samples)
+    run_count, sample_count = len(states), len(samples)
     simulated = evaluator.simulate(
-        np.repeat(samples, runs, axis=0),
-        np.tile(np.arange(runs), sample_count),
+        np.repeat(samples, run_count, axis=0),
+        np.tile(np.arange(run_count), sample_count),
         np.tile(states, (sample_count, 1)),
     )
     residual = simulated.reshape(sample_count, *evaluator.observed.shape) - evaluator.observed
@@ -470,7 +470,8 @@ def _refine_coefficient(search: EffectSearch, value: _ScannedValue) -> _ScannedV
 def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_ScannedValue]:
     """Scan each effect at a contact over its range, and rank those that explain the residual.
 
-    The scans simulate the runs from the initial states of the base model.
+    A scan simulates the runs with equidistant values of the coefficient, from the initial states of
+    the base model. No derivative is used, since contacts make the motion rough.
 
     Args:
         search: Search with its run evaluator.

@@ -198,19 +198,20 @@ class Inquiry:
         if unidentified:
             lack_of_fit = assess_lack_of_fit(search, base)
             return DiagnosisResult(
-                decide_verdict(DiagnosisState(fixed=False)),
-                base,
-                base,
-                (),
-                lack_of_fit,
-                unidentified,
+                verdict=decide_verdict(DiagnosisState(fixed=False)),
+                model=base,
+                base=base,
+                causes=(),
+                lack_of_fit=lack_of_fit,
+                unidentified_parameters=unidentified,
             )
         return None
 
     def _evaluate_on_held_out_runs(self) -> None:
         """Compare the model with competitors on held-out runs, and drop effects that do not help.
 
-        It does nothing if there are no held-out runs and too few runs for cross-validation.
+        The results are kept for the choice of alternatives and for the verdict. It does nothing if
+        there are no held-out runs and too few runs for cross-validation.
         """
         if self._held_out is None or self._model is None:
             return
@@ -226,6 +227,8 @@ class Inquiry:
 
     def _accept_larger_model(self, lack_of_fit: LackOfFitResult) -> bool:
         """Replace the model by one with more effects if held-out runs confirm it.
+
+        This is tried only if the residual has structure, that is, if the model lacks something.
 
         Returns:
             Whether the model was replaced.
@@ -332,6 +335,9 @@ def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
 def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tuple[str, ...]:
     """Return the sensitive base parameters that the data do not determine, the worst first.
 
+    A parameter is not determined if its standard deviation is too large a share of its plausible
+    range.
+
     Args:
         search: search for causes, with its run evaluator, noise and fitted models.
         base: base model: the simulator without additional effects, fitted to the runs.
@@ -340,10 +346,10 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     spread = np.sqrt(np.maximum(variances, 0.0))
     parameters = [search.evaluator.parameters[place] for place in base.fit.free_indices]
     unidentified = []
-    for parameter, sd in zip(parameters, spread.tolist(), strict=True):
+    for parameter, deviation in zip(parameters, spread.tolist(), strict=True):
         low, high = parameter.bounds
-        if not verdict_rules.is_identified(sd, low, high):
-            unidentified.append((sd / (high - low), parameter.name))
+        if not verdict_rules.is_identified(deviation, low, high):
+            unidentified.append((deviation / (high - low), parameter.name))
     return tuple(name for _, name in sorted(unidentified, key=lambda entry: -entry[0]))
 
 
@@ -402,7 +408,8 @@ def compute_gap_closed(
     """Return the share of the discrepancy on the fitted runs that a model removes.
 
     With the RMS residuals b of the base model and a of this model, in units of the noise, it is (b
-    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy.
+    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy. The noise of a channel
+    whose residual has no structure is that residual.
 
     Args:
         search: search for causes, with its run evaluator, noise and fitted models.
@@ -411,8 +418,8 @@ def compute_gap_closed(
     """
     residual_sigma = model.likelihood.sigma
     # A residual without structure is noise, even if it exceeds an estimated noise floor.
-    is_noise = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
-    floor = np.where(is_noise, residual_sigma, search.noise.sigma)
+    is_residual_noise = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
+    floor = np.where(is_residual_noise, residual_sigma, search.noise.sigma)
     noise = np.maximum(floor, search.noise.sigma)
     before = _compute_normalised_rms(search, search.base_model, noise)
     after = _compute_normalised_rms(search, model, noise)

@@ -170,8 +170,16 @@ class EffectSearch(ModelMoves):
     def _search_size(self, best: FittedModel, size: int) -> FittedModel | None:
         """Fit models of `size` effects, and return the best one after exchanges and simplification.
 
-        It may have fewer effects, if some were not needed. `best` is the best smaller model. Return
-        None if no model of this size could be fitted.
+        The exchange of effects corrects choices of the smaller model that were wrong. A larger
+        model that replaces effects of the best smaller one is accepted only for a good reason.
+
+        Args:
+            best: the best smaller model.
+            size: number of effects.
+
+        Returns:
+            The best model, with fewer effects if some were not needed; None if no model of this
+            size could be fitted.
         """
         if size > 1:
             self.evaluator.search_control.begin_larger_models()
@@ -190,10 +198,11 @@ class EffectSearch(ModelMoves):
         )
 
     def _grow_models(self, size: int) -> FittedModel | None:
-        """Return the best model with `size` effects.
+        """Return the best model with `size` effects; None if none could be fitted.
 
-        First only the best smaller model is extended. If that does not explain the data, segments,
-        further models of the beam or patient fits are used.
+        First only the best smaller model is extended. If that does not explain the data, further
+        and slower methods follow: fits to short segments; then, for single effects, fits of all
+        candidates, and for more effects, extensions of the other good models (the beam).
         """
         smaller_models = select_beam(self, size - 1)
         self.refit_extensions(smaller_models[:1], MAX_REFITTED_CANDIDATES)
@@ -295,7 +304,10 @@ class EffectSearch(ModelMoves):
 
         A simpler effect is one that the effect contains, as Stribeck friction contains Coulomb
         friction. It is preferred if the residual has structure to which the richer effect may have
-        adapted. `single` is the model with the one effect; it is returned otherwise.
+        adapted, and the richer one does not clearly leave less.
+
+        Args:
+            single: fitted model with one effect; it is returned if no simpler one is preferable.
         """
         if self.is_complete(single, EFFECT_P_VALUE_THRESHOLD):
             return single
@@ -317,9 +329,11 @@ def select_by_size(models: ModelSet, size: int) -> list[FittedModel]:
 
 
 def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
-    """Return the models with `size` effects to extend: highest merit, and lowest sum of squares.
+    """Return the models with `size` effects to extend: the likeliest and the nearest to the data.
 
-    Far from the data merit is misleading, because AR(1) noise explains almost any residual there.
+    The likelihood is the penalised one. Far from the data it is misleading, because AR(1) noise
+    explains almost any residual there; the sum of squares, by which the nearest are selected, is
+    not.
 
     Args:
         search: the search, with all fitted models.
@@ -328,12 +342,12 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
     members = select_by_size(search, size)
     if not size or not members:
         return members
-    base = search.base_model.penalised_log_likelihood
-    best_gain = members[0].penalised_log_likelihood - base
+    base_likelihood = search.base_model.penalised_log_likelihood
+    best_gain = members[0].penalised_log_likelihood - base_likelihood
     best_models = [
         model
         for model in members
-        if model.penalised_log_likelihood - base >= MIN_RELATIVE_GAIN_IN_BEAM * best_gain
+        if model.penalised_log_likelihood - base_likelihood >= MIN_RELATIVE_GAIN_IN_BEAM * best_gain
     ][:BEAM_WIDTH]
     nearest_models = sorted(members, key=lambda model: model.fit.cost)[:BEAM_WIDTH_BY_SQUARES]
     return best_models + [model for model in nearest_models if model not in best_models]

@@ -139,8 +139,9 @@ class HeldOutValidation:
     ) -> float:
         """Return the excess of a larger model relative to what its further effects must achieve.
 
-        The value is one if the reduction is just enough; the worse of fitted and held-out runs
-        counts.
+        The excess is the RMS residual in units of the noise, minus one. Each further effect must
+        reduce it by a factor. The value is one if the reduction is just enough; the worse of fitted
+        and held-out runs counts.
 
         Args:
             search: the search, which computes the excess on the fitted runs.
@@ -203,10 +204,8 @@ class HeldOutValidation:
         )
         if improves_held_out((before, after), excesses):
             return True
-        excess_without, excess_with = (
-            search.compute_excess_residual(reduced_model),
-            search.compute_excess_residual(full_model),
-        )
+        excess_without = search.compute_excess_residual(reduced_model)
+        excess_with = search.compute_excess_residual(full_model)
         # 2. Small improvement.
         # Errors of a motion without feedback accumulate, whatever their cause.
         is_better = (

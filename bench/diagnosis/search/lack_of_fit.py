@@ -24,7 +24,7 @@ with correlation phi, its relative standard error is (formula of M. S. Bartlett,
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,8 +88,8 @@ class JointHatForce(Force):
         active_elements = np.flatnonzero(strength[:, 0])
         if not active_elements.size:
             return np.zeros_like(moment.x)
-        j = int(joint[active_elements[0], 0])
-        x, v = moment.x[:, j, None], moment.v[:, j, None]
+        joint_index = int(joint[active_elements[0], 0])
+        x, v = moment.x[:, joint_index, None], moment.v[:, joint_index, None]
         variable_index = int(variable[active_elements[0], 0])
         value = (moment.t, x, np.abs(v))[variable_index]
         # A hat that is off has zero width, which must not be a divisor.
@@ -99,7 +99,7 @@ class JointHatForce(Force):
             int(direction[active_elements[0], 0])
         ]
         forces = np.zeros_like(moment.x)
-        forces[:, j] = (strength * height * force_direction)[:, 0]
+        forces[:, joint_index] = (strength * height * force_direction)[:, 0]
         return forces
 
 
@@ -232,13 +232,8 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
     if force_test is not None and force_test[0] > level:
-        return LackOfFitResult(
-            force_test[0],
-            force_test[1],
-            size_result.excess,
-            size_result.channels_above_noise,
-            level,
-        )
+        p_value, variable = force_test
+        return replace(size_result, p_value=p_value, where=variable, p_value_threshold=level)
     # 3. Hat forces.
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(evaluator, model)
@@ -267,6 +262,9 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
 def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     """Test only the size of the residual, without an unmodelled force.
 
+    A channel counts as above its noise if the excess is significant. The p-value of the result is
+    1: no force was tested.
+
     Args:
         models: the models of the recording.
         model: the fitted model.
@@ -276,9 +274,9 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     residual_sigma = np.where(np.isfinite(sigma), sigma, 0.0)
     excess = residual_sigma / models.noise.sigma
     channels = []
-    for c, name in enumerate(models.evaluator.channels):
-        error = _compute_sigma_standard_error(models, model, c)
-        if exceeds_noise(excess[c], error, models.is_noise_stated[c]):
+    for channel_index, name in enumerate(models.evaluator.channels):
+        error = _compute_sigma_standard_error(models, model, channel_index)
+        if exceeds_noise(excess[channel_index], error, models.is_noise_stated[channel_index]):
             channels.append(name)
     return LackOfFitResult(1.0, "", excess, tuple(channels))
 
@@ -307,6 +305,9 @@ def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel:
 def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> DirectionSet:
     """Compute the responses of a model to hats over every recorded variable.
 
+    A hat is a force that acts only in an interval of time, position or speed of the motion.
+    Together, hats can represent any force.
+
     Args:
         evaluator: the runs.
         model: the fitted model.
@@ -326,7 +327,8 @@ def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> Direc
 def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], float]:
     """Return hats over every recorded variable, and their strength.
 
-    All hats of a family have the same label, because they form one hypothesis and act together.
+    Each family has hats with overlapping triangles over the range of its variable. All hats of a
+    family have the same label, because they form one hypothesis and act together.
     """
     size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
     is_robot = JointHatForce.name in evaluator.coefficient_slices
@@ -362,7 +364,11 @@ class _HatFamily(NamedTuple):
 
 
 def _iterate_joint_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
-    """Yield every family of hats at the joints of a robot that the recording can show."""
+    """Yield every family of hats at the joints of a robot that the recording can show.
+
+    They are forces over time along the coordinate; over the position along it, against the motion,
+    and as dry friction; and over the speed against the motion and as dry friction.
+    """
     for joint, name, low, high in _iterate_positions(evaluator):
         speeds = np.abs(_compute_rates(evaluator, evaluator.channels.index(name)))
         speed = float(np.nanquantile(speeds, HIGH_SPEED_QUANTILE))

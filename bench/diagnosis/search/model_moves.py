@@ -81,7 +81,9 @@ class ModelMoves(ScoredModelSet):
     def drop_unneeded_effects(self, model: FittedModel) -> FittedModel:
         """Return the model without effects that it does not need.
 
-        Each smaller model is fitted from the larger one, even if it is known.
+        An effect is not needed if the model without it has at least the same penalised
+        log-likelihood. Each smaller model is fitted from the larger one, even if it is known.
+        Effects are dropped one at a time.
         """
         key = frozenset(model.effects)
         # From here, the smaller model may reach a minimum that was missed when it was built up.
@@ -138,8 +140,9 @@ class ModelMoves(ScoredModelSet):
     def _split_into_contained_laws(self, model: FittedModel, name: str) -> EffectStarts:
         """Return the simpler laws that an effect contains, with its fitted coefficients.
 
-        The scaling coefficients of the contained laws come first among the coefficients of the
-        effect, in the order in which it names the laws.
+        For example, Stribeck friction contains Coulomb friction. The scaling coefficients of the
+        contained laws come first among the coefficients of the effect, in the order in which it
+        names the laws.
 
         Args:
             model: fitted model: its effects, parameters, initial states and likelihood.
@@ -180,10 +183,15 @@ class ModelMoves(ScoredModelSet):
         yield {members[largest].name: coefficients[largest]}
 
     def _fit_with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
-        """Fit the model with the simpler effects `parts` in place of the richer effect `name`.
+        """Fit the model with simpler effects in place of a richer one.
 
         All other parameters start from their present values. A model that was already fitted from
         here is not fitted again.
+
+        Args:
+            model: fitted model with the richer effect.
+            name: the richer effect.
+            parts: the simpler effects, with coefficients to start from.
         """
         effects_of_each = ([*parts] if n == name else [n] for n in model.effects)
         names = tuple(dict.fromkeys(chain.from_iterable(effects_of_each)))
@@ -207,7 +215,7 @@ class ModelMoves(ScoredModelSet):
         """Replace one effect at a time by a better one, while that improves the model.
 
         Each effect in turn is removed, and the smaller model is extended by the most promising
-        effects.
+        effects. The best model of the size then loses effects that it does not need.
         """
         for _ in range(MAX_SWAP_ROUNDS):
             # Each smaller model is extended again, because the removed effect may not be the best.

@@ -114,7 +114,7 @@ class RandomSearch:
             bounds: (K, 2) lower and upper bounds of these coefficients.
         """
         sample_count = int(self._is_recorded.sum())
-        best, centre, lowest = theta.copy(), theta[list(indices)], np.inf
+        best_theta, centre, lowest_cost = theta.copy(), theta[list(indices)], np.inf
         spread = widths.astype(np.float64)
         for _ in range(MAX_ROUNDS):
             self._evaluator.search_control.check_not_stopped()
@@ -128,15 +128,17 @@ class RandomSearch:
             sampled_states = [self._sample_states(run, samples) for run in range(len(self._means))]
             totals = np.sum([costs.min(axis=1) for _, costs in sampled_states], axis=0)  # (1)
             # 3. Best sample.
-            index, previous_lowest = int(np.argmin(totals)), lowest
-            if totals[index] < lowest:
-                lowest, best, centre = float(totals[index]), samples[index], values[index]
+            index, previous_lowest = int(np.argmin(totals)), lowest_cost
+            if totals[index] < lowest_cost:
+                lowest_cost = float(totals[index])
+                best_theta = samples[index]
+                centre = values[index]
                 for run, (states, costs) in enumerate(sampled_states):
                     self._deviates[run] = states[index, np.argmin(costs[index])]
             # 4. Convergence.
-            if not lowest < (1.0 - MIN_COST_DECREASE) * previous_lowest:
+            if not lowest_cost < (1.0 - MIN_COST_DECREASE) * previous_lowest:
                 break
-            if not lowest > EXPLAINED_SQUARES * sample_count:
+            if not lowest_cost > EXPLAINED_SQUARES * sample_count:
                 break
             # 5. Widths of the next round.
             order = np.argsort(totals)[:BEST_COEFFICIENTS]
@@ -152,7 +154,7 @@ class RandomSearch:
         states = np.where(
             evaluator.known_state_mask, evaluator.initial_state_guesses, sampled_initial_states
         )
-        return FoundValues(best, states, lowest / max(sample_count, 1))
+        return FoundValues(best_theta, states, lowest_cost / max(sample_count, 1))
 
     def _sample_states(self, run: int, samples: Array) -> tuple[Array, Array]:
         """Simulate one run from random initial states, with each of N samples of the parameters.

@@ -222,8 +222,13 @@ def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSoluti
     """Solve the normal equations G c = h of each group for a subset of its columns.
 
     Groups whose columns are zero or collinear have no unique solution and are left out; a smaller
-    subset of their columns explains the same. `gram` has G (n, k, k) and `cross` has h (n, k, S) of
-    `compute_explained_squares`, and `subset` has the indices of the columns.
+    subset of their columns explains the same. Columns are scaled to unit length, so that
+    collinearity does not depend on units.
+
+    Args:
+        gram: G (n, k, k), as in `compute_explained_squares`.
+        cross: h (n, k, S), as in `compute_explained_squares`.
+        subset: indices of the columns.
     """
     products = gram[:, subset][:, :, subset]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
@@ -483,6 +488,10 @@ class _BestScores:
 
     def add_batch(self, batch: GroupBatch, gain: Array, coefficients: Array) -> None:
         """Update the best scores of groups and effects with the results of one batch.
+
+        An effect may have several groups (shapes), of which the best counts, for each residual on
+        its own. The best groups of the observed residual are kept with their coefficients,
+        from which fits start.
 
         Args:
             batch: groups that were solved together.

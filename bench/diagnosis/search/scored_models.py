@@ -134,7 +134,8 @@ class ScoredModelSet(ModelSet):
     ) -> CandidateScores:
         """Score every effect that the model lacks, to find the effects that are worth fitting.
 
-        The scores about a model are computed once and stored, except with a `noise_residual`.
+        A score is the gain of an effect to first order, without a fit. The scores about a model are
+        computed once and stored, except with a `noise_residual`.
 
         Shapes: R runs, T samples, C channels.
 
@@ -178,10 +179,8 @@ class ScoredModelSet(ModelSet):
             self._report_scoring(model)
             model = self.refine_jacobian(model)
             key = frozenset(model.effects)
-            residual, rng = (
-                self.compute_residual(model.fit),
-                self.make_rng("library", model.effects),
-            )
+            residual = self.compute_residual(model.fit)
+            rng = self.make_rng("library", model.effects)
             # 1. Directions of a fit that was replaced.
             previous_scan = self.superseded_scans.pop(key, None)
             # A model that has hardly moved keeps its directions.
@@ -300,7 +299,7 @@ class ScoredModelSet(ModelSet):
     def refit_extensions(
         self, beam: Iterable[FittedModel], max_count: int, fits_all: bool = False
     ) -> None:
-        """Fit the models with one more effect that have the highest scores.
+        """Fit the models with one more effect that have the highest scores, and store them.
 
         Scores are linear, so the best candidates are fitted by simulation. For robots, models with
         simpler laws are fitted first, and those with richer laws only if the simpler ones leave
@@ -353,10 +352,10 @@ class ScoredModelSet(ModelSet):
         ]
         self._score_models(unscanned_models, other_kept_models=models)
         for model in models:
-            key = frozenset(model.effects)
-            stored_scan = self.cached_scans[key]
+            effect_set = frozenset(model.effects)
+            stored_scan = self.cached_scans[effect_set]
             # The model may have been improved since it was put into the beam.
-            latest_model = self.models[key]
+            latest_model = self.models[effect_set]
             extension_starts = select_refit_starts(
                 self.evaluator,
                 self.noise,

@@ -61,7 +61,8 @@ def select_refit_starts(
     """Return starts of fits with one more effect, for the effects with the best scores.
 
     1. Rank the effects by their scores.
-    2. Make starts with several values of the coefficients for each peak of an effect's score.
+    2. Make starts with several values of the coefficients for each peak of an effect's score: a
+       peak is the best shape, such as a frequency, or another local maximum.
     3. Simulate all starts, and keep the nearest to the data for each peak.
 
     Args:
@@ -144,7 +145,8 @@ def _rank_candidates(
     1. Effects with the best scores above their null-hypothesis level.
     2. Effects with the best scores for white noise, if they are not among these.
     3. Effects scored by full simulation that exceed all linear scores. They are added to the others
-       and replace none.
+       and replace none: far from the data, their score may exceed the first-order score of the true
+       effect.
 
     Args:
         scores: scores of all candidates.
@@ -157,8 +159,6 @@ def _rank_candidates(
     ranked: list[int] = np.argsort(-score_excess, kind="stable").tolist()
     if is_all_wanted:
         return ranked
-    # Far from the data, the score of a full simulation may exceed the first-order score of the true
-    # effect, so such candidates are added to the others and displace none.
     # 1. Best scores.
     order = [i for i in ranked if i not in simulated]
     selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:max_count]
@@ -179,15 +179,20 @@ def _rank_candidates(
 def add_effect_to_start(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
     """Add an effect to a model, in place of the effects that it contains.
 
+    The start of the new effect takes over the coefficients of those: an effect and one that it
+    contains together would have no unique solution.
+
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         start: the model.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) coefficients of the effect.
+
+    Returns:
+        Start of a fit, with the effect last.
     """
     effect = evaluator.available_effects[name]
     contained, theta = effect.contains, start.theta.copy()
-    # An effect and one that it contains together would have no unique solution.
     for contained_effect in sorted(set(contained) & set(start.effects)):
         part_slice = evaluator.coefficient_slices[contained_effect]
         c = effect.taking(c, contained_effect, theta[part_slice])

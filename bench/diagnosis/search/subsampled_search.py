@@ -43,7 +43,9 @@ A channel that is sampled rarely might otherwise lose all its samples.
 
 
 def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
-    """Return a `RunEvaluator` with thinned runs and the same parameters.
+    """Return a run evaluator with fewer samples and the same parameters, for a faster search.
+
+    Recordings with many samples in each step of the engine lose little information.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -137,13 +139,15 @@ MAX_SINGLE_EFFECT_REFITS = 6
 def search_with_subsampling(search: EffectSearch) -> FittedModel:
     """Return the model of all effects that the data show; long runs are thinned first.
 
+    Recordings with contacts have their own search, because thinned runs would begin in contact
+    without an estimate of their initial states.
+
     Args:
         search: the search, which contains the fitted base model.
 
     Raises:
         SearchStoppedError: the search had to end early.
     """
-    # Thinned runs would begin in contact without an estimate of their initial states.
     if search.evaluator.is_in_contact:
         # This import is needed for robots only.
         from bench.diagnosis.search.contact_search import search_in_contact

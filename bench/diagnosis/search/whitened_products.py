@@ -440,10 +440,8 @@ class WhiteningDesign:
             [normal[:, parameter_count:, :parameter_count], mixed[:, parameter_count:]], axis=2
         )
         by_states = _project_directions(state_root, other_products)
-        by_parameters, by_directions = (
-            by_states[:, :parameter_count],
-            by_states[:, parameter_count:],
-        )
+        by_parameters = by_states[:, :parameter_count]
+        by_directions = by_states[:, parameter_count:]
         schur_complement = (
             normal[:, :parameter_count, :parameter_count].sum(axis=0)
             - by_parameters.T @ by_parameters
