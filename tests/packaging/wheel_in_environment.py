@@ -13,6 +13,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("bench", "methods", "sims")
 LARGEST = 3_000_000
 """Maximum size of a wheel in bytes; a larger one contains unwanted files."""
+DEVELOPER_PAGES = {"bench/pages/README.md", "sims/effects/README.md"}
+"""Pages on how to extend a folder; readers find them in the repository."""
 
 
 def build(folder):
@@ -27,6 +29,7 @@ def wanted():
     """Return the files that the wheel must contain in addition to its metadata."""
     code = {p.relative_to(ROOT).as_posix() for name in PACKAGES for p in (ROOT / name).rglob("*")}
     kept = {name for name in code if (ROOT / name).is_file() and "__pycache__" not in name}
+    kept -= DEVELOPER_PAGES
     reference = ROOT / "results" / "reference"
     tables = [path.parent for path in reference.rglob("table.csv") if drawn(path)]
     files = ("table.csv", "experiment.toml", "environment.json")
