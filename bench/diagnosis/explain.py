@@ -130,24 +130,27 @@ def _diagnose(
         DivergingSimulationError: The simulation fails in the shortest segments, too.
     """
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
-    started, attempt, retried = time.perf_counter(), options, list(SEGMENT_DURATIONS)
+    started, attempt, remaining_durations = time.perf_counter(), options, list(SEGMENT_DURATIONS)
     while True:
         with (
             closing(ForkedWorkerPool(options.jobs or 1)) as worker_pool,
             closing(DiagnosisContext(attempt, worker_pool)) as context,
         ):
             runs = prepare_runs(sources, context)
-            may_divide = runs.contacts.is_divisible and options.pieces is None and bool(retried)
+            may_divide = (
+                runs.contacts.is_divisible and options.pieces is None and bool(remaining_durations)
+            )
             try:
                 diagnosis = _diagnose_runs(runs, may_divide)
             except DivergingSimulationError as error:
                 if not may_divide:
                     raise
-                retried = [s for s in retried if s <= error.longest_segment]
+                # Durations that the error says to be too long are not tried.
+                remaining_durations = [s for s in remaining_durations if s <= error.longest_segment]
             else:
                 yield diagnosis
                 return
-        seconds, elapsed = retried.pop(0), time.perf_counter() - started
+        seconds, elapsed = remaining_durations.pop(0), time.perf_counter() - started
         budget = None if options.budget is None else max(options.budget - elapsed, 0.0)
         attempt = replace(options, pieces=seconds, budget=budget)
         options.say(
@@ -176,6 +179,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     """
     error_check = RecordingErrorCheck()
     step_choice, option_choice = TimeStepChoice(), SolverOptionChoice()
+    # 1. Conventions.
     refuse_broken_conventions(runs)
 
     def fit_base(runs: SimulatedRuns) -> BaseModel:
@@ -197,6 +201,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             model = step_choice.choose(model)
         return model.finish()
 
+    # 2. Base model. Segments that it cannot follow, such as jumps on the ground, are left out.
     runs.context.search_control.begin_stage(STAGES["base_fit"])
     base = fit_base(runs)
     if not base.is_simulated:
@@ -209,10 +214,12 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
         raise DivergingSimulationError(
             f"{runs.recording.path}: the simulation loses the orientation"
         )
+    # 3. Causes.
     cause_search = CauseSearch(error_check)
     result = step_choice.reconsider(cause_search.search(base), cause_search)
     if step_choice.finding is None:
         result = option_choice.reconsider(result, cause_search)
+    # 4. Explanation.
     runs.context.search_control.begin_stage("measuring the gain")
     numerics_causes = [] if step_choice.finding is None else list_step_causes(step_choice.finding)
     if option_choice.finding is not None:

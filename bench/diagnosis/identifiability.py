@@ -185,6 +185,7 @@ class _IdentifiabilityAssessment:
         correlation_inverse = np.linalg.pinv(
             unit_columns.T @ unit_columns, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True
         )
+        # The pseudoinverse has the variance zero for combinations that are not determined.
         values, vectors = np.linalg.eigh(unit_columns.T @ unit_columns)
         unidentified = vectors[:, values < MIN_EIGENVALUE]
         correlation_inverse += UNIDENTIFIED_VARIANCE * unidentified @ unidentified.T
@@ -192,6 +193,7 @@ class _IdentifiabilityAssessment:
         covariance[sensitive_block] = correlation_inverse / np.outer(
             scale[is_sensitive], scale[is_sensitive]
         )
+        # Interval of each parameter, and its correlations with the others.
         assessments = []
         for column, index in enumerate(self.fit.free_indices.tolist()):
             parameter = self.evaluator.parameters[index]
@@ -260,13 +262,14 @@ class _IdentifiabilityAssessment:
         responses = self.found.responses[..., is_at_one_place]
         scaled_responses = np.where(self.seen[..., None], responses, 0.0)
         scaled_responses /= self.noise.sigma[:, None]
+        # 1. Information on each direction.
         runs, _, _, count = scaled_responses.shape
         columns = self._project_out_states(scaled_responses.reshape(runs, -1, count))
         if self.parameters.shape[1]:
             basis, _ = np.linalg.qr(self.parameters)
             columns -= basis @ (basis.T @ columns)
         norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-        # A coefficient with several shapes is represented by the most sensitive one.
+        # 2. A coefficient with several shapes is represented by the most sensitive one.
         most_sensitive: dict[tuple[str, int], int] = {}
         switching_effects = {probe.effect for probe in probes if probe.is_single_size}
         for k, probe in enumerate(probes):
@@ -275,6 +278,7 @@ class _IdentifiabilityAssessment:
             key = probe.effect, probe.coefficient_index
             if key not in most_sensitive or norms[k] > norms[most_sensitive[key]]:
                 most_sensitive[key] = k
+        # 3. Intervals and correlations.
         selected_columns = list(most_sensitive.values())
         unit_columns = columns[:, selected_columns] / np.maximum(norms[selected_columns], 1e-300)
         correlations = np.abs(unit_columns.T @ unit_columns)
@@ -289,10 +293,10 @@ class _IdentifiabilityAssessment:
             half_width = Z95 / norms[k] if norms[k] > 0 else np.inf
             confounders = [
                 (other_effect, float(correlation))
-                for (other_effect, _), j, correlation in zip(
+                for (other_effect, _), other_column, correlation in zip(
                     most_sensitive, selected_columns, row, strict=True
                 )
-                if other_effect != name and norms[j] > 0
+                if other_effect != name and norms[other_column] > 0
             ]
             is_single_coefficient = sum(1 for effect, _ in most_sensitive if effect == name) == 1
             label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
@@ -501,6 +505,7 @@ def freeze_unidentified_parameters(
         base = replace(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
         )
+        # Fit the remaining parameters again.
         start = replace(base.fit.make_start(), theta=theta)
         base = replace(
             base,

@@ -195,6 +195,7 @@ def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
     frame = pd.DataFrame(lines, columns=columns)
     frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))
+    # The commonest number first.
     frequency = frame["what"].map(frame["what"].value_counts())
     order = frequency.sort_values(ascending=False, kind="stable").index
     return frame.loc[order].reset_index(drop=True)
@@ -222,7 +223,10 @@ class BatchLog:
 
 
 def list_logs(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> list[BatchLog]:
-    """List the logs with their names and folders.
+    """List the logs with their names, folders and digests.
+
+    The digest of a recording with all settings shows a later call whether the log must be explained
+    again.
 
     Args:
         paths: Paths of the recordings.
@@ -295,7 +299,9 @@ def explain_batch(
 
 
 def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -> LogResult:
-    """Explain a log and write its results, in any process.
+    """Explain a log and write its results; worker processes call this.
+
+    An error of the input becomes the result of its log, so that it does not end the batch.
 
     Args:
         log: Log to explain.

@@ -182,6 +182,8 @@ def _list_causes(
 ) -> list[_CommonCause]:
     """List the causes over all logs, the most common first.
 
+    Alternatives that the data of a log do not distinguish count as one cause.
+
     Args:
         rows: results of the logs.
         numbers: one row for each coefficient of a cause of a log, with the column ``cause``.

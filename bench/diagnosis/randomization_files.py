@@ -217,6 +217,7 @@ def _build_terms(
                 "body_mass", name, "randomize_rigid_body_mass", params, [sentences[number_range]]
             )
         )
+    # The centre of mass has a range for each coordinate.
     for name, offsets in by_effect.pop("mass.offset", {}).items():
         pairs = [
             f'"{offset.coefficient}": {_format_pair(offset.minimum, offset.maximum)}'
@@ -309,7 +310,9 @@ def _group_by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str
 def _convert_gain_to_joint(
     robot: Any, ranges: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
 ) -> tuple[float, float]:
-    """Return the interval of an actuator's gain, multiplied by the square of the gear ratio.
+    """Return the interval of an actuator's gain at its joint: multiplied by the gear ratio squared.
+
+    The gear converts the joint's motion to that of the actuator, and its force back.
 
     Args:
         robot: model of the robot.

@@ -267,8 +267,11 @@ def _convert_to_range(
     fields = model_fields(robot, cause.effect, cause.place)
     own_fields = tuple(fields[names.index(entry.coefficient)]) if fields else ()
     nominal, value, unit = totals.at(number, entry.coefficient, fitted.value)
-    ends = (totals.at(number, entry.coefficient, end)[1] for end in (fitted.low, fitted.high))
-    low, high = sorted(ends)
+    # Both ends of the interval as numbers of the file; the order may be reversed.
+    interval_ends = (
+        totals.at(number, entry.coefficient, end)[1] for end in (fitted.low, fitted.high)
+    )
+    low, high = sorted(interval_ends)
     operation = operation_of(cause.effect)
     minimum, maximum = low, high
     if operation == "add" and nominal is not None:

@@ -31,6 +31,9 @@ def check_identifiability(
 ) -> tuple[ParameterIdentifiability, ...]:
     """Assess which free numbers and which causes a recording can identify.
 
+    The base model is fitted first. The derivatives of the runs at the fit then show what the
+    recording can determine; white noise is assumed, so no correlation is estimated.
+
     Args:
         source: Recording, or the path of its table.
         system: Name of the system to use instead of the one in the description.
@@ -62,6 +65,7 @@ def check_identifiability(
                 f"{recording.path}: the simulation fails at every starting point of the fit; "
                 "check constants, units, inputs and initial states"
             )
+        # Derivatives of the runs at the fit.
         numbers = assess_identifiability(
             evaluator, noise, compute_central_jacobian(evaluator, base.fit, noise)
         )

@@ -400,10 +400,10 @@ def _iterate_joint_variables(
         yield f"position of {joint.name}", unit, values
         slopes = np.full_like(values, np.nan)
         for run_index, run_data in enumerate(evaluator.prepared_runs):
-            size = len(run_data.observed)
-            if size > 1:
-                slopes[run_index, :size] = np.gradient(
-                    values[run_index, :size], run_data.scenario.times
+            sample_count = len(run_data.observed)
+            if sample_count > 1:
+                slopes[run_index, :sample_count] = np.gradient(
+                    values[run_index, :sample_count], run_data.scenario.times
                 )
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
     elif rate in evaluator.channels:

@@ -355,6 +355,7 @@ def _read_estimates(document: Mapping[str, Any]) -> dict[str, FittedValue]:
 
 
 def _read_estimate(estimate: Mapping[str, Any]) -> FittedValue:
+    """Build a fitted value from its JSON object, in which the usual range is a list."""
     usual_range = estimate.get("usual_range")
     ends = (float(usual_range[0]), float(usual_range[1])) if usual_range is not None else None
     return FittedValue(**{**estimate, "usual_range": ends})

@@ -612,6 +612,8 @@ class ConventionComparison:
 def _cut_to_common_samples(first: Recording, second: Recording) -> tuple[Recording, Recording]:
     """Cut the runs of two versions of a recording to the samples that both have.
 
+    Likelihoods can be compared only for the same samples.
+
     Args:
         first: a recording.
         second: the same runs, whose ends may be cut differently.

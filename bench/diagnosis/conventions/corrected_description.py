@@ -157,6 +157,7 @@ def list_changed_tables(
 
 
 def _format_value(value: Any) -> str:
+    """Format a value of a TOML file."""
     if isinstance(value, bool):
         return str(value).lower()
     return toml_text(value) if isinstance(value, str) else f"{value:.9g}"

@@ -759,6 +759,9 @@ def _fit_rescaled(
 def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float) -> float:
     """Return the largest cost of a fit that leaves at most these residuals.
 
+    A fit with a larger cost explains the recording too badly, and need not be finished. If a
+    channel hardly moves, only the limit of all channels together applies.
+
     Args:
         evaluator: Run evaluator of the rescaled recording.
         noise: White noise of each channel.

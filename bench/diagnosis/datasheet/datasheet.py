@@ -108,6 +108,7 @@ def _describe_rest_forces(diagram: DriveDiagram) -> str:
 
 
 def _format_runs(runs: Sequence[str]) -> str:
+    """Format the names of runs, such as ``runs a, b and 3 more``."""
     named_runs = f"runs {', '.join(runs[:_NAMED_RUNS])}" if len(runs) > 1 else f"run {runs[0]}"
     unnamed_count = len(runs) - _NAMED_RUNS
     return f"{named_runs} and {unnamed_count} more" if unnamed_count > 0 else named_runs
@@ -186,6 +187,7 @@ def build_datasheet(
             raise make_unknown_name_error(
                 f"channel of {recording.path}", channel, recorded_channels
             )
+    # Prepare the recording as for a diagnosis.
     recording = replace(recording, constants={**extended.constants, **recording.constants})
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)

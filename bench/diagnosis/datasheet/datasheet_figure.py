@@ -317,6 +317,8 @@ def _draw_effects_not_shown(
 def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
     """Draw the description of the diagram next to it.
 
+    It has the break-away force, the load that moves the unpowered joint, and the friction laws.
+
     Args:
         figure: the page.
         diagram: the diagram.

@@ -183,7 +183,9 @@ class SheetSubject:
 
 
 def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject:
-    """Make the subject of a data sheet.
+    """Make the subject of a data sheet: a system, or a joint of a robot.
+
+    Effects belong to a joint if they act at it, at its actuators or at its channels.
 
     Args:
         kind: Simulator class of the system.
@@ -203,8 +205,8 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
     joint = joints[0] if joint is None else joint
     if joint not in joints:
         raise make_unknown_name_error(f"joint of robot {kind.name}", joint, joints)
-    subject_without_values = SheetSubject(kind, joint, frozenset())
+    subject_without_places = SheetSubject(kind, joint, frozenset())
     channels = {f"{kind_of}.{joint}" for kind_of in ("q", "qd", "tau")}
     return SheetSubject(
-        kind, joint, frozenset({joint, *subject_without_values.actuators, *channels})
+        kind, joint, frozenset({joint, *subject_without_places.actuators, *channels})
     )

@@ -141,9 +141,7 @@ class RunEvaluator:
     ) -> None:
         """Build the simulator with all observable effects, and prepare the runs as padded arrays.
 
-        An effect is included if the recorded channels and inputs can show it. `free` names
-        constants that are fitted like parameters. `candidates` are the names of the effects to
-        include; None means all that are observable.
+        An effect is included if the recorded channels and inputs can show it.
 
         Args:
             kind: class of the simulator.
@@ -152,7 +150,7 @@ class RunEvaluator:
             engine: name of the engine.
             extra: effects in addition to the registered library.
             free: names of constants to treat as parameters.
-            candidates: names of the available library effects; None for all that are applicable.
+            candidates: names of the library effects to include; None for all that are observable.
         """
         self.kind = kind
         self.recording = recording

@@ -242,6 +242,7 @@ class RunRanker:
             thetas = [information.model.fit.theta for information in self.information]
             whitened = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
             gaps = [other - one for one, other in combinations(whitened, 2)]
+            # A single model has no pair.
             gaps = gaps or [whitened[0] - whitened[0].mean()]
             size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
             differences.append(size if np.isfinite(size) else -np.inf)

@@ -190,9 +190,11 @@ class RigLimits:
                 bounds[name] = _widen_by_stop(
                     stated_channels[name], (low, high), name.startswith("q.")
                 )
+            # 3. Ranges of the recorded runs, widened.
             elif name.startswith("q."):
                 bounds[name] = _widen_range(low, high, scales[name])
             else:
+                # A joint that hardly moved may be as fast as a share of the fastest joint.
                 kind = name.partition(".")[0]
                 largest = max(
                     max(map(abs, limit))

@@ -455,7 +455,9 @@ def _get_physical_limits(parameter: Parameter) -> Bounds:
 
 
 def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
-    """Return the next wider range of a parameter.
+    """Return the next wider range of a parameter, which is at most as wide as its limits.
+
+    The sign of the range is kept: only a range with negative values grows below zero.
 
     Args:
         parameter: the parameter with its present range.

@@ -124,14 +124,17 @@ class Columns:
         return replace(self, probes=probes, places=self.places[indices], sizes=self.sizes[indices])
 
     def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
-        """Return the sum of the inputs of the chosen candidates.
+        """Return the sum of the inputs of the chosen candidates, each times its coefficient.
+
+        Columns are stored for a trial coefficient, so they are divided by its size.
 
         Args:
             chosen: indices of probes.
             coefficients: coefficient of each chosen probe.
 
         Returns:
-            Forces and controls (R, T - 1, E + nu), and ψ (R, T, C).
+            Missing forces and changes of the controls (R, T - 1, E + nu), and changes ψ of the
+            readings (R, T, C).
         """
         columns = self.places[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
@@ -495,6 +498,7 @@ class FollowedRuns:
                 column_by_key[key] = len(effects)
                 effects.append((effect, c))
             column_indices.append(column_by_key[key])
+        # Inputs to the states and to the readings, by run.
         run_count, samples, channels = self.runs.residuals.shape
         inputs = self.runs.inputs.shape[3]
         pushed = np.zeros((run_count, samples - 1, inputs, len(effects)), dtype=np.float32)

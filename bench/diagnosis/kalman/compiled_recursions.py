@@ -156,6 +156,7 @@ def run_filter(
                     for d in range(c + 1):
                         value += crossed[z, d] * inverse[c, d]
                     half[z, c] = value
+            # Innovation, whitened innovation, and its share of the log-likelihood.
             for c in range(channels):
                 value = residuals[run, i, c]
                 for z in range(size):
@@ -168,6 +169,7 @@ def run_filter(
                     whiteners[run, i, c, d] = inverse[c, d]
                 w[c] = value
                 total -= np.log(root[c, c]) + 0.5 * value * value
+            # K = half W
             for z in range(size):
                 for c in range(channels):
                     value = 0.0
@@ -176,6 +178,7 @@ def run_filter(
                     gains[run, i, z, c] = value
             if i + 1 == samples:
                 break
+            # Update the state and its covariance by the reading.
             for z in range(size):
                 for c in range(channels):
                     x[z] += half[z, c] * w[c]
@@ -185,6 +188,7 @@ def run_filter(
                     for c in range(channels):
                         value += half[z, c] * half[y, c]
                     p[z, y] -= value
+            # Predict the next state and its covariance.
             a = states[run, i]
             for z in range(size):
                 value = -defects[run, i, z]
@@ -281,7 +285,7 @@ def run_smoother(
             h, whitener = readings[run, i], whiteners[run, i]
             multiply_sparse(whitener, h, weighed)
             if i + 1 < samples:
-                # closed = I - K H
+                # Carry λ and Λ from the next sample to this one; closed = I - K H.
                 multiply_sparse(gains[run, i], h, closed)
                 for z in range(size):
                     for y in range(size):
@@ -299,6 +303,7 @@ def run_smoother(
                 for z in range(size):
                     for y in range(size):
                         information[z, y] = spread[z, y]
+            # Add what the reading of this sample says.
             for c in range(channels):
                 value = 0.0
                 for d in range(channels):
@@ -318,6 +323,7 @@ def run_smoother(
                 smoothed[run, i, z] = value  # (6)
             if i == 0:
                 break
+            # Missing force between the previous sample and this one, and its share of (7).
             g = forces[run, i - 1]
             for e in range(count):
                 pushed, known = 0.0, 0.0

@@ -339,6 +339,7 @@ class _CubatureFilters:
         has_failed = np.zeros(len(mean), dtype=bool)
         intervals: list[tuple[Array, ...]] = []
         added_covariance = ADDED_VARIANCE * np.eye(size)
+        # Forward: update by the readings of a sample, then propagate to the next one.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._mujoco_batch.write_effects(self._acting)
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
@@ -352,6 +353,7 @@ class _CubatureFilters:
                 )
                 has_failed |= ~np.isfinite(ends).all(axis=(1, 2))
                 ends[has_failed] = 0.0
+                # Moments of the propagated points.
                 predicted = ends.mean(axis=1)
                 deviations = ends - predicted[:, None]
                 predicted_covariance = deviations.swapaxes(1, 2) @ deviations / ends.shape[1]
@@ -365,6 +367,7 @@ class _CubatureFilters:
                 self._knots.size - 1, mean, covariance
             )
             log_likelihood += log_likelihood_gain
+            # Backward: correct each filtered state by what later readings say.
             for (
                 filtered_mean,
                 filtered_covariance,
@@ -406,6 +409,7 @@ class _CubatureFilters:
         innovation_covariance = observed_covariance[:, :, rows] * is_recorded[
             :, None, :
         ] + variances[:, :, None] * np.eye(len(rows))
+        # Kalman gain: covariance with the readings times the inverse of the readings' covariance.
         gain = _solve(innovation_covariance, observed_covariance).swapaxes(1, 2)
         _, log_determinant = np.linalg.slogdet(innovation_covariance)
         weighted = _solve(innovation_covariance, residual[..., None])[..., 0]

@@ -246,6 +246,7 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
         1.0 - np.square(noise.phi[coloured_channels])
     )
     forces[:, :, noise_states, runs.forces.shape[3] + np.arange(noise_count)] = innovation_sigmas
+    # A reading contains the noise state of its channel.
     readings = np.concatenate(
         [runs.readings, np.zeros((run_count, samples, channels, noise_count))], axis=3
     )

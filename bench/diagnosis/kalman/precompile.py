@@ -13,7 +13,10 @@ from sims.effects.compiled_recursions import LINEAR, run_recursion
 
 
 def precompile() -> None:
-    """Run the recursions of tiny examples, so that their code is compiled and stored."""
+    """Run the recursions of tiny examples, so that their code is compiled and stored.
+
+    Otherwise the first command would wait for the compiler.
+    """
     states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
     runs = LinearRuns(
         states=states,

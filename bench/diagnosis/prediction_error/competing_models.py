@@ -136,6 +136,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         best = select_more_likely(best, fit_filtered(context, trial))
         if search_control.is_over():
             break
+    # All servos together.
     if friction is None and not is_explained(context, best) and not search_control.is_over():
         check_filter(context, larger_sets[0].followed.log_likelihood)
         best = select_more_likely(best, _fit_all_servos(context))

@@ -289,6 +289,7 @@ def is_friction_sufficient(
         if np.array_equal(stateless_theta, start.theta)
         else filters.log_likelihood(start.theta)
     )
+    # The ratio is twice the difference of log-likelihoods.
     if (
         not max(stiff_log_likelihood, soft_log_likelihood)
         > selected_log_likelihood - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO

@@ -192,6 +192,7 @@ class EffectProposals:
             float(np.abs(linear_run.trajectory.v[:, joint]).max()) for linear_run in followed.linear
         )
         interval = float(np.median(np.diff(evaluator.runs[0].times)))
+        # Sizes to try if the data give none.
         typical = {
             **dict.fromkeys(COMMAND_MODEL, FIRST_LAG_INTERVALS * interval),
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
@@ -209,7 +210,7 @@ class EffectProposals:
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 proposals.append((gain, name, np.array([change])))
-        proposals.sort(key=lambda linear_run: -linear_run[0])
+        proposals.sort(key=lambda proposal: -proposal[0])
         return [(name, c) for _, name, c in proposals]
 
     def compute_largest_gain_of_others(self, friction: str) -> float:

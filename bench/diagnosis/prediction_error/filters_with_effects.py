@@ -374,6 +374,8 @@ class ModelFilters:
     ) -> FilteredSet:
         """Follow the runs with effects in the model, and improve their coefficients.
 
+        Filters of the latest parameters are kept, because sets of effects are often tried again.
+
         Args:
             theta: (P,) initial parameters.
             names: names of the effects.

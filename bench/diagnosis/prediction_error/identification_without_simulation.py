@@ -145,6 +145,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         if larger is None:
             break
         current, gains = _prune_set(context, larger)
+        # The new effect was removed at once.
         if larger.names[-1] not in current.names:
             break
     if not current.names or not current.followed.has_missing_force:
@@ -292,6 +293,7 @@ def _prune_set(
         theta[context.evaluator.coefficient_slices[name]] = 0.0
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
+    # The other coefficients may have moved.
     if lost_gain > 2.0 * MIN_STEP_GAIN:
         return _prune_set(context, _fit_set(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains

@@ -162,6 +162,7 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
                 for present, added in zip(inactive_masks, drive.masks, strict=True)
             ]
             continue
+        # A column shows when this drive is off.
         runs, texts = apply_drive_switches(recording.path, runs, switches)
         switch_lines = " and ".join(switch.line for switch in switches)
         description = recording.path.with_suffix(".toml").name
@@ -288,6 +289,7 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
         for joint_index, joint in enumerate(robot.joints)
     }
     joints = [joint_index for joint_index, actuator_names in actuators.items() if actuator_names]
+    # First each drive alone, then a brake on all joints.
     drives = []
     for joint in joints:
         intervals = _Intervals(forces, [joint], OFF)
@@ -301,6 +303,7 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
             joint=robot.joints[joint].name,
             actuators=actuators[joint],
             is_held=intervals.state == HELD,
+            # From every k-th sample to all samples.
             masks=tuple(
                 np.repeat(mask, sample_stride)[: run.times.size]
                 for mask, run in zip(intervals.masks, recording.runs, strict=True)
@@ -409,6 +412,7 @@ class _Intervals:
             and sum(hypothesis_error_inside) <= MAX_RESIDUAL_SHARE * sum(drive_error_inside)
         ):
             return empty_masks
+        # Single intervals.
         typical_speeds = [
             _compute_magnitude(
                 np.concatenate([f.velocity[m, j] for f, m in self._pair_with_forces(active_masks)])

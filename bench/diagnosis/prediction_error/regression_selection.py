@@ -509,6 +509,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     for _ in range(MAX_REGRESSIONS):
         regression = first or regress(refitted, columns, selected_before, coefficients, numerics)
         first = None
+        # Drop effects that are not needed any more, and add others.
         selected = regression.prune(selected_before) if selected_before else []
         selected = regression.select(MAX_SET_SIZE, selected)
         _, new_coefficients = regression.solve(selected)

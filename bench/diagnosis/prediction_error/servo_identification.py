@@ -193,6 +193,7 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
     final_fitter = _ServoFitter(context, all_runs)
     model = final_fitter.fit(final_fitter.simulate(model.theta, model.laws), FINAL_ITERATIONS)
     gains = final_fitter.compute_gains(model)
+    # Remove effects without a gain, and widen the ranges that their values left.
     theta = model.theta.copy()
     for name in set(model.effects) - set(gains):
         theta[evaluator.coefficient_slices[name]] = 0.0
@@ -330,7 +331,12 @@ class _ServoFitter:
         return self._join(model, improved_joints)
 
     def simulate(self, theta: Array, laws: Sequence[tuple[str, ...]]) -> ServoModel:
-        """Simulate the runs from the initial states of the base model."""
+        """Simulate the runs from the initial states of the base model.
+
+        Args:
+            theta: (P,) parameters.
+            laws: names of the effects at each joint, of which the model takes note.
+        """
         states = self.context.search.base_model.fit.initial_states[self.runs]
         thetas = np.tile(theta, (self.runs.size, 1))
         simulated = self._evaluator.simulate(thetas, self.runs, states)[:, :, self._channels]
@@ -383,7 +389,11 @@ class _ServoFitter:
         return blocks
 
     def _compute_difference(self, theta: Array, joint: int, index: int) -> float:
-        """Return the difference step of a parameter, away from its upper bound."""
+        """Return the step of a parameter for a difference quotient, away from its upper bound.
+
+        Base parameters are shares by which gains of the servo change, so 1 + parameter is their
+        size.
+        """
         low, high = self._evaluator.parameters[index].bounds
         is_share = index in self._base_parameters[joint]
         size = abs(1.0 + theta[index]) if is_share else max(abs(theta[index]), high - low)
@@ -507,6 +517,7 @@ class _ServoFitter:
             }
             if not chosen or self._evaluator.search_control.is_over():
                 break
+            # Start with the law alone, or with the parameters that were estimated together with it.
             theta, laws = model.theta.copy(), list(model.laws)
             for joint, trial in chosen.items():
                 laws[joint] = (*laws[joint], trial.name)
@@ -580,7 +591,7 @@ class _ServoFitter:
         return self.fit(self._join(model, dict.fromkeys(better, shared)), TRIAL_ITERATIONS)
 
     def _is_better(self, model: ServoModel, other: ServoModel, joint: int) -> bool:
-        """Return whether a model is better at a joint, each further law with enough gain."""
+        """Return whether a model is better at a joint; each law that it has more must gain."""
         added = max(len(model.laws[joint]) - len(other.laws[joint]), 0)
         return bool(model.costs[joint] < (1.0 - MIN_GAIN) ** added * other.costs[joint])
 
@@ -704,7 +715,9 @@ class _ServoFitter:
 
 
 def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
-    """Return the step (k,) of damped least squares.
+    """Return the step (k,) of damped (Levenberg-Marquardt) least squares.
+
+    A small part of the largest diagonal is added, too, for columns without any influence.
 
     Args:
         block: (m, k) derivatives of the samples.

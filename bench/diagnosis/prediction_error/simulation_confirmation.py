@@ -41,6 +41,7 @@ class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
     def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
+        """Return the p-value of a gain by its chi-squared law; no surrogates are simulated."""
         slot = self.search.evaluator.coefficient_slices[effect]
         return compute_p_value_of_gain(
             gain, slot.stop - slot.start, len(self.search.evaluator.library)

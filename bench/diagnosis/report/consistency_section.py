@@ -94,6 +94,9 @@ def name_missing_physics(
 ) -> str:
     """Name the effect that would explain a trend, or else the dependence itself.
 
+    For example, dry friction that increases with speed means that friction that grows with speed is
+    missing. If that effect is in the model already, the text is ``friction that depends on speed``.
+
     Args:
         number: Name of the parameter; for a coefficient of a cause, it includes the effect.
         kind: Category of the covariate.
@@ -105,6 +108,7 @@ def name_missing_physics(
     family = next((law for law, prefix in LAW_PREFIXES.items() if base_name.startswith(prefix)), "")
     explanation = MISSING_PHYSICS_NAMES.get((family, kind), "")
     text = explanation if isinstance(explanation, str) else explanation[0 if is_increasing else 1]
+    # The text ends with the name of the effect in parentheses.
     effect = text.partition("(")[2].rstrip(")")
     if not text or any(known_effect.partition("@")[0] == effect for known_effect in known_effects):
         return f"{LAW_NAMES.get(family, 'something')} that depends on {name}"

@@ -430,6 +430,7 @@ def _format_set(report: DiagnosisReportData, cause: Cause) -> str:
 
 
 def _format_units(report: DiagnosisReportData) -> str:
+    """List the units of the channels; 1 for a channel without a unit."""
     units = [format_unit(channel.unit) or "1" for channel in report.channels]
     # A robot has many channels, so each unit is listed once.
     return sanitise(joined(list(dict.fromkeys(units)) if is_robot(report) else units), 100)

@@ -167,6 +167,8 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
 def _separate_identifiable(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
     """Separate effects that are identifiable at every place from all others.
 
+    The others come first in the report; they need the reader's attention.
+
     Returns:
         Rows of the other effects, and rows of effects that are identifiable at every place.
     """
@@ -178,7 +180,7 @@ def _separate_identifiable(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]
 
 
 def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
-    """Build a matrix for each kind of place."""
+    """Build a matrix of effects and places for each kind of place, such as joints."""
     kinds = dict.fromkeys(get_place_kind(row.effect) for row in rows)
     return [
         _build_matrix([row for row in rows if get_place_kind(row.effect) == kind], kind)

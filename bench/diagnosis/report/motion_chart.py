@@ -179,6 +179,7 @@ def _format_rows(
     # A thousandth of a step shows whether time stamps have jitter.
     decimals = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
     count = len(rows)
+    # Columns: run, channel, time, signals, and residuals in units of the noise.
     texts = [[sanitise(split.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
     texts.append(_format_numbers(times[rows], decimals))
     texts += [_format_numbers(values[rows], digits) for values in (observed, *simulated)]

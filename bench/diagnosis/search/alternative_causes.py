@@ -18,7 +18,7 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.search.coefficient_start_values import generate_frequency_neighbours
+from bench.diagnosis.search.coefficient_start_values import generate_shifted_starts
 from bench.diagnosis.search.effect_search import FAR_EXCESS, EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
@@ -62,7 +62,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
     # 2. Neighbouring frequencies.
-    neighbour_starts = list(generate_frequency_neighbours(search.evaluator, model.fit))
+    neighbour_starts = list(generate_shifted_starts(search.evaluator, model.fit))
     # Periodic effects have dozens of local minima.
     if neighbour_starts:
         search.refit_from_segments(effect_count)

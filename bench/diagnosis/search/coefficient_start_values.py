@@ -303,9 +303,7 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
             yield coefficients
 
 
-def generate_frequency_neighbours(
-    evaluator: RunEvaluator, fit: TrajectoryFit
-) -> Iterator[FitStart]:
+def generate_shifted_starts(evaluator: RunEvaluator, fit: TrajectoryFit) -> Iterator[FitStart]:
     """Yield starts with shifted frequencies, periods, event times and end stops.
 
     Least squares stops at the nearest of the many local minima that such effects have, so fits

@@ -271,6 +271,7 @@ class EffectSearch(ModelMoves):
             self._segment_search.refit_models(
                 [FitStart((), self.base_model.fit.theta, segment_evaluator.initial_state_guesses)]
             )
+        # Search on segments, then refit its best models to whole runs.
         segment_search = self._segment_search
         segment_search.refit_extensions(
             select_beam(segment_search, size - 1), MAX_REFITTED_CANDIDATES

@@ -78,6 +78,9 @@ class RandomSearch:
     ) -> None:
         """Begin with the smoothed states, whose deviates are normalised by their covariances.
 
+        Initial states are sampled as mean plus root times deviate, so deviates are standard normal
+        at first.
+
         Args:
             evaluator: Run evaluator of the recording.
             sigma: (C,) standard deviation of the noise of each channel.
@@ -193,7 +196,11 @@ class RandomSearch:
         return deviates, np.where(np.isfinite(costs), costs, np.inf)
 
     def _move_covariance(self, run: int, deviates: Array, costs: Array) -> None:
-        """Take the covariance of the best deviates (N, M, s) about the best one."""
+        """Take the covariance of the best deviates (N, M, s) about the best one.
+
+        A share of the previous covariance is kept. N values of the parameters are combined with M
+        initial states with s components.
+        """
         order = np.argsort(costs, axis=None)[:BEST_STATES]
         differences = deviates.reshape(-1, deviates.shape[2])[order] - self._deviates[run]
         covariance = differences.T @ differences / len(order)

@@ -212,8 +212,10 @@ def _predict_jacobian(
     """Return the approximate Jacobian of a model with one more effect, from known derivatives.
 
     A fit that starts with it needs no simulations for its first Jacobian. It consists of the
-    Jacobian of the model and the directions of the effect. Return None if these do not contain all
-    coefficients.
+    Jacobian of the model and the directions of the effect. Columns of simpler effects that the new
+    one contains are dropped, since it replaces them. Return None if the directions do not contain
+    all coefficients: none for shape coefficients, such as frequencies, whose range does not contain
+    zero.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.

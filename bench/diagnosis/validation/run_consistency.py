@@ -184,6 +184,7 @@ def _compute_motion_covariates(
 
 
 def _varies_between_runs(values: Array) -> bool:
+    """Return whether a covariate differs enough between runs to test a trend with it."""
     return bool(
         np.isfinite(values).all() and np.ptp(values) > MIN_RELATIVE_VARIATION * np.abs(values).max()
     )
@@ -365,6 +366,7 @@ def _find_trend_covariate(
         grouping: the groups of runs, such as logs.
         consistency: estimates of the parameter from each group.
     """
+    # Groups by a constant.
     if grouping.by not in ("run", "log"):
         if consistency.trend is None or consistency.trend.p_value >= SIGNIFICANCE_LEVEL:
             return None
@@ -453,6 +455,7 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
                 tuple(i for i, v in enumerate(values) if v == unique_value)
                 for unique_value in unique_values
             )
+            # Runs with an equal value of the constant, such as a load, form a group.
             yield _RunGrouping(
                 name,
                 tuple(f"{unique_value:g}" for unique_value in unique_values),

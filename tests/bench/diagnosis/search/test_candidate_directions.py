@@ -22,8 +22,8 @@ from bench.diagnosis.search.coefficient_start_values import (
     MAX_EVENT_TIME_SUBDIVISIONS,
     REFIT_STIFFNESS_FACTORS,
     generate_event_times,
-    generate_frequency_neighbours,
     generate_neighbouring_end_stops,
+    generate_shifted_starts,
 )
 from bench.diagnosis.search.score_test import ScoreTest
 from sims.core.simulator import Scenario
@@ -266,7 +266,7 @@ def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
     theta = fit.theta.copy()
     theta[there.coefficient_slices["state.limit"]] = [40.0, 0.5 * high, 0.1]
     starts = list(
-        generate_frequency_neighbours(there, replace(fit, effects=("state.limit",), theta=theta))
+        generate_shifted_starts(there, replace(fit, effects=("state.limit",), theta=theta))
     )
     stops = np.array([s.theta[there.coefficient_slices["state.limit"]] for s in starts])
     np.testing.assert_allclose(stops[:, 0] / 40.0, REFIT_STIFFNESS_FACTORS)

@@ -46,7 +46,7 @@ def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_re
         search.models[frozenset("b")] = model("b", likelihood=110.0)
 
     search.refit_models, search.refit_extensions = refit, lambda models, max_effects: None
-    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
+    monkeypatch.setattr(settling, "generate_shifted_starts", lambda evaluator, fit: [])
     monkeypatch.setattr(
         settling,
         "assess_lack_of_fit",
@@ -81,7 +81,7 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
         lambda s, noise: begun.extend(s),
         lambda models, max_effects: None,
     )
-    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
+    monkeypatch.setattr(settling, "generate_shifted_starts", lambda evaluator, fit: [])
     left = SimpleNamespace(has_structure=False)
     monkeypatch.setattr(settling, "assess_lack_of_fit", lambda search, model: left)
     refine_best_model(search, best)
