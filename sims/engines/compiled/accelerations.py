@@ -45,20 +45,28 @@ from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
 
 def run_part(block: Block, part: int) -> None:
-    """Run one part of the force program on all slots in use.
+    """Run one part of the force program on all slots in use, which hold one element each.
+
+    Entries `part` and `part + 1` of `block.ends` are the bounds of its instructions.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         part: `CONSTANTS`, `FORCES` or `IMPACTS`.
     """
     run_instructions(block.code, block.ends[part], block.ends[part + 1], block.r, block.w)
 
 
 def evaluate_forces(block: Block) -> None:
-    """Copy every element's state to the registers and evaluate the forces.
+    """Copy time, position and velocity of every element to the registers, and compute its forces.
+
+    Afterwards register `block.out[k]` has the force on coordinate k, without dry friction.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     d = block.flags[DIMENSIONS]
     rows = block.rows
@@ -74,12 +82,18 @@ def evaluate_forces(block: Block) -> None:
 
 
 def begin_step(block: Block) -> None:
-    """Compute the accelerations at the beginning of a step, in rows K1.
+    """Compute the accelerations at the beginning of a step, in rows K1, by equations (1) to (3).
 
-    This also determines which elements stick, and the direction of motion of the others.
+    The forces must be evaluated before. Three results are constant during the step, so that the
+    step is smooth: which elements stick (dry friction holds them at rest), the direction of motion
+    of the others, and the excess, the pulling force minus the limit of dry friction. Friction acts
+    on the first coordinates only; systems without friction, and those with one such coordinate,
+    have faster versions.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     if block.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(block, K1)
@@ -116,12 +130,15 @@ def begin_step(block: Block) -> None:
 
 
 def begin_step_1d(block: Block) -> None:
-    """Compute `begin_step` for dry friction on one coordinate, the first; no ground.
+    """Do the work of `begin_step` if dry friction acts only on the first coordinate.
 
-    The numbers are the same; there are no branches, so that the loops over slots are vectorised.
+    There is no ground. The numbers are the same. All cases are computed and one is selected, without branches, so that
+    the compiler can vectorise the loop over slots.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     r = block.r
@@ -150,15 +167,18 @@ def begin_step_1d(block: Block) -> None:
 
 
 def compute_acceleration(block: Block, row_of_result: int, friction_row: int) -> None:
-    """Compute the accelerations of all slots within the present step, with dry friction.
+    """Compute the accelerations of all slots at a later stage of a Runge-Kutta step.
 
-    A slot is a column of the buffers that holds one batch element. The force program runs for
-    all slots together; friction is then computed by the number of coordinates.
+    The registers hold the time, positions and velocities of that stage. The force program runs for
+    all slots together, then dry friction is subtracted: `begin_step` determined which elements
+    stick, and the direction of friction for the others.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
-        row_of_result: first row of the accelerations.
-        friction_row: first row of dry friction.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        row_of_result: first row of `block.a` for the accelerations, one of K2, K3 and K4.
+        friction_row: first row of `block.a` for the dry friction, one of F2, F3 and F4.
     """
     run_part(block, FORCES)
     if block.flags[HAS_FRICTION] == 0:
@@ -172,10 +192,15 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
 
 
 def compute_acceleration_1d(block: Block, row_of_result: int, friction_row: int) -> None:
-    """Compute `compute_acceleration` for dry friction on one coordinate, the first; no ground.
+    """Do the work of `compute_acceleration` if friction acts only on the first coordinate.
+
+    This is for systems without ground. It also stores the excess of the pulling force over the
+    friction limit at the end of the step, from which a break-away is detected.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
@@ -198,7 +223,9 @@ def compute_further_coordinates(block: Block, row_of_result: int, friction_row: 
     """Compute the accelerations of the coordinates after the first, which have no dry friction.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
@@ -212,10 +239,15 @@ def compute_further_coordinates(block: Block, row_of_result: int, friction_row: 
 
 
 def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_row: int) -> None:
-    """Compute `compute_acceleration` for an element of several coordinates.
+    """Compute one element's acceleration if friction acts on several coordinates, or with ground.
+
+    Friction points against the velocity of this stage, unless that has reversed since the beginning
+    of the step; then it keeps its side. An element that sticks has zero acceleration.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
@@ -228,10 +260,10 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
     a[EXCESS_AFTER, i] = compute_norm(a, row_of_result, friction_coordinate_count, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
-    square = 0.0
+    squared_speed = 0.0
     for k in range(friction_coordinate_count):
-        square += block.r[velocity + k, i] * block.r[velocity + k, i]
-    speed = np.sqrt(square)
+        squared_speed += block.r[velocity + k, i] * block.r[velocity + k, i]
+    speed = np.sqrt(squared_speed)
     projection = 0.0
     for k in range(friction_coordinate_count):
         direction = a[DIRECTION + k, i]
@@ -250,10 +282,15 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
 def compute_acceleration_without_friction(
     block: Block, i: int, row_of_result: int, friction_row: int
 ) -> None:
-    """Convert forces to accelerations for the coordinates without dry friction.
+    """Divide forces by the mass, for the coordinates without dry friction.
+
+    Dry friction acts on the first coordinates only, those along guides or along the ground. The
+    rows of friction and of its direction are zero for the others.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations, which contains the forces before.
         friction_row: first row of dry friction.
@@ -266,10 +303,14 @@ def compute_acceleration_without_friction(
 
 
 def compute_force_without_friction(block: Block, i: int, row_of_result: int) -> None:
-    """Compute all forces except dry friction, without the part that the ground supports.
+    """Copy the forces on an element, except dry friction, from the registers to rows of `block.a`.
+
+    If the element rests on the ground, which balances its weight, a downward force counts as zero.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the forces.
     """
@@ -283,10 +324,14 @@ def compute_force_without_friction(block: Block, i: int, row_of_result: int) -> 
 
 
 def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
-    """Compute accelerations without dry friction, in rows `row_of_result`.
+    """Compute the accelerations of all slots if the system has no dry friction: force / mass.
+
+    If an element rests on the ground, which balances its weight, a downward force counts as zero.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
     """
     a = block.a

@@ -43,13 +43,15 @@ class ArrayFunctions:
         shapes: Mapping[Callable[..., None], Sequence[str]],
         can_run_uncompiled: bool = False,
     ) -> None:
-        """Store what is compiled; nothing is compiled before the first use.
+        """Store which functions to compile; compilation happens at their first use.
 
         Args:
             module: name of the module, which holds this object under the name ``COMPILED``.
             description: what is compiled, for messages to the user.
-            shapes: shapes of the arguments of each function (`data_layout`). A function with one
-                parameter receives them as one tuple, whose class is its annotation.
+            shapes: shapes of the arguments of each function, one letter for each dimension. Equal
+                letters are equal sizes, and ``#`` marks integers (see `data_layout`). A function
+                with one parameter receives all arguments as one tuple, whose class is its
+                annotation.
             can_run_uncompiled: whether the functions run as Python where llvmlite is not installed,
                 a hundred times slower.
         """
@@ -59,9 +61,11 @@ class ArrayFunctions:
         self._compiled: Callable[..., None] | None = None
 
     def call(self, function: Callable[..., None], *arguments: Any) -> list[Array]:
-        """Run a function, and return its last arguments: those that are not given.
+        """Run a function on the given arguments, and return the arrays that it fills in.
 
-        They begin as zeros; the compiled functions themselves allocate no memory.
+        Compiled functions cannot allocate memory. So the arrays for the results, which are the last
+        parameters of a function, are allocated here, with zeros. Their sizes follow from the
+        letters that the shapes of the given arguments have in common with theirs.
 
         Args:
             function: one of the functions.
@@ -72,15 +76,18 @@ class ArrayFunctions:
         """
         shapes = self._shapes[function]
         sizes = measure_arrays(shapes[: len(arguments)], arguments)
-        allocated = [
+        results = [
             np.zeros([int(a) if a.isdigit() else sizes[a] for a in shape])
             for shape in shapes[len(arguments) :]
         ]
-        self._bind(function, sizes, (*arguments, *allocated))()
-        return allocated
+        self._bind(function, sizes, (*arguments, *results))()
+        return results
 
     def bind(self, function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
-        """Return a function without arguments that runs a function on the memory of these arrays.
+        """Check the arguments of a function once, and return a call of it without arguments.
+
+        The call reads and writes the memory of these arrays, so it can be repeated cheaply after
+        their values have changed.
 
         Args:
             function: one of the functions.
@@ -89,16 +96,18 @@ class ArrayFunctions:
         Raises:
             ValueError: an array has another shape, type or memory layout than declared.
         """
-        # The compiled code does not check array bounds.
+        # Measuring checks the arrays; the compiled code itself does not check array bounds.
         return self._bind(function, measure_arrays(self._shapes[function], arguments), arguments)
 
     def _bind(
         self, function: Callable[..., None], sizes: Mapping[str, int], arguments: tuple[Any, ...]
     ) -> Callable[[], None]:
-        """Return a function that runs a function on measured arguments, see `bind`.
+        """Return a call of a function on arguments whose shapes are already checked, see `bind`.
 
-        The compiled function gets one array of integers: its number, the sizes, and the addresses
-        of arrays.
+        All functions are compiled into one entry (`make_entry`), which has a single argument: the
+        address of an array of integers. They are the number of the function, the sizes of its
+        arrays, and then each argument: the address of an array, or an integer itself. If llvmlite
+        is not installed, the Python function itself runs.
 
         Args:
             function: One of the functions of this object.
@@ -130,10 +139,18 @@ class ArrayFunctions:
         return self._compiled
 
     def make_entry(self) -> FunctionType:
-        """Make the function to be compiled: it reads the integers of `bind`, and calls a function.
+        """Generate the Python function that numba compiles: one entry for all functions.
 
-        The integers are the function, its sizes in the order of their letters, and the address of
-        each array.
+        Its source text is written here and executed. It reads the array of integers that `_bind`
+        makes (``words``): the number of the function, the sizes in the order of their letters, and
+        each argument. It turns addresses into arrays of these sizes, and calls the function. For
+        example, a function ``scale(x, k)`` of shapes ``n`` and ``#`` becomes::
+
+            def entry(address):
+                words = carray(address, (4,))
+                if words[0] == 0:
+                    n = words[1]
+                    scale(carray(to_real_pointer(words[2]), (n, )), words[3])
         """
         count = max(map(_count_words, self._shapes.values()))
         lines = ["def entry(address):", f"    words = carray(address, ({count},))"]
@@ -169,11 +186,12 @@ def _count_words(shapes: Sequence[str]) -> int:
 
 
 def _format_argument(shape: str, word: str) -> str:
-    """Return the expression of an argument in the entry.
+    """Return the source text with which the compiled entry reads one argument of a function.
 
     Args:
-        shape: its shape.
-        word: expression of its integer: the address of an array.
+        shape: shape of the argument: `INTEGERS` for an integer, otherwise an array.
+        word: source text of the number that the entry receives for it: the integer itself, or the
+            address of the array.
     """
     if shape == INTEGERS:
         return word
@@ -195,7 +213,9 @@ def get_address(array: Array) -> int:
 def load_stored(
     module: str, entry: str, description: str, pointers: int, constants: Mapping[str, int]
 ) -> Callable[..., None]:
-    """Return a function whose machine code is in a file of the cache, compiled if necessary.
+    """Return a function as machine code: from the user's cache, or compiled now and stored there.
+
+    A lock prevents that two threads compile the same function.
 
     Args:
         module: name of the function's module.
@@ -266,9 +286,10 @@ def _print_line(text: str) -> None:
 
 
 def make_cache_name(module: str, constants: Mapping[str, int]) -> str:
-    """Return the name of a file of the cache.
+    """Return the name of the cached file with the machine code of a module.
 
-    It has a hash of everything on which the code depends: sources, constants, compiler, processor.
+    The name contains a hash of everything on which the code depends: sources, constants, compiler
+    and processor. So a change of any of them leads to another file, and old code is never used.
 
     Args:
         module: name of the module.

@@ -47,7 +47,9 @@ def fly_elements(block: Block) -> None:
     element is loaded into slot 0 of the buffers.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     for order_index in range(block.order.size):
         load_element(block, 0, order_index)
@@ -60,36 +62,41 @@ def fly_elements(block: Block) -> None:
 
 
 def record_flight(block: Block) -> None:
-    """Record the states of the element at all sample times.
+    """Record the states of the element in slot 0 at all sample times.
 
-    The element in slot 0 moves on a parabola up to its next impact with the ground, and bounces
-    there.
+    It moves on a parabola up to its next impact with the ground. All impacts up to a sample time
+    are applied before that sample is recorded; without ground, the next impact is at infinity.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     element = block.n[ELEMENT, 0]
+    # The step sizes have a single row if they are equal for all elements.
     row = element if block.steps.shape[0] > 1 else 0
     time = 0.0
-    impact = compute_impact_time(block)
+    impact_time = compute_impact_time(block)
     for step in range(block.steps.shape[1] + 1):
         if step % block.steps_per_record == 0:
-            while impact <= time:
-                bounce(block, impact)
-                impact = compute_impact_time(block)
+            while impact_time <= time:
+                bounce(block, impact_time)
+                impact_time = compute_impact_time(block)
             record_arc(block, step // block.steps_per_record, time)
         if step < block.steps.shape[1]:
             time += block.steps[row, step]
 
 
 def record_arc(block: Block, record: int, time: float) -> None:
-    """Record the state of slot 0 on its present parabola at a time, by (1) and (2).
+    """Record position, velocity and acceleration at a time on the present parabola of slot 0.
 
-    The position is x + v s + a s^2 / 2 and the velocity v + a s, with the time s since the
-    beginning of the parabola. The record is position, velocity and acceleration, D numbers each.
+    The position is x + v s + a s^2 / 2 (1) and the velocity v + a s (2), with the time s since the
+    beginning of the parabola. A record has D numbers each, for D coordinates.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         record: index of the record.
         time: seconds since the start of the run.
     """
@@ -108,11 +115,14 @@ def record_arc(block: Block, record: int, time: float) -> None:
 def compute_impact_time(block: Block) -> float:
     """Return the time of the next impact in seconds since the start; infinite if there is none.
 
-    From height H with upward speed u, s = (u + w) / g = 2 H / (w - u), w = sqrt(u^2 + 2 g H) (3);
-    the form without cancellation is used.
+    From height H with upward velocity u and downward acceleration g, it is s seconds away:
+    s = (u + w) / g = 2 H / (w - u), w = sqrt(u^2 + 2 g H) (3). Of these two equal forms, the one
+    that does not subtract nearly equal numbers is used.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     if block.flags[BOUNCES] == 0:
         return np.inf
@@ -120,32 +130,34 @@ def compute_impact_time(block: Block) -> float:
     last = block.flags[DIMENSIONS] - 1
     height = a[X + last, 0] - a[FLOOR_LEVEL, 0]
     upward_velocity = a[V + last, 0]
-    down = -a[K1 + last, 0]
-    root = np.sqrt(
-        upward_velocity * upward_velocity + 2.0 * down * height
-    )  # NaN if it does not reach the ground
+    gravity = -a[K1 + last, 0]
+    # NaN if the element never reaches the ground.
+    root = np.sqrt(upward_velocity * upward_velocity + 2.0 * gravity * height)
     if upward_velocity < 0.0:
         seconds = 2.0 * height / (root - upward_velocity)  # (3)
     else:
-        seconds = (upward_velocity + root) / down if down > 0.0 else np.inf
-    return float(np.inf if seconds != seconds else a[T, 0] + seconds)
+        seconds = (upward_velocity + root) / gravity if gravity > 0.0 else np.inf
+    is_nan = seconds != seconds
+    return float(np.inf if is_nan else a[T, 0] + seconds)
 
 
-def bounce(block: Block, impact: float) -> None:
-    """Move the element to its impact and begin the parabola after it.
+def bounce(block: Block, impact_time: float) -> None:
+    """Move the element in slot 0 to its impact, and begin the parabola after the rebound.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
-        impact: time of the impact in seconds since the start of the run.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        impact_time: time of the impact in seconds since the start of the run.
     """
     a = block.a
     vertical = block.flags[DIMENSIONS] - 1
-    s = impact - a[T, 0]
+    s = impact_time - a[T, 0]
     for k in range(vertical + 1):
         acceleration = a[K1 + k, 0]
         a[X + k, 0] += s * (a[V + k, 0] + s * (0.5 * acceleration))  # (1)
         a[V + k, 0] += s * acceleration  # (2)
-    a[T, 0] = impact
+    a[T, 0] = impact_time
     a[X + vertical, 0] = a[FLOOR_LEVEL, 0]  # removes the rounding of (1) and (3)
     compute_rebound_velocity(block, 0, a[K1 + vertical, 0])
     compute_frictionless_acceleration(block, K1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import compress
 
 import numpy as np
 
@@ -11,7 +12,14 @@ from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
 from sims.engines.compiled.ballistic_motion import fly_elements
-from sims.engines.compiled.data_layout import BatchArrays, Block
+from sims.engines.compiled.data_layout import (
+    FLOOR,
+    GROUND_FRICTION,
+    MIN_REMAINING_SHARE,
+    RESTITUTION,
+    BatchArrays,
+    Block,
+)
 from sims.engines.compiled.element_stepping import step_elements
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 from sims.engines.compiled.kernel import COMPILED, integrate_elements
@@ -27,10 +35,12 @@ _MIN_ELEMENTS_PER_THREAD = 256
 def integrate_batch(
     batch: IntegrationBatch, max_phase: float, patience: float, jobs: int
 ) -> Trajectories:
-    """Integrate a batch on the compiled kernel.
+    """Integrate the motion of all elements of a batch in machine code.
 
-    Elements of uniform systems without forces or friction by effects fly in closed form; others
-    are stepped.
+    Elements with the same active effects have the same force program (see `force_program`), so
+    they are grouped by effects, and each group is integrated with its program. Where the force is
+    constant (a uniform system without effects that add force or friction), elements move on
+    parabolas in closed form; all others are integrated in steps.
 
     Args:
         batch: batch to integrate.
@@ -41,25 +51,29 @@ def integrate_batch(
     Returns:
         The trajectories.
     """
-    COMPILED.load()  # an error of the compiler is not an error of the system
-    whole = _make_arrays(batch, max_phase, patience)
+    # Loaded first, so that an error of the compiler is not reported as an error of the system.
+    COMPILED.load()
+    all_elements = _make_arrays(batch, max_phase, patience)
     for elements, effects in _group_by_effects(batch):
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
         columns = [batch.theta[elements], *(c[elements] for c in batch.constants.values())]
         columns += [c[:, elements, 0].T for _, c in effects]
         parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
-        arrays = whole._replace(order=elements.astype(np.int64), parameters=parameters)
-        is_uniform = batch.system.uniform and not any(
+        arrays = all_elements._replace(order=elements.astype(np.int64), parameters=parameters)
+        has_constant_force = batch.system.uniform and not any(
             isinstance(e, (Force, Friction)) for e, _ in effects
         )
-        _integrate_group(fly_elements if is_uniform else step_elements, program, arrays, jobs)
-    return Trajectories(*np.split(whole.records, 3, axis=2))
+        integrate = fly_elements if has_constant_force else step_elements
+        _integrate_group(integrate, program, arrays, jobs)
+    # A record is position, velocity and acceleration, one after the other.
+    return Trajectories(*np.split(all_elements.records, 3, axis=2))
 
 
 def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> BatchArrays:
-    """Convert a batch to the contiguous arrays that the kernel reads, without selected elements.
+    """Convert a batch to the contiguous arrays that the machine code reads.
 
-    If all elements have the same steps, one row of steps is stored for all of them.
+    No elements are selected yet (`order`, `queue` and `parameters` are empty); each group of
+    elements sets its own. If all elements have the same steps, one row of steps is stored for all.
 
     Args:
         batch: batch: system, initial states, inputs and effects of all elements.
@@ -67,11 +81,14 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
         patience: maximum number of steps of an element, as a multiple of the planned ones.
     """
     count, dimensions = batch.x.shape
-    shared = batch.steps.strides[0] == 0
-    steps = np.ascontiguousarray(batch.steps[:1] if shared else batch.steps, dtype=np.float64)
+    # A broadcast array, whose rows are the same memory, has a stride of zero.
+    are_steps_shared = batch.steps.strides[0] == 0
+    steps = np.ascontiguousarray(
+        batch.steps[:1] if are_steps_shared else batch.steps, dtype=np.float64
+    )
     ones = np.ones(count)
-    spans = steps.max(axis=1, initial=0.0) * ones
-    divisions = np.ceil(batch.system.fastest * spans / max_phase)
+    longest_steps = steps.max(axis=1, initial=0.0) * ones
+    divisions = np.ceil(batch.system.fastest * longest_steps / max_phase)
     record_count = steps.shape[1] // batch.steps_per_sample + 1
     return BatchArrays(
         order=np.zeros(0, dtype=np.int64),
@@ -82,7 +99,7 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
         v=np.ascontiguousarray(batch.v, dtype=np.float64),
         steps=steps,
         inputs=_stack_inputs(list(batch.inputs.values()), steps.shape[1]),
-        max_steps=spans,
+        max_steps=longest_steps,
         planned_counts=np.count_nonzero(steps, axis=1) * ones,
         divisions=np.clip(divisions, 1.0, MAX_STEP_DIVISIONS),
         ground=_get_ground_parameters(batch),
@@ -110,9 +127,9 @@ def _integrate_group(
     threads = min(jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
 
     def run(part: BatchArrays) -> None:
-        """Run one thread's part of the elements, in separate program buffers.
+        """Integrate one thread's part of the elements, with buffers of its own.
 
-        `program` and `function` are bound by the enclosing function.
+        The number of slots is at most the number of elements, rounded up to whole SIMD vectors.
 
         Args:
             part: Elements of one thread.
@@ -147,10 +164,11 @@ def _to_column(values: Array, count: int) -> Array:
 
 
 def _stack_inputs(values: list[Array], steps: int) -> Array:
-    """Return the inputs (U, L or 1, S), with one row if all elements share it.
+    """Return the inputs as one array (U, L, S), or (U, 1, S) if all elements have the same inputs.
 
     Args:
-        values: U inputs (L, S); those that all elements share have stride zero.
+        values: U inputs (L, S) in L elements and S steps. An input that is the same for all
+            elements is a broadcast array, whose first stride is zero.
         steps: number S of steps.
     """
     if not values:
@@ -161,10 +179,11 @@ def _stack_inputs(values: list[Array], steps: int) -> Array:
 
 
 def _get_ground_parameters(batch: IntegrationBatch) -> Array:
-    """Return the ground parameters (4, L), rows as in `sims.engines.compiled.data_layout`.
+    """Return the parameters (4, L) of the ground for each of L elements.
 
-    The rows are the height of the ground, restitution, friction coefficient, and the share of slip
-    that remains after an impact.
+    The rows are the height of the ground, the coefficients of restitution and friction, and the
+    minimum share of the tangential speed that remains after an impact. All are zero for systems
+    that do not bounce.
 
     Args:
         batch: Elements to integrate.
@@ -175,17 +194,20 @@ def _get_ground_parameters(batch: IntegrationBatch) -> Array:
     if system.bounces:
         friction = system.friction(batch.constants)
         grip = system.grip(batch.constants)
-        ground[0] = _to_column(system.floor(batch.constants), count)
-        ground[1] = _to_column(system.restitution(batch.theta), count)
+        ground[FLOOR] = _to_column(system.floor(batch.constants), count)
+        ground[RESTITUTION] = _to_column(system.restitution(batch.theta), count)
         if friction is not None:
-            ground[2] = _to_column(friction, count)
+            ground[GROUND_FRICTION] = _to_column(friction, count)
         if grip is not None:
-            ground[3] = 1.0 - _to_column(grip, count)
+            ground[MIN_REMAINING_SHARE] = 1.0 - _to_column(grip, count)
     return ground
 
 
 def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
-    """Group the elements by their active effects, since each group needs its own program.
+    """Group the elements by their active effects, since each group needs its own force program.
+
+    Only effects that are part of a force program count: forces, friction and contact laws. An
+    effect is active in an element if its coefficients there are not zero.
 
     Returns:
         Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
@@ -195,16 +217,14 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
     ]
     if not effects:
         return [(np.arange(len(batch.x)), [])]
+    # Row l: whether each effect acts in element l.
     patterns = np.stack([is_active(c)[:, 0] for _, c in effects], axis=1)
     # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
     if (patterns == patterns[0]).all():
-        groups = {0: np.arange(len(patterns))}
+        groups = [np.arange(len(patterns))]
     else:
         elements_of: dict[bytes, list[int]] = {}
         for element, pattern in enumerate(patterns):
             elements_of.setdefault(pattern.tobytes(), []).append(element)
-        groups = {members[0]: np.array(members) for members in elements_of.values()}
-    return [
-        (members, [pair for pair, is_on in zip(effects, patterns[first], strict=True) if is_on])
-        for first, members in groups.items()
-    ]
+        groups = [np.array(members) for members in elements_of.values()]
+    return [(members, list(compress(effects, patterns[members[0]]))) for members in groups]

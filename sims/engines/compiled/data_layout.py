@@ -18,10 +18,16 @@ INTEGERS = "#"
 
 
 def measure_arrays(shapes: Sequence[str], arguments: Sequence[Any]) -> dict[str, int]:
-    """Return the sizes of arrays by the letters of their shapes.
+    """Check arrays against declared shapes, and return the size that each letter stands for.
+
+    A shape has one character for each dimension: a digit is a fixed size, and equal letters must
+    have equal sizes in all arrays. For example, ``ld`` and ``l`` are an array (l, d) and another
+    one with the same number l of rows. A prefix ``#`` marks integers instead of floating-point
+    numbers; ``#`` alone is an integer argument, which is skipped. The machine code relies on this
+    check, since it does not check array bounds.
 
     Args:
-        shapes: shapes of the arrays.
+        shapes: shapes of the arguments.
         arguments: arrays, and integers where the shape is `INTEGERS`.
 
     Raises:
@@ -269,19 +275,21 @@ class InputNames(NamedTuple):
 
 
 def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> IntTable:
-    """Return `ProgramArrays.flags` of a system with these effects.
+    """Return `ProgramArrays.flags`: integers from which compiled code skips what is not needed.
 
-    The compiled code reads these integers to skip parts that a system does not need.
+    `system.bends` is true if its own force may change sharply, as with hidden states such as a
+    motor's current. `system.guided` is the number of coordinates, from the first, on which dry
+    friction acts; zero stands for all.
 
     Args:
         system: System that is integrated.
         names: Names and numbers of its coordinates and inputs.
         effects: Effects that act on it.
     """
-    has_friction, has_forces = (
-        any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
-    )
+    has_friction = any(isinstance(effect, Friction) for effect in effects)
+    has_forces = any(isinstance(effect, Force) for effect in effects)
     friction_coordinate_count = system.guided or names.coordinates
+    # In the order of the constants from DIMENSIONS to HAS_HIDDEN_STATES.
     flags = (
         names.coordinates,
         has_friction,
@@ -308,17 +316,22 @@ def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
 
 
 def check_block(block: Block) -> None:
-    """Check that the arrays of a block belong together, because machine code does not check them.
+    """Check that the arrays of a block match, because machine code does not check array bounds.
+
+    First their shapes must agree with `BLOCK_SHAPES`. Then the registers of the program must have
+    room for the inputs, the records for all sample times, every selected element must exist, and
+    instructions may use only existing registers.
 
     Raises:
         ValueError: an array is not as specified.
     """
     sizes = measure_arrays(BLOCK_SHAPES, block)
     d, elements, steps, rows = sizes["d"], sizes["l"], sizes["t"], block.rows
-    groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
+    # Numbers of registers for positions, inputs and parameters. They are consecutive groups.
+    register_counts = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
     record_sizes = steps // block.steps_per_record + 1, 3 * d
     if (
-        groups != (d, sizes["u"], sizes["p"])
+        register_counts != (d, sizes["u"], sizes["p"])
         or (sizes["y"], sizes["z"]) != record_sizes
         or (sizes["q"], sizes["a"], sizes["n"]) != (11, NUMBER_ROW_COUNT, STATE_ROW_COUNT)
         or not {sizes["j"], sizes["k"]} <= {1, elements}
@@ -330,11 +343,14 @@ def check_block(block: Block) -> None:
 
 
 def uses_registers(code: IntTable, count: int) -> bool:
-    """Return whether the instructions (n, 5) use only the first `count` registers.
+    """Return whether all instructions use only existing registers.
+
+    Calls of external functions are not checked: their arguments are addresses, not registers.
 
     Args:
-        code: (n, 5) instructions.
+        code: (n, 5) instructions: operation, register of the result, registers of arguments.
         count: number of registers.
     """
     is_external = code[:, 0] == EXTERNAL
+    # The initial values are those for a program without instructions.
     return bool(code.min(initial=0) >= 0 and code[~is_external, 1:].max(initial=-1) < count)

@@ -37,10 +37,13 @@ from sims.engines.compiled.data_layout import (
 def load_element(block: Block, i: int, order_index: int) -> None:
     """Load an element into a slot, at the beginning of its run.
 
-    A slot is a column of the buffers. It takes the next element when its element has finished.
+    A slot takes the next element when its element has finished. All its numbers are reset to zero,
+    except the few that have another initial value.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         order_index: index of the element in `block.order`.
     """
@@ -71,10 +74,14 @@ def load_element(block: Block, i: int, order_index: int) -> None:
 
 
 def set_inputs(block: Block, i: int) -> None:
-    """Set the inputs of the element's step; after the last step, those of the last step.
+    """Copy the inputs of an element's present step to the registers of the force program.
+
+    After the last step, they are those of the last step.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     first = block.rows[IN_U]
@@ -85,14 +92,20 @@ def set_inputs(block: Block, i: int) -> None:
 
 
 def record_and_check_remaining(block: Block, i: int) -> bool:
-    """Record the state of an element that begins a step at a sample time.
+    """Record the state of an element at a sample time, and return whether it has further steps.
+
+    It is called before every attempt of a step. Nothing is recorded unless a planned step begins
+    there (a step may be divided). An element that needs more attempts than `PATIENCE` allows is
+    abandoned: its last record becomes NaN, by which the caller recognises the failure.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
 
     Returns:
-        Whether the element has further steps.
+        False if the element is finished or abandoned.
     """
     a = block.a
     n = block.n
@@ -106,7 +119,6 @@ def record_and_check_remaining(block: Block, i: int) -> bool:
     if block.limits[PATIENCE] < np.inf and a[REMAINING_TIME, i] > 0.0:
         a[STEP_COUNT, i] += 1.0
         if a[STEP_COUNT, i] > block.limits[PATIENCE] * block.planned_counts[n[ELEMENT, i]]:
-            # Failed elements are recognised by their last recorded state.
             block.records[n[ELEMENT, i], block.records.shape[1] - 1, :] = np.nan
             return False
     return True
@@ -116,7 +128,9 @@ def record_state(block: Block, i: int, record: int) -> None:
     """Record position, velocity and acceleration of the element in slot i.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         record: index of the record.
     """
@@ -132,10 +146,14 @@ def record_state(block: Block, i: int, record: int) -> None:
 def next_step(block: Block, i: int) -> None:
     """Begin the next planned step of the element in slot i, with the inputs of that step.
 
-    A planned step is one of the batch's steps; it may be divided at events such as impacts.
+    A planned step is one of the batch's steps; it may be divided at events such as impacts. The
+    time is set to the sum of the planned steps, which removes the rounding of divided ones. After
+    the last planned step, the remaining time is zero.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

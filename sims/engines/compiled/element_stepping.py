@@ -89,24 +89,30 @@ from sims.engines.compiled.events import (
     FORCE_NONLINEARITY_TOLERANCE,
     FRICTION_NONLINEARITY_TOLERANCE,
     NEGLIGIBLE_ACCELERATION_SHARE,
-    detect_event,
+    detect_and_schedule_event,
     handle_event,
     handle_impact,
-    is_too_nonlinear,
+    shorten_if_nonlinear,
 )
 from sims.engines.compiled.interpreter import nan_maximum
 from sims.engines.compiled.step_size import choose_step_divisions, queue_by_divisions
 
 
 def step_elements(block: Block) -> None:
-    """Make all steps of all elements, in slots that are refilled as elements finish.
+    """Integrate all elements, a block of them together, each with its own clock.
 
-    Steps are divided where an element moves fast. Each slot has its own time and step length, so
-    that impacts and reversals of one element do not delay others.
+    Each slot has its own time and step length, so that impacts and reversals of one element do not
+    delay others. In every turn of the loop, all slots compute their forces, record their states at
+    sample times, and try one step; slots of finished elements get the next ones. A tried step is
+    accepted if it contains no event (such as an impact) and its forces are smooth enough; otherwise
+    it is shortened and repeated in the next turn.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
+    # Elements that move fast get shorter steps.
     choose_step_divisions(block)
     queue_by_divisions(block)
     loaded_count = 0
@@ -118,11 +124,13 @@ def step_elements(block: Block) -> None:
             loaded_count += 1
             active_count += 1
         else:
-            load_element(block, i, block.order.size - 1)  # its result is not used
+            # There are more slots than elements: this one computes valid numbers, but is not used.
+            load_element(block, i, block.order.size - 1)
             block.n[ORDER_INDEX, i] = -1
     has_new_elements = True
     while active_count > 0:
         if has_new_elements:
+            # Values that depend on an element's parameters alone.
             run_part(block, CONSTANTS)
             if block.flags[BOUNCES] != 0:
                 resolve_initial_ground_contact(block)
@@ -142,6 +150,7 @@ def step_elements(block: Block) -> None:
                     has_new_elements = True
                 block.n[IS_IDLE, i] = 1
             a = block.a
+            # The step ends at the planned one's end, its limit, or the next known event.
             a[H, i] = min(min(a[REMAINING_TIME, i], a[STEP_LIMIT, i]), a[EVENT_DELAY, i])
             if block.n[IS_IDLE, i] != 0:
                 a[H, i] = 0.0
@@ -156,11 +165,14 @@ def step_elements(block: Block) -> None:
 def resolve_initial_ground_contact(block: Block) -> None:
     """Apply ground contact at the initial state of newly loaded elements.
 
-    Elements that start inside the ground are moved to its surface; those that do not move up have
-    an impact or rest.
+    Elements that start inside the ground are moved to its surface. Of those on the ground, the ones
+    that move down have an impact, and the ones without vertical speed rest. The last coordinate is
+    the height.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     n = block.n
@@ -198,14 +210,17 @@ def is_newly_loaded(block: Block, i: int) -> bool:
 
 
 def try_step(block: Block) -> None:
-    """Try a step of H seconds of every element by the classical Runge-Kutta method, (2) to (6).
+    """Try a step of H seconds of every element by the classical Runge-Kutta method.
 
     The acceleration k1 at the beginning is in rows K1. Stages 1 and 2 evaluate k2 and k3 in the
-    middle of the step, stage 3 evaluates k4 at its end. The result is stored in rows NEXT_X and
-    NEXT_V.
+    middle of the step, stage 3 evaluates k4 at its end, by equations (2) to (6) of this module. The
+    new state is stored in rows NEXT_X and NEXT_V; the element moves there only if the step is
+    accepted.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     r = block.r
@@ -246,8 +261,16 @@ def try_step(block: Block) -> None:
 def detect_possible_events(block: Block) -> None:
     """Set MAY_HAVE_EVENT for the elements that may have an event in the step just tried.
 
+    It is a fast first check in loops over all slots. Steps of elements without the flag are
+    accepted at once; those with it are examined one by one in `accept_or_retry`. The flag is set
+    for unused slots, for steps that end at a known event, if the accelerations k1 to k4 within the
+    step are too nonlinear, if the element falls below the ground or lifts off, and by
+    `detect_friction_events`.
+
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     n = block.n
@@ -260,8 +283,9 @@ def detect_possible_events(block: Block) -> None:
             a[SCRATCH, i] = 0.0
         for k in range(d):
             for i in range(block.w):
-                bend = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
-                a[NONLINEARITY, i] += bend * bend
+                # Six times equation (7); zero if the acceleration is linear within the step.
+                nonlinearity = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
+                a[NONLINEARITY, i] += nonlinearity * nonlinearity
                 a[SCRATCH, i] += a[K1 + k, i] * a[K1 + k, i]
         for i in range(block.w):
             a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], a[SCRATCH, i])
@@ -271,9 +295,9 @@ def detect_possible_events(block: Block) -> None:
             n[MAY_HAVE_EVENT, i] |= 1 if a[NONLINEARITY, i] > largest else 0
     if block.flags[BOUNCES] != 0:
         for i in range(block.w):
-            low = a[NEXT_X + d - 1, i] < a[FLOOR_LEVEL, i]
-            lifts = n[IS_RESTING, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
-            n[MAY_HAVE_EVENT, i] |= 1 if low or lifts else 0
+            is_below_ground = a[NEXT_X + d - 1, i] < a[FLOOR_LEVEL, i]
+            lifts_off = n[IS_RESTING, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
+            n[MAY_HAVE_EVENT, i] |= 1 if is_below_ground or lifts_off else 0
     if block.flags[HAS_FRICTION] != 0:
         detect_friction_events(block)
 
@@ -281,10 +305,14 @@ def detect_possible_events(block: Block) -> None:
 def detect_friction_events(block: Block) -> None:
     """Set MAY_HAVE_EVENT for the elements that may have a friction event in the step just tried.
 
-    If friction acts on several coordinates, it is set for all elements.
+    For an element that slips, these are friction that is too nonlinear in the step, and a reversal
+    of its motion. For one that sticks, it is a pulling force above the limit of dry friction. If
+    friction acts on several coordinates, the flag is set for all elements.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     n = block.n
@@ -297,20 +325,25 @@ def detect_friction_events(block: Block) -> None:
         a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], friction)
         a[SCRATCH, i] = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
     for i in range(block.w):
-        bend = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
+        nonlinearity = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
         largest = nan_maximum(a[MAX_FRICTION, i], a[SCRATCH, i])
-        is_nonlinear = bend > FRICTION_NONLINEARITY_TOLERANCE * largest
+        is_nonlinear = nonlinearity > FRICTION_NONLINEARITY_TOLERANCE * largest
         reverses = a[NEXT_V, i] * a[DIRECTION, i] < 0.0
-        slips = 1 if is_nonlinear or reverses else 0
-        loosens = 1 if a[EXCESS_AFTER, i] > 0.0 else 0
-        n[MAY_HAVE_EVENT, i] |= loosens if n[IS_STICKING, i] != 0 else slips
+        has_slip_event = 1 if is_nonlinear or reverses else 0
+        breaks_away = 1 if a[EXCESS_AFTER, i] > 0.0 else 0
+        n[MAY_HAVE_EVENT, i] |= breaks_away if n[IS_STICKING, i] != 0 else has_slip_event
 
 
 def accept_steps(block: Block) -> None:
-    """Accept the steps just tried of elements that have no event in them.
+    """Accept the steps just tried of the elements without MAY_HAVE_EVENT.
+
+    Their state becomes the new one, and their clock advances by H; other elements stay unchanged.
+    Values are selected without branches, so that the compiler can vectorise the loops over slots.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     a = block.a
     n = block.n
@@ -339,19 +372,25 @@ def accept_steps(block: Block) -> None:
 
 
 def accept_or_retry(block: Block, i: int) -> None:
-    """Accept the step just tried if it contains no event, otherwise prepare to repeat it.
+    """Examine the step just tried of one element: accept it, or prepare to repeat it.
+
+    It is repeated with a shorter length if its forces are too nonlinear, or up to the event that it
+    contains. An accepted step that leads to a scheduled event is followed by that event.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
     n = block.n
     d = block.flags[DIMENSIONS]
-    bends = block.flags[HAS_FRICTION] != 0 or block.flags[HAS_FORCES] != 0
-    if bends and is_too_nonlinear(block, i):
+    can_be_nonlinear = block.flags[HAS_FRICTION] != 0 or block.flags[HAS_FORCES] != 0
+    if can_be_nonlinear and shorten_if_nonlinear(block, i):
         return
-    if (block.flags[HAS_FRICTION] != 0 or block.flags[BOUNCES] != 0) and detect_event(block, i):
+    can_have_event = block.flags[HAS_FRICTION] != 0 or block.flags[BOUNCES] != 0
+    if can_have_event and detect_and_schedule_event(block, i):
         return
     for k in range(d):
         a[X + k, i] = a[NEXT_X + k, i]

@@ -142,12 +142,11 @@ def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
 
 
 def find_event_time(value: float, rate: float, end_value: float, h: float) -> float:
-    """Return the seconds to the last root of the interpolating parabola.
+    """Return the seconds until a quantity, such as the height above the ground, becomes zero.
 
-    The error is of third order in h; it is corrected when the root is reached.
-
-    The parabola is p(s) = p + r s - b s^2 with b = (p + h r - q) / h^2 (8), from value p and rate r
-    at the beginning and value q at the end of a step h.
+    It is the last root of the parabola p(s) = p + r s - b s^2 with b = (p + h r - q) / h^2 (8),
+    which interpolates the value p and the rate r at the beginning of a step of length h, and the
+    value q at its end. The error is of third order in h; it is corrected when the root is reached.
 
     Args:
         value: value >= 0 at the beginning.
@@ -163,15 +162,18 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
     return float(seconds if abs(seconds) < np.inf else h)
 
 
-def is_too_nonlinear(block: Block, i: int) -> bool:
-    """Return whether forces are too nonlinear in the step just tried; set the next step size.
+def shorten_if_nonlinear(block: Block, i: int) -> bool:
+    """Shorten the step just tried if its forces are too nonlinear; return whether it is rejected.
 
     The measure is |k1 - k2 - k3 + k4| of the four Runge-Kutta accelerations, relative to the
-    largest acceleration, and likewise for friction. A rejected step is repeated with a shorter
-    length.
+    largest acceleration so far, and likewise for dry friction unless the element sticks. A step is
+    not rejected if it is already very short or ends at a scheduled event. STEP_LIMIT, the longest
+    allowed step, is reduced after a rejection, and doubles after an accepted step of that length.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -195,21 +197,19 @@ def is_too_nonlinear(block: Block, i: int) -> bool:
             change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
             squared_change += change * change
         change_size = abs(change) if d == 1 else np.sqrt(squared_change)
-        if block.n[
-            IS_STICKING, i
-        ] == 0 and change_size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
-            a[MAX_FRICTION, i], negligible
-        ):
+        tolerance = FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(a[MAX_FRICTION, i], negligible)
+        if block.n[IS_STICKING, i] == 0 and change_size > tolerance:
             is_nonlinear = True
+    is_rejected = False
     if is_nonlinear:
-        is_nonlinear = h > MIN_STEP_SHARE * a[MAX_STEP, i] and has_no_pending_event(block, i)
-    if is_nonlinear:
+        is_rejected = h > MIN_STEP_SHARE * a[MAX_STEP, i] and has_no_pending_event(block, i)
+    if is_rejected:
         a[STEP_LIMIT, i] = STEP_REDUCTION_FACTOR * h
     elif h >= a[STEP_LIMIT, i]:
         # The limit doubles with each accepted step of that length, as the nonlinearity may still be
         # near.
         a[STEP_LIMIT, i] = min(2.0 * a[STEP_LIMIT, i], a[MAX_STEP, i])
-    return is_nonlinear
+    return is_rejected
 
 
 def has_no_pending_event(block: Block, i: int) -> bool:
@@ -223,15 +223,19 @@ def has_no_pending_event(block: Block, i: int) -> bool:
     return bool(n[PENDING_EVENT, i] == NO_EVENT and n[EVENT_COUNT, i] < MAX_EVENTS_PER_STEP)
 
 
-def detect_event(block: Block, i: int) -> bool:
-    """Return whether an event is within the step just tried; schedule the event.
+def detect_and_schedule_event(block: Block, i: int) -> bool:
+    """Return whether an event is within the step just tried, and schedule it.
 
     Events are: an impact, when the height above the ground becomes negative; a standstill, when the
     speed along the motion changes sign; and a break-away, when the pulling force of a sticking
-    element exceeds its friction limit.
+    element exceeds its friction limit. The step is then repeated up to the time of the event. If it
+    was already repeated for an event, that event is handled at its end, so no other one is sought;
+    only the time of a break-away is refined until it is accurate enough.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -258,17 +262,17 @@ def detect_event(block: Block, i: int) -> bool:
                 has_event = True
         awaits_break_away = block.n[PENDING_EVENT, i] == BREAK_AWAY
         if is_sticking and (has_no_event or awaits_break_away):
-            value_before = a[EXCESS_BEFORE, i]
-            value_after = a[EXCESS_AFTER, i]
+            # Pulling force minus friction limit at both ends of the step.
+            excess_before = a[EXCESS_BEFORE, i]
+            excess_after = a[EXCESS_AFTER, i]
             # A scheduled break-away is checked again with a tolerance.
-            if value_after > (
-                BREAK_AWAY_TIME_TOLERANCE * (value_after - value_before)
-                if awaits_break_away
-                else 0.0
-            ):
+            max_excess = 0.0
+            if awaits_break_away:
+                max_excess = BREAK_AWAY_TIME_TOLERANCE * (excess_after - excess_before)
+            if excess_after > max_excess:
                 # Just after the linear estimate of the zero, so that the excess is not negative.
                 seconds = h * (
-                    value_before / (value_before - value_after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE
+                    excess_before / (excess_before - excess_after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE
                 )
                 schedule_event(block, i, seconds, BREAK_AWAY)
                 has_event = True
@@ -276,13 +280,17 @@ def detect_event(block: Block, i: int) -> bool:
 
 
 def schedule_event(block: Block, i: int, seconds: float, event: int) -> None:
-    """Schedule an event at the end of the next step; of two events the first counts.
+    """Schedule an event: the step is repeated so that it ends there.
+
+    If two events are in a step, the earlier one is scheduled; the other is found again later.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
-        seconds: seconds to the event.
-        event: kind of event.
+        seconds: seconds from the beginning of the step to the event.
+        event: kind of event: IMPACT, STANDSTILL or BREAK_AWAY.
     """
     if seconds < block.a[EVENT_DELAY, i]:
         block.a[EVENT_DELAY, i] = min(max(seconds, 0.0), block.a[H, i])
@@ -297,7 +305,9 @@ def handle_event(block: Block, i: int) -> None:
     break-away. The step was shortened to end there.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     event = block.n[PENDING_EVENT, i]
@@ -311,13 +321,15 @@ def handle_event(block: Block, i: int) -> None:
 
 
 def shift_time(block: Block, i: int, seconds: float) -> float:
-    """Move the element's clock, at most by one step.
+    """Correct the element's clock at an event, by at most one step, and return the correction.
 
-    An event is known only up to rounding when a step ends at it; the clock is corrected by the
-    rest.
+    A step that should end at an event ends there only approximately. The caller computes by how
+    much, and moves the state by the same time. Later steps have correspondingly less time left.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         seconds: time correction in seconds; NaN counts as zero.
 
@@ -325,7 +337,7 @@ def shift_time(block: Block, i: int, seconds: float) -> float:
         The applied correction in seconds.
     """
     step = block.a[MAX_STEP, i]
-    if seconds != seconds:
+    if seconds != seconds:  # NaN
         seconds = 0.0
     seconds = min(max(seconds, -step), step)
     block.a[T, i] += seconds
@@ -334,27 +346,31 @@ def shift_time(block: Block, i: int, seconds: float) -> float:
 
 
 def handle_impact(block: Block, i: int, k: int) -> None:
-    """Apply the impact to which a step led up to rounding.
+    """Apply an impact with the ground, which the element has nearly reached.
 
-    The remaining distance d to the ground is removed by the time correction (10), which is
-    -d / r (1 + d a / (2 r^2)) with the rate r and acceleration a. Then the velocity changes.
+    First the element moves exactly to the ground: with the remaining distance d, its rate r and
+    acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (10). Then its velocity
+    becomes that of the rebound.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         k: first row of the acceleration before the impact.
     """
     a = block.a
     d = block.flags[DIMENSIONS]
     floor = block.ground[FLOOR, block.n[ELEMENT, i]]
+    # The last coordinate is the height.
     height_row = X + d - 1
     rate_row = V + d - 1
-    pull = a[k + d - 1, i]
+    upward_acceleration = a[k + d - 1, i]
     rate = a[rate_row, i]
     correction = 0.0
     if rate < 0.0:
         correction = (floor - a[height_row, i]) / rate
-        correction *= 1.0 - 0.5 * correction * pull / rate  # (10)
+        correction *= 1.0 - 0.5 * correction * upward_acceleration / rate  # (10)
     correction = shift_time(block, i, correction)
     for j in range(d):
         acceleration = a[k + j, i]
@@ -364,7 +380,7 @@ def handle_impact(block: Block, i: int, k: int) -> None:
     # impact.
     a[height_row, i] = floor
     a[rate_row, i] = clip_to_non_positive(a[rate_row, i])
-    compute_rebound_velocity(block, i, pull)
+    compute_rebound_velocity(block, i, upward_acceleration)
 
 
 def clip_to_non_positive(rate: float) -> float:
@@ -372,18 +388,20 @@ def clip_to_non_positive(rate: float) -> float:
     return rate if rate <= 0.0 or rate != rate else 0.0
 
 
-def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
-    """Compute the velocity after an impact, from restitution and friction with effects.
+def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -> None:
+    """Set the velocity after an impact, from restitution and friction with effects.
 
     With restitution e, friction coefficient mu and normal speed v, the rebound speed is e v, and
-    the tangential speed decreases by mu (1 + e) v, but not below the share that the ground leaves.
+    the tangential speed decreases by mu (1 + e) v, but not below a share that the ground leaves.
     A ball whose bounces are over comes to rest, and loses the tangential speed of all remaining
     impacts at once.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
-        pull: upward acceleration before the impact.
+        upward_acceleration: upward acceleration before the impact; negative under gravity.
     """
     a = block.a
     r = block.r
@@ -403,8 +421,9 @@ def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
     friction = r[rows[OUT_MU], i]
     rebound_speed = restitution * speed
     lost_speed = friction * (1.0 + restitution) * speed
-    if is_bouncing_over(block, i, rebound_speed, -pull):
+    if count_bounce_and_check_end(block, i, rebound_speed, -upward_acceleration):
         if restitution < 1.0:
+            # Sum of the geometric series of all further impacts, whose speeds fall by e each.
             lost_speed += friction * (1.0 + restitution) * rebound_speed / (1.0 - restitution)
         rebound_speed = 0.0
         block.n[IS_RESTING, i] = 1
@@ -420,32 +439,43 @@ def compute_rebound_velocity(block: Block, i: int, pull: float) -> None:
     a[rate_row, i] = rebound_speed
 
 
-def is_bouncing_over(block: Block, i: int, rebound_speed: float, down: float) -> bool:
-    """Return whether bouncing is finished after an impact.
+def count_bounce_and_check_end(
+    block: Block, i: int, rebound_speed: float, downward_acceleration: float
+) -> bool:
+    """Count short flights in a row, and return whether bouncing is finished after this impact.
 
     Without this, a ball would bounce infinitely often in finite time. Bouncing ends at a flight
-    shorter than `MIN_FLIGHT_SECONDS`, or after `MAX_SHORT_FLIGHTS` short ones.
+    shorter than `MIN_FLIGHT_SECONDS`, or after more than `MAX_SHORT_FLIGHTS` in a row that are
+    shorter than `SHORT_FLIGHT_SECONDS`. Without downward acceleration, the element flies away.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
-        rebound_speed: rebound speed.
-        down: downward acceleration.
+        rebound_speed: upward speed after the impact.
+        downward_acceleration: downward acceleration.
     """
-    if not down > 0.0:
+    if not downward_acceleration > 0.0:
         block.n[SHORT_FLIGHT_COUNT, i] = 0
         return False
-    flight = 2.0 * rebound_speed / down
-    count = block.n[SHORT_FLIGHT_COUNT, i] + 1 if flight < SHORT_FLIGHT_SECONDS else 0
+    flight_seconds = 2.0 * rebound_speed / downward_acceleration
+    count = block.n[SHORT_FLIGHT_COUNT, i] + 1 if flight_seconds < SHORT_FLIGHT_SECONDS else 0
     block.n[SHORT_FLIGHT_COUNT, i] = count
-    return bool(flight < MIN_FLIGHT_SECONDS or count > MAX_SHORT_FLIGHTS)
+    return bool(flight_seconds < MIN_FLIGHT_SECONDS or count > MAX_SHORT_FLIGHTS)
 
 
 def handle_standstill(block: Block, i: int) -> None:
-    """Stop the element, which has lost its speed along its direction up to rounding.
+    """Stop an element that has nearly lost its speed, where dry friction may then hold it.
+
+    The clock and the state first move to the exact time of standstill. Then the small remaining
+    velocity along the former direction of motion is removed; motion across it stays. If what stays
+    is negligible, the velocity becomes exactly zero.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -459,7 +489,7 @@ def handle_standstill(block: Block, i: int) -> None:
     directed_velocity = dot(a, V, DIRECTION, d, i)
     for k in range(d):
         a[V + k, i] -= a[DIRECTION + k, i] * directed_velocity
-    # The speed becomes exactly zero, because only an element with zero speed can stick.
+    # Only an element whose speed is exactly zero can stick.
     friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
     if (
         compute_norm(a, V, friction_coordinate_count, i)

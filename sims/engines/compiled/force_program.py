@@ -174,10 +174,12 @@ class SystemTracer:
     """
 
     def __init__(self, system: System, names: InputNames) -> None:
-        """Make graph inputs for time, state, inputs and parameters, and trace the system's force.
+        """Trace the system's force: record its operations as an expression graph.
 
-        Time, state and inputs change in each evaluation, parameters only between batch elements.
-        `e`, `mu` and `speed` are restitution, friction coefficient and normal speed of an impact.
+        The system's function is called once with symbols instead of numbers. These inputs of the
+        graph are: time `t`, position `x`, velocity `v` and inputs `u`, which change in each
+        evaluation; parameters, which change only between batch elements; and restitution `e`,
+        friction coefficient `mu` and normal speed of an impact.
 
         Args:
             system: system to trace.
@@ -209,7 +211,7 @@ class SystemTracer:
         self._programs: dict[tuple[type[Effect], ...], ForceProgram] = {}
 
     def build_program(self, effects: Sequence[Effect]) -> ForceProgram:
-        """Return the program of the system with these effects.
+        """Return the program of the system with these effects; it is cached by their classes.
 
         Raises:
             NotTraceableError: an effect cannot be traced.
@@ -225,7 +227,8 @@ class SystemTracer:
         """Return an effect's force and friction limit as expressions of the graph.
 
         Each class of effects is traced once: its functions are called with traced arrays,
-        which record the operations.
+        which record the operations. Force and limit are None for effects without them. A contact
+        effect acts on impacts; it is traced when a program is built.
 
         Raises:
             NotTraceableError: the effect cannot be traced.
@@ -245,8 +248,9 @@ class SystemTracer:
     def _combine_traces(self, effects: Sequence[Effect]) -> _ProgramNodes:
         """Combine the traced system and effects into the inputs and outputs of one program.
 
-        Forces and limits of dry friction are added up. Contact effects change the
-        restitution `e` and the friction coefficient `mu` one after the other.
+        Forces and limits of dry friction are added up; without friction effects there is no limit.
+        Contact effects change the restitution `e` and the friction coefficient `mu` one after the
+        other. The inputs are groups of nodes in the order of `ProgramArrays.rows`.
         """
         force: Any = self._force
         limit: Any = None
@@ -299,16 +303,14 @@ class _ProgramNodes(NamedTuple):
 
 
 def _write_program(nodes: _ProgramNodes) -> ForceProgram:
-    """Write traced expressions as instructions, with the registers of their inputs and outputs.
+    """Write traced expressions as instructions, and note the registers of inputs and outputs.
 
     Args:
         nodes: Expression graph with the outputs: forces, friction limit and impact.
-
-    Returns:
-        The program with the registers of inputs and outputs.
     """
     outputs = [*nodes.force, *nodes.limit, *nodes.impact]
     instructions = emit_instructions(nodes.inputs, outputs)
+    # -1 if the program has no dry friction; the register is then never read.
     limit = instructions.place[nodes.limit[0]] if nodes.limit else -1
     rows = [*instructions.rows, limit, *(instructions.place[node] for node in nodes.impact)]
     arrays = ProgramArrays(
@@ -344,11 +346,13 @@ class InstructionList(NamedTuple):
 def emit_instructions(
     groups: Sequence[Sequence[ExpressionNode]], outputs: Sequence[ExpressionNode]
 ) -> InstructionList:
-    """Return instructions that compute outputs from groups of inputs.
+    """Translate an expression graph to instructions that compute its outputs from its inputs.
 
-    Registers are allocated in this order: inputs by group, constants, results. Instructions are
-    grouped by how often they must be repeated: once per element, per evaluation of forces, or per
-    impact.
+    Every node of the graph gets a register of its own: first the inputs by group, then the
+    constants, then the results of operations. Each operation becomes one instruction: its code, the
+    register of its result, and those of three arguments (the first one fills up missing ones).
+    Instructions are sorted by how often they must be repeated: once per batch element, per
+    evaluation of forces, or per impact.
 
     Args:
         groups: groups of input nodes; the registers of a group are consecutive.
@@ -391,10 +395,11 @@ def emit_instructions(
 
 
 def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
-    """Return the outputs and all nodes they depend on, each after its arguments.
+    """Return the outputs and all nodes on which they depend, each after its arguments.
 
-    It is a depth-first topological sort with a stack, because recursion would be too deep for large
-    graphs.
+    It is a depth-first topological sort. It uses a stack, because recursion would be too deep for
+    large graphs. A node is on the stack twice: first to put its arguments on top of it, and then to
+    be added after them.
 
     Args:
         outputs: Nodes whose values the program must produce.
@@ -425,8 +430,9 @@ def get_force_program(
 ) -> ForceProgram | NumpyForceProgram:
     """Return the program that computes the forces of a system and its effects.
 
-    It is compiled from a trace of their functions if possible; otherwise it calls them with
-    NumPy, which is slower.
+    If possible, it consists of instructions, from a trace of their Python functions. Otherwise,
+    for example because a user's effect contains an ``if``, the program calls these functions with
+    NumPy, which is slower; the user is told the reason once.
 
     Args:
         batch: whole batch.
@@ -468,7 +474,7 @@ def _get_tracer(
             tracer = SystemTracer(batch.system, names)
             _check_program(tracer, batch, elements, names, None)
             _tracers[key] = tracer
-        # A user's system may raise any error when called with traced arrays.
+        # A user's system may raise any error when called with traced arrays. The cached None stays.
         except Exception as reason:
             _print_once(f"system {batch.system.name}", reason)
     return _tracers[key]
@@ -504,10 +510,10 @@ def _is_traceable(
 
 
 def _print_once(subject: str, reason: Exception) -> None:
-    """Write one line to the standard error output, once per process.
+    """Tell the user why a system or effect runs slowly with NumPy; once per process.
 
     Args:
-        subject: system or effect, as the beginning of the line.
+        subject: system or effect, as the beginning of the line on the standard error output.
         reason: why it cannot be compiled.
     """
     text = str(reason) or type(reason).__name__
@@ -521,7 +527,11 @@ def _check_program(
     names: InputNames,
     effect: Effect | None,
 ) -> None:
-    """Check that a program agrees with the array functions, on one element.
+    """Check that a traced program gives the same numbers as the functions that it was traced from.
+
+    A trace records the operations for one call. If a function chooses its operations by values, for
+    example by the parameters of an object, the trace is wrong elsewhere. So both are evaluated for
+    the first of the elements, at its initial state and at another one, and at two impact speeds.
 
     Args:
         tracer: traced system.
@@ -551,9 +561,10 @@ def _check_program(
         _evaluate_program(program, parameters, states) for program in programs
     )
     for value, expected in zip(values, expected_values, strict=True):
-        size = _MAX_RELATIVE_DIFFERENCE * np.abs(expected).max()
+        # A component that is nearly zero is compared relative to the largest one.
+        atol = _MAX_RELATIVE_DIFFERENCE * np.abs(expected).max()
         if not np.allclose(
-            value, expected, rtol=_MAX_RELATIVE_DIFFERENCE, atol=size, equal_nan=True
+            value, expected, rtol=_MAX_RELATIVE_DIFFERENCE, atol=atol, equal_nan=True
         ):
             raise NotTraceableError("its compiled form gives other numbers")
 

@@ -103,13 +103,15 @@ def nan_minimum(a: float, b: float) -> float:
 
 
 def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -> None:
-    """Compute row o = sin(row a + `quarter_turns` quarter turns).
+    """Compute the sine or cosine of a row of registers, as fdlibm does.
 
-    With x = k pi/2 + r, |r| <= pi/4: sin r = r + r^3 (S1 + ...), cos r = 1 - r^2/2 + r^4 (C1 + ...)
-    (1).
+    An own version computes every element in the same way, and is vectorised over slots. The
+    argument is split into k quarter turns and a remainder, x = k pi/2 + y with |y| <= pi/4.
+    Polynomials give sin y and cos y (1); whether k is odd selects one of them, and k modulo 4 its
+    sign. Angles that are too large for this splitting are left to the library's function.
 
     Args:
-        r: registers.
+        r: registers (rows, slots).
         o: row of the result.
         a: row of the argument in radians.
         w: number of slots in use.
@@ -118,7 +120,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -
     is_large = False
     for i in range(w):
         x = r[a, i]
-        k = (x * TWO_OVER_PI + ROUNDING_OFFSET) - ROUNDING_OFFSET
+        k = (x * TWO_OVER_PI + ROUNDING_OFFSET) - ROUNDING_OFFSET  # rounded to an integer
         y = ((x - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
         z = y * y
         s = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
@@ -144,12 +146,14 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -
 
 
 def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
-    """Compute row o = exp(row a).
+    """Compute the exponential of a row of registers, as fdlibm does.
 
-    With x = k ln 2 + r: exp r = 1 + r + r c / (2 - c), c = r - r^2 (P1 + ...) (2).
+    The argument is split as x = k ln 2 + y with |y| <= ln 2 / 2. Then exp x = 2^k exp y, where
+    exp y = 1 + y + y c / (2 - c) with a polynomial c in y^2 (2), and 2^k is made by writing k into
+    the exponent bits of a number. Arguments that are too large are left to the library's function.
 
     Args:
-        r: registers.
+        r: registers (rows, slots).
         o: row of the result.
         a: row of the argument.
         w: number of slots in use.
@@ -157,7 +161,7 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
     is_large = False
     for i in range(w):
         x = r[a, i]
-        k = (x * INVERSE_LN_2 + ROUNDING_OFFSET) - ROUNDING_OFFSET
+        k = (x * INVERSE_LN_2 + ROUNDING_OFFSET) - ROUNDING_OFFSET  # rounded to an integer
         high = x - k * LN_2_HIGH
         low = k * LN_2_LOW
         y = high - low
@@ -176,16 +180,17 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
 
 
 def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: int) -> None:
-    """Run instructions first to last - 1 on the registers.
+    """Run the instructions from `first` to `last` - 1 of a force program on the registers.
 
-    An instruction is (operation, row of the result, rows of up to three arguments). It is
-    applied to all slots in use, the columns of the registers.
+    An instruction has five numbers: the operation `op`, the row `o` of the result, and the rows
+    `a`, `b` and `c` of up to three arguments. It is applied to all slots in use. Each operation has
+    its own loop over the slots, which the compiler can vectorise.
 
     Args:
         code: (n, 5) instructions.
         first: index of the first instruction.
         last: index after the last instruction.
-        r: registers.
+        r: registers (rows, slots): a row for each value of the program, a column for each element.
         w: number of slots in use.
     """
     for n in range(first, last):
@@ -227,22 +232,23 @@ def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: in
                 no = r[c, i]
                 r[o, i] = yes if r[a, i] != 0.0 else no
         elif op == SIN:
-            evaluate_sine(r, o, a, w, 0.0)
+            evaluate_sine(r, o, a, w, quarter_turns=0.0)
         elif op == COS:
-            evaluate_sine(r, o, a, w, 1.0)
+            evaluate_sine(r, o, a, w, quarter_turns=1.0)
         elif op == EXP:
             evaluate_exponential(r, o, a, w)
         elif op == EXTERNAL:
+            # Here b and c are not rows, but the part of the program and the function's address.
             call_external(c, b, w)
         else:
             run_rare_instruction(op, r, o, a, b, w)
 
 
 def run_rare_instruction(op: int, r: FloatArray, o: int, a: int, b: int, w: int) -> None:
-    """Run an instruction that is not in the common ones of `run_instructions`.
+    """Run an instruction that is not one of the common ones in `run_instructions`.
 
-    True is 1 and false is 0. The loop over slots is outside, because these instructions are too
-    rare to need vector code.
+    Comparisons give 1 for true and 0 for false. There is one loop over slots for all operations,
+    because these instructions are too rare to need vector code.
 
     Args:
         op: operation code.

@@ -23,7 +23,7 @@ _INLINED_FUNCTIONS = frozenset(
         *("evaluate_forces", "begin_step", "compute_acceleration"),
         *("compute_force_without_friction", "compute_frictionless_acceleration", "try_step"),
         *("accept_steps", "next_step", "set_inputs", "record_and_check_remaining"),
-        *("detect_possible_events", "detect_friction_events", "is_too_nonlinear"),
+        *("detect_possible_events", "detect_friction_events", "shorten_if_nonlinear"),
         *("has_no_pending_event", "nan_maximum", "nan_minimum", "record_state", "dot"),
         *("compute_norm", "begin_step_1d", "compute_acceleration_1d"),
         *("compute_further_coordinates", "run_part"),
@@ -37,13 +37,19 @@ _START = (
 
 
 def build_module(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -> bytes:
-    """Return the packed machine code of a function of a module and all functions that it calls.
+    """Compile a function of a module, with all functions that it calls, in a separate process.
+
+    There numba ignores the user's settings, and its memory is released afterwards. The process
+    runs `main`, and writes the machine code to its standard output.
 
     Args:
         module: name of the module.
         entry: name of the function, which receives pointers to integers, or of `ArrayFunctions`.
         pointers: number of these pointers.
         constants: values that replace constants of the module, by name.
+
+    Returns:
+        The machine code as bytes, see `MachineCode.pack`.
 
     Raises:
         machine_code.CodeNotLoadableError: the compilation failed; the message is the last line of
@@ -69,13 +75,16 @@ def build_module(module: str, entry: str, pointers: int, constants: Mapping[str,
 
 
 def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -> None:
-    """Write the machine code to the standard output, where `build_module` reads it.
+    """Compile a function, and write its machine code to the standard output.
+
+    `build_module` starts this in a separate process, and reads the output. numba translates the
+    function and those that it calls to LLVM code, which becomes machine code in one piece.
 
     Args:
         module: name of the module.
-        entry: name of the function, or of `ArrayFunctions`.
-        pointers: number of its arguments, which are pointers.
-        constants: further global names and their numbers.
+        entry: name of the function, or of an `ArrayFunctions` object, which generates it.
+        pointers: number of the function's arguments, which are pointers to integers.
+        constants: numbers that replace global constants of the module, by name.
     """
     import numba as typed
 
@@ -94,7 +103,11 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
 
 
 def list_called_functions(function: FunctionType) -> list[FunctionType]:
-    """Return the functions that a function calls, and those that they call, callees first."""
+    """Return the functions that a function calls, and those that they call, callees first.
+
+    These are the global functions whose names its byte code contains. Intrinsics are left out,
+    because they have no Python code to compile.
+    """
     functions: dict[FunctionType, None] = {}
     for name in function.__code__.co_names:
         callee = function.__globals__.get(name)
@@ -106,12 +119,15 @@ def list_called_functions(function: FunctionType) -> list[FunctionType]:
 def _compile_functions(
     numba: Any, entry: FunctionType, constants: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Return the names that a function uses, with the functions that it calls compiled.
+    """Compile all functions that a function calls, and return the global names for its own code.
+
+    The callees are compiled first, in one common name space: there each name stands for the
+    compiled function, so that callers use it instead of the Python function.
 
     Args:
         numba: the module.
         entry: function whose callees are compiled.
-        constants: further global names and their numbers.
+        constants: numbers that replace global constants, by name.
     """
     functions = list_called_functions(entry)
     space: dict[str, Any] = {}

@@ -66,14 +66,15 @@ def describe_processor() -> list[str]:
 
 
 def compile_llvm(text: str, name: str) -> MachineCode:
-    """Compile intermediate code to machine code for the present processor.
+    """Compile LLVM's intermediate code to optimised machine code for the present processor.
+
+    All functions except the named one become internal, so that those that are inlined everywhere
+    are not kept. Symbols that are only declared, such as the sine of the C library, are stored by
+    name; they are resolved when the code is loaded.
 
     Args:
         text: LLVM intermediate code.
-        name: name of the function.
-
-    Returns:
-        The machine code.
+        name: name of the function that is called from outside.
     """
     import llvmlite.binding as llvm
 
@@ -81,7 +82,7 @@ def compile_llvm(text: str, name: str) -> MachineCode:
     module.verify()
     for symbol in (*module.functions, *module.global_variables):
         if not symbol.is_declaration and symbol.name != name:
-            symbol.linkage = "internal"  # so that inlined functions are not also emitted
+            symbol.linkage = "internal"
     target = _make_target(llvm)
     tuning = llvm.create_pipeline_tuning_options(speed_level=3)
     tuning.loop_vectorization = True
@@ -96,20 +97,19 @@ def compile_llvm(text: str, name: str) -> MachineCode:
 
 
 def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., None]:
-    """Load the machine code of a function.
+    """Load the machine code of a function, and return it as a callable function.
 
     The code was compiled earlier, perhaps by another process. Only llvmlite is needed to load
-    it.
+    it. Functions of numba's error handling, which is never called, are replaced by one that aborts,
+    since numba may not be installed.
 
     Args:
         code: machine code.
-        pointers: number of pointer arguments of the function.
-
-    Returns:
-        The function.
+        pointers: number of arguments of the function, which are all pointers.
 
     Raises:
-        CodeNotLoadableError: a required symbol is missing; LLVM itself would end the process.
+        CodeNotLoadableError: a required symbol is missing. It is checked here, because LLVM itself
+            would end the process.
     """
     import llvmlite.binding as llvm
 
@@ -164,15 +164,14 @@ def read_cached(path: Path) -> bytes | None:
 
 
 def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[], None]) -> bytes:
-    """Return the cached content of a file, made by one of all processes that request it.
+    """Return the cached content of a file; if it does not exist, make and store it first.
+
+    If several processes request it, only one makes it, and the others wait for its result.
 
     Args:
         path: path of the file.
         make: function that makes the content if it does not exist.
         report_wait: called once if another process is making the content.
-
-    Returns:
-        The content.
 
     Raises:
         OSError: the file cannot be written.

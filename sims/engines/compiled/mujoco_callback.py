@@ -125,12 +125,17 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
 
     MuJoCo calls this in each evaluation of a step. At the first evaluation of step k (`stage` 0),
     the force program computes forces and dry friction at the state in the middle of the step; the
-    further evaluations of a Runge-Kutta step reuse them. The address of the batch element's
-    `CallbackContext` is in MuJoCo's user data; its fields are read as words in their order.
+    further evaluations of a Runge-Kutta step reuse them. The work is: read the simulation's
+    context, copy time, state and inputs to the registers, run the program, add its forces to
+    MuJoCo's applied forces, advance hidden states, and set the limits of dry friction.
+
+    The function is compiled, so memory is read by addresses: `carray` is the array at an address.
+    The address of the `CallbackContext` is in MuJoCo's user data; its fields are integers in their
+    order. Zero marks a simulation without effects.
 
     Args:
-        model_at: MuJoCo's model; not used.
-        data_at: MuJoCo's data.
+        model_at: pointer to MuJoCo's model; not used.
+        data_at: pointer to MuJoCo's data, which is read as words of eight bytes.
     """
     data = carray(data_at, (MAX_DATA_WORDS,))
     context_address = carray(to_real_pointer(data[USERDATA]), (1,))[0]
@@ -192,10 +197,14 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
 def set_friction_limits(data: Any, context: Any, limits: Any) -> None:
     """Write limits of dry friction into the constraints of the present evaluation.
 
+    MuJoCo's solver treats dry friction as constraints, one row each. The rows are sorted by type:
+    those of equalities come first and are skipped; those of friction follow. Each names the
+    velocity coordinate on which it acts, by which its joint is found.
+
     Args:
-        data: MuJoCo's data.
+        data: MuJoCo's data as words of eight bytes.
         context: the context of the simulation.
-        limits: (D,) limits.
+        limits: (D,) limits of dry friction of the D joints, in N or N m.
     """
     velocities = carray(to_int_pointer(context.velocities), (context.joints,))
     kinds = carray(to_short_pointer(data[EFC_TYPE]), (MAX_DATA_WORDS,))

@@ -16,6 +16,8 @@ from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot, System
 from sims.engines.compiled.data_layout import (
+    FORCES,
+    IMPACTS,
     IN_E,
     IN_MU,
     IN_P,
@@ -57,7 +59,7 @@ class NumpyForces:
         out: IntTable,
         r: Array,
     ) -> None:
-        """Make the C callback with which the compiled instructions call the array functions.
+        """Make the C callback through which machine code calls the Python functions.
 
         `_snapshots` caches, by the number of slots, arrays that are views of the registers.
 
@@ -90,16 +92,16 @@ class NumpyForces:
     def _evaluate_part(self, part: int, width: int) -> None:
         """Evaluate one part of the program for the first `width` slots (called by machine code).
 
-        Part 0 has nothing to evaluate, part 1 computes forces, and the last part computes
-        impacts.
+        Values that depend on parameters alone (`CONSTANTS`) are not separated here, so that part
+        has nothing to do. An exception cannot pass through machine code: it is stored, all results
+        are NaN from then on, and the caller raises it afterwards.
         """
-        # An exception cannot pass through machine code; the caller raises it afterwards.
         if self.error is None:
             try:
                 with np.errstate(all="ignore"):
-                    if part == 1:
+                    if part == FORCES:
                         self._evaluate_forces(width)
-                    elif part == PART_COUNT - 1:
+                    elif part == IMPACTS:
                         self._evaluate_impact(width)
             except BaseException as error:
                 self.error = error
@@ -142,19 +144,22 @@ class NumpyForces:
         self._r[self._rows[OUT_MU], :width] = friction[:, 0]
 
     def _make_snapshot(self, width: int) -> tuple[StateSnapshot, list[Array]]:
-        """Return snapshot and coefficients (K, W, 1) of the first W = `width` slots.
+        """Return the arguments of the array functions for the first W = `width` slots.
 
         They are views of the registers, so that they show the present values in every
-        evaluation.
+        evaluation. One slice of registers holds all parameters: those of the system, its constants,
+        and the coefficients of each effect, in this order.
+
+        Returns:
+            State, inputs and parameters; and the coefficients (K, W, 1) of each effect, which has
+            K of them.
         """
         if width not in self._snapshots:
             names = self._names
             first = int(self._rows[IN_P])
-            parameters = [names.parameters, *(1 for _ in names.constants)]
-            parameters += [len(effect.coefficients) for effect in self._effects]
-            parts = np.split(
-                self._r[first : first + sum(parameters), :width], np.cumsum(parameters)[:-1]
-            )
+            counts = [names.parameters, *(1 for _ in names.constants)]
+            counts += [len(effect.coefficients) for effect in self._effects]
+            parts = np.split(self._r[first : first + sum(counts), :width], np.cumsum(counts)[:-1])
             theta, *columns = (part.T for part in parts)
             constants = dict(zip(names.constants, columns, strict=False))
             coefficients = [part[:, :, None] for part in parts[1 + len(names.constants) :]]
@@ -184,16 +189,24 @@ class NumpyForces:
 def lay_out_registers(
     system: System, names: InputNames, effects: Sequence[Effect]
 ) -> tuple[ProgramArrays, int]:
-    """Return the arrays of a program without code, and its number of registers.
+    """Assign registers to the inputs and outputs of a program that calls NumPy.
+
+    Groups of registers follow each other in the order of `ProgramArrays.rows`, then those of the
+    force.
 
     Args:
         system: system whose forces are evaluated.
         names: input names and sizes.
         effects: effects that act.
+
+    Returns:
+        The arrays of the program, without instructions yet, and its number of registers.
     """
     parameters = names.parameters + len(names.constants)
     parameters += sum(len(effect.coefficients) for effect in effects)
     d = names.coordinates
+    # Time, position, velocity, inputs, parameters; restitution, ground friction and speed of an
+    # impact; limit of dry friction, restitution and ground friction with effects; forces.
     sizes = [1, d, d, len(names.inputs), parameters, 1, 1, 1, 1, 1, 1, d]
     block_ends = np.cumsum(sizes)
     program = ProgramArrays(

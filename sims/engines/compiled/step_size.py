@@ -53,12 +53,19 @@ PHASE_TO_DECAY_RATIO = MAX_PHASE_PER_STEP / MAX_DECAY_PER_STEP
 
 
 def choose_step_divisions(block: Block) -> None:
-    """Raise `block.divisions` to the number of parts into which steps must be divided.
+    """Raise `block.divisions`, the number of parts into which each element's steps are divided.
+
+    Stiff forces need short steps. The stiffness of the acceleration (1/s^2) gives the angular
+    frequency of an oscillation, and its damping (1/s) the rate of a decay; their phase and decay
+    per step must stay below a limit. They are computed at a few times of the run if inputs change
+    with time, at the initial state and at rest. Elements are loaded in groups of one block.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
-    spans = block.max_steps
+    longest_steps = block.max_steps
     divisions = block.divisions
     instants = SAMPLED_INSTANTS if block.inputs.shape[0] > 0 else 1
     for first_order_index in range(0, block.order.size, block.w):
@@ -74,8 +81,10 @@ def choose_step_divisions(block: Block) -> None:
                 compute_stiffness_and_damping(block, at_rest == 1)
                 for i in range(min(block.w, block.order.size - first_order_index)):
                     element = block.n[ELEMENT, i]
-                    phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * spans[element]
-                    decay = block.a[MAX_FRICTION, i] * spans[element] * PHASE_TO_DECAY_RATIO
+                    # The two rows hold the stiffness and the damping here.
+                    step = longest_steps[element]
+                    phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * step
+                    decay = block.a[MAX_FRICTION, i] * step * PHASE_TO_DECAY_RATIO
                     needed_divisions = np.ceil(nan_maximum(phase, decay) / block.limits[MAX_PHASE])
                     # NaN does not change the number of parts.
                     if needed_divisions > divisions[element]:
@@ -83,12 +92,15 @@ def choose_step_divisions(block: Block) -> None:
 
 
 def queue_by_divisions(block: Block) -> None:
-    """Set the longest step of each element, and queue the elements.
+    """Queue the elements by the number of parts of their steps, and set their longest step.
 
-    Elements with many steps begin first; the others fill the remaining slots meanwhile.
+    Elements with the most parts begin first, since they take longest; the others fill the remaining
+    slots meanwhile. The loop over numbers of parts is a counting sort.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
     queued_count = 0
     division = MAX_STEP_DIVISIONS
@@ -109,12 +121,15 @@ def queue_by_divisions(block: Block) -> None:
 
 
 def select_sampled_steps(block: Block, i: int) -> None:
-    """Select the steps of an element at which the forces are evaluated.
+    """Select the steps of an element at which stiffness and damping are computed.
 
-    Steps of zero length do not count.
+    They are `SAMPLED_INSTANTS` steps, evenly distributed from the first to the last; steps of zero
+    length do not count. If all elements have the same steps, those of slot 0 are copied.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     n = block.n
@@ -143,7 +158,9 @@ def set_inputs_at(block: Block, instant: int) -> None:
     """Set the inputs of every element to those of one of its selected steps.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         instant: index of the selected step.
     """
     first = block.rows[IN_U]
@@ -154,13 +171,16 @@ def set_inputs_at(block: Block, instant: int) -> None:
 
 
 def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
-    """Compute the largest slopes of the acceleration with position and with velocity.
+    """Compute the stiffness and damping of every element by finite differences.
 
-    The slope with position (1/s^2) is stored in row MAX_ACCELERATION, that with velocity (1/s) in
-    row MAX_FRICTION.
+    The stiffness is the largest change of a coordinate's acceleration with its position (1/s^2);
+    it is stored in row MAX_ACCELERATION. The damping is that with its velocity (1/s), in row
+    MAX_FRICTION. These rows are free before the integration begins.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
@@ -171,6 +191,7 @@ def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
         for k in range(d):
             x = block.x[block.n[ELEMENT, i], k]
             v = block.v[block.n[ELEMENT, i], k]
+            # 0.0 * x is zero, but NaN for an element whose state is NaN.
             a[X + k, i] = 0.0 * x if at_rest else x
             a[V + k, i] = 0.0 * v if at_rest else v
     evaluate_forces(block)
@@ -183,13 +204,19 @@ def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
 
 
 def update_max_slope(block: Block, k: int, register: int, row_of_result: int) -> None:
-    """Raise row `row_of_result` to the slope of the acceleration with one coordinate.
+    """Raise a row to the slope of a coordinate's acceleration with its position or velocity.
+
+    The position or velocity is changed by `FINITE_DIFFERENCE_STEP`, the forces are computed again,
+    and the former value is restored.
 
     Args:
-        block: force program, batch elements, and buffers of the slots.
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
         k: index of the coordinate.
         register: first register of the positions or velocities.
-        row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities.
+        row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities. The row
+            stays unchanged where it is larger than the slope.
     """
     a = block.a
     if row_of_result == MAX_FRICTION:

@@ -75,6 +75,9 @@ class ExpressionGraph:
     def make_operation(self, operation: str, *args: ExpressionNode) -> ExpressionNode:
         """Return the node of an operation on nodes.
 
+        If all arguments are constants, the result is computed at once and is a constant too.
+        Otherwise it changes as often as the argument that changes most often.
+
         Args:
             operation: a name of `OPERATIONS`.
             *args: argument nodes.
@@ -356,12 +359,13 @@ class TracedArray(NDArrayOperatorsMixin):
         return TracedArray(self.graph, nodes, self.mask)
 
     def _reduce_axis(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
-        """Apply an operation with two operands to the elements along an axis, from first to last.
+        """Combine the elements along an axis with an operation of two operands, such as a sum.
 
-        An axis of None means all elements.
+        Elements are combined one after the other, from first to last. An axis of None means all
+        elements. With `keepdims`, the axis stays with length one.
         """
         if axis is None:
-            reduced = self.reshape(-1)._reduce_axis(operation, 0, False)
+            reduced = self.reshape(-1)._reduce_axis(operation, axis=0, keepdims=False)
             return reduced.reshape((1,) * self.ndim) if keepdims else reduced
         parts = list(np.moveaxis(self.nodes, axis, 0))
         total = TracedArray(self.graph, to_node_array(parts[0]))

@@ -40,9 +40,10 @@ GAIN_KEYS_BY_KIND: Mapping[str, tuple[str, ...]] = {
 
 
 def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[str, ...]:
-    """Add actuators to a model.
+    """Add the actuators that a recording's description states to a model.
 
-    With the gear times the joint's position l, its rate v and the control u, they exert
+    Let l be the joint's position times the gear, v the rate of l, and u the control. Actuators
+    exert, by their kind,
 
         motor     u                                                                             (1)
         position  kp (u - l) - kv v                                                             (2)
@@ -82,8 +83,9 @@ def _check_actuator_table(
 ) -> None:
     """Check the table of an added actuator: its joint, kind, name and gains.
 
-    A message names the table, the wrong entry and what is expected. `kp`, `ki`
-    and `kv` are gains on position, integral and velocity; `kd` acts on the rate of the error.
+    The joint must have one degree of freedom, the kind determines the allowed gains, and the first
+    of these is required. `kp`, `ki` and `kv` are gains on position, integral and velocity; `kd`
+    acts on the rate of the error, and so excludes `kv`. Only the gear may be negative.
 
     Args:
         spec: editable MuJoCo model (`mujoco.MjSpec`) with the joints and actuators of the file.
@@ -170,7 +172,7 @@ def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
     """Make an actuator a PID servo, by eq. (4) or (5) of `add_actuators`.
 
     With kd, a gain on the rate of the error, the actuator has two controls: the set point and
-    its rate.
+    its rate. MuJoCo then takes kd in place of kv.
     """
     import mujoco
 

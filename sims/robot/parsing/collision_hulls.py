@@ -91,9 +91,10 @@ class Hull:
 
 
 def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull | None:
-    """Read the convex hull of a compiled mesh, which is all that contacts read of it.
+    """Read the convex hull of a compiled mesh: all that contacts read of the mesh.
 
-    A reduced model that contains the hull needs less memory, and its contacts are bitwise equal.
+    A model that contains the hulls instead of the meshes needs less memory, and its contacts are
+    bitwise equal. The steps are:
 
     1. Read the graph of the hull's edges.
     2. Renumber its vertices, so that the others can be left out.
@@ -108,8 +109,9 @@ def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull |
         The hull; None if the mesh has none, since no geom with it collides.
     """
     # 1. Graph.
-    # MuJoCo's graph: the numbers of vertices and faces, then per vertex the address of its edges
-    # and its number in the mesh, then the edges, then three vertices for each face.
+    # MuJoCo's graph of n vertices and f faces is one array of integers: n and f; the address of the
+    # edges of each vertex (n); the number of each vertex in the mesh (n); the edges (n + 3 f); and
+    # three vertices for each face (3 f).
     graph_address = int(model.mesh_graphadr[mesh])
     if graph_address < 0:
         return None
@@ -127,6 +129,7 @@ def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull |
     )
     new_numbers = np.full(all_vertices.size, -1, dtype=np.int32)
     new_numbers[kept_vertices] = np.arange(kept_vertices.size)
+    # The two parts of the graph that have numbers of the mesh: its vertices and its faces.
     for vertex_entries in (
         slice(2 + vertex_count, 2 + 2 * vertex_count),
         slice(graph.size - 3 * face_count, graph.size),
@@ -173,8 +176,10 @@ class CollisionShapes:
     def read(cls, model: Any, hulls: Mapping[str, Hull], geoms: Mapping[str, int]) -> Self:
         """Read the data from the model with the whole meshes.
 
+        They are rounded differently in a model that is compiled from hulls.
+
         Args:
-            model: model with the whole meshes.
+            model: compiled model with the whole meshes.
             hulls: hulls by name of the mesh.
             geoms: numbers of the geoms in that model, by geom name.
         """
@@ -216,33 +221,37 @@ def _get_bounding_volumes(model: Any, body: int) -> Array:
 
 
 def add_hull(spec: Any, name: str, hull: Hull) -> None:
-    """Add a mesh to a spec that compiles to the hull's vertices in the hull's frame.
+    """Add a mesh with a hull's vertices to an editable model, so that compilation keeps them.
 
-    MuJoCo moves a mesh into the principal frame of its faces. The added faces are those of a small
-    box around the origin, whose frame is the hull's, so that no vertex moves.
+    When MuJoCo compiles a mesh, it moves the vertices into the principal frame of the faces, which
+    would round them. So the only faces are those of a small box inside the hull, around its origin
+    and along its axes: its principal frame is the present one, and no vertex moves.
 
     Args:
-        spec: the mujoco.MjSpec; it is changed in place.
+        spec: editable MuJoCo model (`mujoco.MjSpec`); it is changed in place.
         name: name of the mesh.
         hull: hull to add.
     """
     import mujoco
 
-    core_size = float(np.abs(hull.vertices).max()) * CORE_SIZE_SHARE
-    # The principal moments must decrease from x to z, else MuJoCo would exchange the axes.
-    sides = 2.0 ** np.floor(np.log2(core_size)) * np.array([0.25, 0.5, 1.0])
-    signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    vertices = np.concatenate([hull.vertices.astype(float), sides * np.array(signs)])
+    box_size = float(np.abs(hull.vertices).max()) * CORE_SIZE_SHARE
+    # The principal moments must decrease from x to z, else MuJoCo would exchange the axes. Powers
+    # of two are exact.
+    half_sides = 2.0 ** np.floor(np.log2(box_size)) * np.array([0.25, 0.5, 1.0])
+    corner_signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    vertices = np.concatenate([hull.vertices.astype(float), half_sides * np.array(corner_signs)])
     faces = np.array(CORE_FACES) + len(hull.vertices)
     mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
 
 
 def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull]) -> None:
-    """Add meshes to a MuJoCo model so that its arrays are large enough for `write_hulls`.
+    """Add unused meshes to a model, so that its arrays are large enough for `write_hulls`.
 
-    MuJoCo computes its own hulls when it compiles, which can have fewer elements than the original
-    ones. The additional meshes, a sphere and a pyramid, reserve the difference.
+    MuJoCo allocates memory for the hulls that it computes when it compiles. These can be smaller
+    than the original ones, which are written over them later. Two additional meshes reserve the
+    difference: a sphere with many vertices makes the arrays longer, and a pyramid, whose base has
+    many corners, makes the buffers for single polygons longer.
 
     Args:
         spec: editable MuJoCo model with the meshes of `add_hull`; it is changed in place.
@@ -296,7 +305,10 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
     """Replace the hulls that MuJoCo's compiler has computed by those of the original meshes.
 
     The compiler computes them from rounded vertices, so contacts would differ in their eighth
-    digit. The data of all hulls are written one after another into MuJoCo's arrays.
+    digit. MuJoCo stores the hulls of all meshes one after another in common arrays, with the
+    address of each mesh. So all of them are written anew: first the graph, then the polygons, then
+    for each vertex the polygons around it. Meshes without a hull, and those that only reserve
+    memory, get the address -1 or no polygons.
 
     Args:
         model: model compiled from a spec with meshes of `add_hull` and `add_memory_reserve`.
@@ -351,24 +363,24 @@ def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
 
 
 def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) -> Lists:
-    """Copy lists of the given begins and sizes out of a flat array.
+    """Copy lists, which lie anywhere in a flat array, into one array without gaps.
 
     Args:
-        values: flat array.
-        first_indices: index of the first entry of each list.
-        sizes: number of its entries.
+        values: flat array that contains the lists.
+        first_indices: (n,) index of the first entry of each list.
+        sizes: (n,) number of its entries.
     """
     list_ends = np.cumsum(sizes)
-    indices = np.repeat(first_indices - list_ends + sizes, sizes) + np.arange(
-        list_ends[-1] if list_ends.size else 0
-    )
+    # Distance by which each list lies further back in `values` than in the result.
+    offsets = first_indices - (list_ends - sizes)
+    indices = np.repeat(offsets, sizes) + np.arange(list_ends[-1] if list_ends.size else 0)
     return Lists(values[indices], sizes.copy())
 
 
 def _write_lists(
     values: Integers, first_indices: Integers, sizes: Integers, lists: Lists, first: int
 ) -> int:
-    """Write lists into an array from index `first` on; return the end index.
+    """Write lists one after another into an array of MuJoCo, and return the index after the last.
 
     Args:
         values: flat array, changed in place.
@@ -388,10 +400,11 @@ OVERLAP_DEPTH = 1e-4
 
 
 def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
-    """Exclude contacts of bodies that a model file lets overlap by construction.
+    """Exclude contacts between bodies that overlap in the model file, but not in reality.
 
-    They would exert large forces that a real robot does not have. These are contacts between the
-    fixed base and the bodies attached to it, and between bodies that overlap at the zero position.
+    Shapes of neighbouring links often overlap at their joint, and would push each other apart with
+    large forces. Excluded are contacts between the fixed base and the bodies attached to it, and
+    between bodies that overlap at the zero position by more than `OVERLAP_DEPTH`.
     MuJoCo itself excludes contacts between a body and its parent, except if the parent is the
     world; the root of a URDF is fused to the world.
 
@@ -404,9 +417,11 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
     """
     import mujoco
 
-    bodies = model.geom_bodyid
+    # MuJoCo's body 0 is the world, and so the fixed base. A geom of contact type 0 never collides.
     colliding_bodies = {
-        int(body) for body, kind in zip(bodies, model.geom_contype, strict=True) if kind
+        int(body)
+        for body, contact_type in zip(model.geom_bodyid, model.geom_contype, strict=True)
+        if contact_type
     }
     base_children = []
     if 0 in colliding_bodies:
@@ -445,10 +460,12 @@ def can_collide(model: Any) -> bool:
 
 
 def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
-    """Find the geoms of a compiled model that can collide with another geom.
+    """Find the geoms (shapes) of a compiled model that can collide with another geom.
 
-    The pairs are filtered by MuJoCo's own rules (its documentation, "Computation", collision
-    detection).
+    All others can be left out to save memory. Pairs are filtered by MuJoCo's own rules (its
+    documentation, "Computation", collision detection): the bit masks contype and conaffinity of the
+    two geoms must match; their bodies must not be welded together, nor parent and child, nor
+    excluded by the file. Pairs that the file lists explicitly always collide.
 
     Args:
         model: the mujoco.MjModel, without flexes.
@@ -458,6 +475,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     """
     import mujoco
 
+    # Number of the topmost body to which each body is welded, that is, attached without a joint.
     weld = np.asarray(model.body_weldid)
     bodies = np.asarray(model.geom_bodyid)
     geom_rows = (bodies, model.geom_contype, model.geom_conaffinity)
@@ -476,6 +494,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
             (parent_weld[:, None] == weld_ids) & (weld_ids != 0) & (weld_ids[:, None] != 0)
         )
         can_collide &= ~(is_parent_pair | is_parent_pair.T)
+    # MuJoCo writes an excluded pair of bodies as one number.
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
     can_collide &= ~np.isin((first << 16) + second, model.exclude_signature)
     result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]
@@ -492,6 +511,8 @@ def has_equal_contacts(
     """Return whether contacts with convex hulls equal those with whole meshes, in random poses.
 
     The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
+    Number, geoms, distances, points and frames of the contacts must be bitwise equal. The random
+    poses are the same in every call.
 
     Args:
         model: compiled model with whole meshes.

@@ -36,10 +36,12 @@ def compute_triangle_violation(moments: Array) -> float:
 
 
 def find_nearest_valid_moments(moments: Array) -> Array:
-    """Return the nearest physically valid moments, in kg m^2: positive, with A + B >= C.
+    """Return the nearest physically valid moments of inertia, in kg m^2.
 
-    Principal moments A <= B <= C of a rigid body satisfy A + B >= C. A violation A + B < C is
-    divided equally: the largest moment is decreased and both others are increased by a third of it.
+    Moments that are not positive become `MIN_MOMENT`. Principal moments A <= B <= C of a rigid body
+    also satisfy A + B >= C. If A + B is smaller, the violation C - A - B is divided equally: the
+    largest moment is decreased and both others are increased by a third of it, with a margin for
+    rounding.
 
     Args:
         moments: (3,) principal moments in kg m^2.
@@ -47,10 +49,9 @@ def find_nearest_valid_moments(moments: Array) -> Array:
     raised_moments: Array = np.maximum(
         moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0)
     )
-    correction = (
-        compute_triangle_violation(raised_moments) + ROUNDING_SHARE * np.max(raised_moments)
-    ) / 3
-    if correction <= ROUNDING_SHARE * np.max(raised_moments) / 3:
+    margin = ROUNDING_SHARE * np.max(raised_moments)
+    correction = (compute_triangle_violation(raised_moments) + margin) / 3
+    if correction <= margin / 3:  # without a violation
         return raised_moments
     return np.where(
         raised_moments == np.max(raised_moments),
@@ -118,13 +119,13 @@ class CompileRepairs:
     slight: list[str] = field(default_factory=list)
 
     def compile(self, spec: Any) -> tuple[Any, Any]:
-        """Compile a spec, and repair what MuJoCo rejects.
+        """Compile an editable model, and repair what MuJoCo rejects.
 
-        MuJoCo reports one error at a time. So the spec is compiled again after each repair;
+        MuJoCo reports one error at a time. So the model is compiled again after each repair;
         the number of attempts is limited by two for each body, mesh and texture.
 
         Args:
-            spec: a mujoco.MjSpec; it must not be used afterwards.
+            spec: editable model (`mujoco.MjSpec`); it must not be used afterwards.
 
         Returns:
             The repaired spec, copied before compilation since a compiled spec holds all meshes
@@ -169,10 +170,13 @@ class CompileRepairs:
         )
 
     def _repair_triangle_inequality(self, spec: Any) -> bool:
-        """Replace principal moments that violate the triangle inequality A + B >= C, in all bodies.
+        """Replace principal moments that no rigid body can have, in all bodies.
 
-        Returns whether any body was changed; no rigid body can have moments that violate
-        it.
+        The moments A <= B <= C of a body satisfy the triangle inequality A + B >= C. Each changed
+        body is noted in `balanced`, with the values before and after.
+
+        Returns:
+            Whether any body was changed.
         """
         before = len(self.balanced)
         for body in spec.bodies:
@@ -184,7 +188,11 @@ class CompileRepairs:
         return len(self.balanced) > before
 
     def _set_default_mass(self, spec: Any, name: str) -> bool:
-        """Give a moving body the default mass and the least moments, where it has less.
+        """Give a moving body the default mass and moments of inertia, where it has less.
+
+        MuJoCo refuses moving bodies without mass or inertia. A changed body is noted: in `massless`
+        if it had no mass, by whether other bodies are attached to it (without any, its joints have
+        little effect), otherwise in `slight`.
 
         Args:
             spec: the model as an `MjSpec`, changed in place.
@@ -195,10 +203,8 @@ class CompileRepairs:
         """
         for body in [body for body in spec.bodies if body.name == name]:
             mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
-            is_too_light, has_small_moments = (
-                mass < DEFAULT_BODY_MASS,
-                min(moments) < MIN_MOMENT * (1 - ROUNDING_SHARE),
-            )
+            is_too_light = mass < DEFAULT_BODY_MASS
+            has_small_moments = min(moments) < MIN_MOMENT * (1 - ROUNDING_SHARE)
             body.mass = max(mass, DEFAULT_BODY_MASS)
             _set_principal_moments(body, np.maximum(moments, MIN_MOMENT), axes)
             body.explicitinertial = True
@@ -241,9 +247,10 @@ class CompileRepairs:
 
 
 def _get_principal_moments(body: Any) -> tuple[Array, Array | None]:
-    """Return the specified principal moments in kg m^2, and their axes or None.
+    """Return the principal moments of inertia of a body in kg m^2, and their axes.
 
-    None stands for the axes of the body's inertial frame.
+    A model file states either a full inertia tensor, or moments about the axes of the body's
+    inertial frame; the axes are None then. Numbers that are missing count as zero.
     """
     tensor = np.asarray(body.fullinertia, dtype=float)
     if np.isfinite(tensor).all() and tensor.any():
@@ -280,7 +287,7 @@ MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
 
 
 def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
-    """Apply the time step and integrator of a recording to a model, and fix its base.
+    """Apply the table ``[engine]`` of a recording to a model: its time step, integrator and base.
 
     Args:
         spec: a mujoco.MjSpec; it is changed in place.
@@ -335,7 +342,10 @@ def fix_bases(spec: Any) -> list[str]:
 
 
 def remove_keyframes(spec: Any) -> str:
-    """Remove the keyframes of a model whose coordinates change, and return the end of a note.
+    """Remove the keyframes (stored states) of a model, and return the end of a note about them.
+
+    A caller that changes joints must remove them, because they have values for the former
+    coordinates. The text is empty if there are none.
 
     Args:
         spec: a mujoco.MjSpec; it is changed in place.

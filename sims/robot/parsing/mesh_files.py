@@ -125,10 +125,12 @@ class OmittedShapes:
     seen: dict[str, list[str]] = field(default_factory=dict)
 
     def leave_out(self, spec: Any, geom: Any, label: str, reason: str) -> None:
-        """Remove a geom from a spec and record it.
+        """Remove a geom (shape) whose file cannot be used, and record it for a note to the user.
+
+        The notes tell shapes that could have touched others from those that are only visual.
 
         Args:
-            spec: the mujoco.MjSpec.
+            spec: editable model (`mujoco.MjSpec`); it is changed in place.
             geom: geom to remove.
             label: file or name of the shape, for messages.
             reason: why the shape or texture cannot be read.
@@ -163,9 +165,11 @@ class OmittedShapes:
 
 
 def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
-    """Return whether the mass of a moving body is computed from a geom.
+    """Return whether the mass of a moving body is computed from a geom (shape).
 
-    Such a geom must not be removed, because the body would lose its mass.
+    Such a geom must not be removed, because the body would lose its mass. MuJoCo's setting
+    ``inertiafromgeom`` decides: always, never, or if the file states no mass of the body. Geoms
+    without mass or density, and those of other groups than the setting states, do not count.
 
     Args:
         spec: the mujoco.MjSpec.
@@ -174,17 +178,16 @@ def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
     """
     import mujoco
 
-    low, high = spec.compiler.inertiagrouprange
-    rule, always_rule = (
-        spec.compiler.inertiafromgeom,
-        mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE,
-    )
-    never_rule = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
-    if rule == never_rule or (rule != always_rule and body.explicitinertial):
+    rule = spec.compiler.inertiafromgeom
+    always = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    never = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    if rule == never or (rule != always and body.explicitinertial):
         return False
+    # NaN is a mass that the file does not state; it follows from the density then.
     if geom.mass == 0 or (not np.isfinite(geom.mass) and geom.density == 0):
         return False
-    return bool(low <= geom.group <= high) and is_moving_body(body)
+    first_group, last_group = spec.compiler.inertiagrouprange
+    return bool(first_group <= geom.group <= last_group) and is_moving_body(body)
 
 
 def is_moving_body(body: Any) -> bool:

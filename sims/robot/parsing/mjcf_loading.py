@@ -56,13 +56,13 @@ class MissingFiles:
     pictures: list[str] = field(default_factory=list)
 
     def remove_from_spec(self, spec: Any, omitted: OmittedShapes) -> None:
-        """Remove elements with missing files from a spec.
+        """Remove the elements whose files are missing from a model.
 
-        The file was loaded with placeholders for the missing files; these are removed
-        before compilation.
+        MuJoCo would refuse a model with missing files, so it was loaded with placeholders for them.
+        These are removed here, before compilation, with all geoms (shapes) that use them.
 
         Args:
-            spec: the mujoco.MjSpec; it is changed in place.
+            spec: editable model (`mujoco.MjSpec`); it is changed in place.
             omitted: record of omitted shapes.
 
         Raises:
@@ -82,6 +82,10 @@ class MissingFiles:
 
 def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles:
     """Read the files that an MJCF refers to, and insert placeholders for missing ones.
+
+    Reading adds the files to the digest of the model, so that a changed mesh is another model. A
+    missing file is no error yet: a robot can be simulated without a visual mesh. The folders of
+    the files are those of the element ``<compiler>``; later settings replace earlier ones.
 
     Args:
         files: reader of the model file.
@@ -121,12 +125,14 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
 
 
 def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> None:
-    """Reject counts and sizes that would exhaust the memory.
+    """Reject counts and sizes in a model file that would exhaust the memory.
+
+    A short file may ask for many elements: for a grid of 1000 x 1000, or for a copy of copies.
 
     Args:
         files: reader of the model file, which makes the errors.
         element: element to check, with all its children.
-        factor: product of all counts above the element, since nested replicates multiply.
+        factor: number of copies of the element, the product of all counts above it; 1 for the root.
     """
     for key, value in element.items():
         size_numbers = (
@@ -156,7 +162,9 @@ def _parse_size(text: str) -> float:
 
 
 def _read_attached_model(files: ModelFileReader, element: Element) -> None:
-    """Read an attached model, which MuJoCo opens itself.
+    """Check an attached model, another model file that MuJoCo opens itself.
+
+    Its content becomes part of the digest, and its sizes are checked like those of the main file.
 
     Args:
         files: reader of the files of the model.
@@ -203,7 +211,11 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
 def _insert_placeholder(
     missing_files: MissingFiles, asset: Element, element: Element, file: str
 ) -> None:
-    """Replace an asset with a missing file by a placeholder that loads, if possible.
+    """Replace an asset with a missing file by a placeholder that MuJoCo loads.
+
+    A mesh becomes a tetrahedron, a height field a flat square, and a texture a single colour. A
+    skin, which is only visual, is removed. Other assets are left unchanged, so that MuJoCo reports
+    the missing file.
 
     Args:
         missing_files: missing files found so far; the asset is added.
@@ -227,6 +239,6 @@ def _insert_placeholder(
         asset.remove(element)
         return
     else:
-        return  # MuJoCo itself reports what is missing.
+        return
     element.attrib.clear()
     element.attrib.update(attributes)

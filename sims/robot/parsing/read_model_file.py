@@ -99,10 +99,10 @@ def _make_robot(
 ) -> RobotModel:
     """Repair, complete and compile a parsed model file, and make the robot from it.
 
-    The steps are: repair of the XML, parsing by MuJoCo, actuators and engine settings of the
-    recording, names of unnamed elements, replacement of recorded floating joints, compilation with
-    repairs, and removal of contacts that overlap in the reference pose (URDF only). Every repair
-    adds a note.
+    The steps are: repair the XML; let MuJoCo parse it; add the actuators and engine settings of the
+    recording; name unnamed elements; replace floating joints whose pose is recorded; compile with
+    repairs; and, for a URDF, exclude contacts of bodies that overlap in the reference pose, and
+    compile again. Every repair adds a note.
 
     Args:
         files: reader of the model file.
@@ -170,7 +170,10 @@ def _make_robot(
 
 
 def _check_model(files: ModelFileReader, model: Any) -> None:
-    """Check that a compiled model can be simulated: it moves, its time step and numbers are sane.
+    """Check that a compiled model can be simulated.
+
+    It must have a joint, its time step must be in the allowed range, and masses, inertias, places
+    and forces of its joints must be finite and not huge. The message names the first wrong value.
 
     Args:
         files: reader of the files of the model, for messages.
@@ -187,14 +190,18 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)
-        faults = np.argwhere(~(np.abs(values) <= MAX_NUMBER))
-        if len(faults):
-            (row, *_), (kind, quantity) = faults[0], field.split("_", 1)
+        # Also true for NaN.
+        fault_indices = np.argwhere(~(np.abs(values) <= MAX_NUMBER))
+        if len(fault_indices):
+            first_fault = tuple(fault_indices[0])
+            row = first_fault[0]
+            # MuJoCo's fields begin with "body", "jnt" or "dof", which says what a row belongs to.
+            kind, quantity = field.split("_", 1)
             joint = model.dof_jntid[row] if kind == "dof" else row
             name = (model.body(row) if kind == "body" else model.joint(joint)).name
             raise InputError(
                 f"{files.path}: {quantity} of {truncate_text(name)}: "
-                f"expected numbers within ±{MAX_NUMBER:g}, found {values[tuple(faults[0])]:g}"
+                f"expected numbers within ±{MAX_NUMBER:g}, found {values[first_fault]:g}"
             )
 
 
@@ -221,6 +228,9 @@ def _parse_repaired_file(files: ModelFileReader, root: Element) -> Any:
 
 def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
     """Map the bodies that MuJoCo fused into others to the bodies that contain them.
+
+    MuJoCo fuses a body that is fixed to its parent into the parent, possibly repeatedly. Users
+    still refer to it by its name in the file.
 
     Args:
         parents: parent of each body of the file that may be fused, by name.

@@ -19,11 +19,13 @@ from sims.robot.parsing.compile_repairs import remove_keyframes
 def separate_floating_joints(
     spec: Any, bases: Sequence[str], source: str
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Replace floating joints by three slides along the axes of the world, and three hinges.
+    """Replace free joints by three slides and three hinges, and ball joints by three hinges.
 
-    All coordinates are as in `sims.recording.recorded_poses`: slides have the position of the body
-    in the world, hinges are zero in the orientation of the file. Keyframes are left out, since they
-    have other coordinates.
+    A quaternion is not a coordinate that can be recorded, varied or fitted like that of another
+    joint. The new joints allow the same motion with such coordinates, which are those of
+    `sims.recording.recorded_poses`: slides along the axes of the world have the position of the
+    body in the world, and hinges about z, y and x are zero in the orientation of the file.
+    Keyframes (stored states) are left out, since they have the former coordinates.
 
     Args:
         spec: a mujoco.MjSpec whose joints have names; it is changed in place.

@@ -44,6 +44,11 @@ def repair_inertials(
 ) -> list[str]:
     """Repair masses and moments of inertia of links that MuJoCo would reject.
 
+    A missing mass becomes zero, and principal moments that are not positive become the nearest ones
+    that a body can have. A link without any inertial stays as it is: MuJoCo computes its mass from
+    its collision shapes. The notes are silent about links whose mass has no influence: those that
+    never move, and mere frames with almost no mass.
+
     Args:
         files: reader of the model file.
         links: link elements by name; changed in place.
@@ -59,14 +64,13 @@ def repair_inertials(
     for name, link in links.items():
         inertials = find_children(link, "inertial")
         if not inertials:
-            inferred_links += (
-                [name] if find_children(link, "collision") and name not in fixed_links else []
-            )
+            if find_children(link, "collision") and name not in fixed_links:
+                inferred_links.append(name)
             continue
-        weight = get_link_mass(link)
-        if not 0 <= weight < math.inf:
+        mass = get_link_mass(link)
+        if not 0 <= mass < math.inf:
             raise files.make_error(
-                inertials[0], f"link {truncate_text(name)}: its mass is {weight:g} kg"
+                inertials[0], f"link {truncate_text(name)}: its mass is {mass:g} kg"
             )
         if not find_children(inertials[0], "mass"):
             SubElement(inertials[0], "mass", value="0")
@@ -79,15 +83,19 @@ def repair_inertials(
                 tensor, f"link {truncate_text(name)}: its inertia is not made of numbers"
             )
         change = _raise_moments(tensor, entries)
-        if name in fixed_links or weight < FRAME_MASS_THRESHOLD or not change:
+        if name in fixed_links or mass < FRAME_MASS_THRESHOLD or not change:
             continue
-        point_masses += [name] if max(map(abs, entries)) < compile_repairs.NEGLIGIBLE_MOMENT else []
-        raised_links += [f"{name} {change}"] if name not in point_masses else []
+        if max(map(abs, entries)) < compile_repairs.NEGLIGIBLE_MOMENT:
+            point_masses.append(name)
+        else:
+            raised_links.append(f"{name} {change}")
     return _format_repair_notes(point_masses, raised_links, inferred_links)
 
 
 def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
     """Raise principal moments that are not positive; return a text about the change.
+
+    The text has the moments before and after; it is empty if nothing was changed.
 
     Args:
         tensor: element with the inertia tensor, changed in place.
@@ -139,6 +147,9 @@ def remove_unusable_shapes(
 ) -> list[str]:
     """Remove visual shapes, and collision shapes whose mesh is missing or of an unsupported format.
 
+    The paths of the other meshes are replaced by those of the files found. A missing mesh is only
+    acceptable if the mass of the link does not follow from its shapes.
+
     Args:
         files: reader of the model file.
         links: link elements by name; changed in place.
@@ -170,7 +181,9 @@ def remove_unusable_shapes(
 def _resolve_collision_shape(
     files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, has_mass: bool
 ) -> bool:
-    """Return whether a collision shape can be read, and set the path of its mesh.
+    """Set the path of a collision shape's mesh, and return whether the shape can be read.
+
+    A shape without a mesh, such as a box, can always be read. A mesh that cannot be read is noted.
 
     Args:
         files: reader of the files of the model.
@@ -214,6 +227,11 @@ MuJoCo raises its time constant, in s, to two time steps.
 
 def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     """Repair a URDF in place, so that MuJoCo reads it and nothing is ignored without a note.
+
+    The steps are: reject unexpanded macros; add a missing world link; remove elements that MuJoCo
+    does not read; give joints unique names; check that the links form a tree with a moving joint;
+    remove repeated elements; repair inertials; remove shapes without a file, meaningless limits,
+    and relations between joints (mimics) that MuJoCo cannot represent.
 
     Args:
         files: reader of the model file.
@@ -356,12 +374,18 @@ def _get_link_name(files: ModelFileReader, joint: Element, tag: str) -> str:
 def _find_parent_links(
     files: ModelFileReader, links: Mapping[str, Element], joints: Sequence[Element]
 ) -> dict[str, tuple[str, Element]]:
-    """Return the parent link and the joint of each link; raise an error if links form no tree.
+    """Return the parent link of each link with the joint to it, and check that links form a tree.
+
+    In a tree every joint connects two existing links, no link has two parents, and no link is its
+    own ancestor. The root is left out, because it has no parent.
 
     Args:
         files: Reader of the model file, which locates errors.
         links: Elements ``<link>`` by name.
         joints: Elements ``<joint>``.
+
+    Raises:
+        InputError: the links do not form a tree, or the type of a joint is unknown.
     """
     parents: dict[str, tuple[str, Element]] = {}
     for joint in joints:
@@ -417,7 +441,9 @@ def _get_compiler_element(root: Element) -> Element:
 
 
 def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
-    """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF.
+    """Raise an error for wrong MuJoCo settings in a URDF, which MuJoCo would ignore there.
+
+    Each setting is parsed alone as an MJCF, in which MuJoCo reports unknown names.
 
     Args:
         files: reader of the files of the model.
@@ -477,8 +503,9 @@ def read_velocity_limits(root: Element) -> dict[str, float]:
 def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
     """Remove limits that are meaningless, and return notes about the limits of joints.
 
-    Removed are limits of joints without one degree of freedom, effort limits that are not
-    positive, position limits of continuous joints, and position ranges that are empty.
+    Removed are limits of joints without one degree of freedom, effort limits (maximum force or
+    torque) that are not positive, position limits of continuous joints, and position ranges that
+    are empty. Valid effort limits are noted too, because they have an influence on the motion.
     """
     invalid_efforts, empty_ranges, effort_limits = [], [], []
     for joint in joints:
@@ -493,10 +520,11 @@ def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
                 del limit.attrib["effort"]
             elif effort > 0:
                 effort_limits.append(f"{name} {effort:g}")
-            if kind == "continuous" or parse_number(limit.get("lower")) >= parse_number(
-                limit.get("upper")
-            ):
-                empty_ranges += [name] if kind != "continuous" else []
+            lower, upper = (parse_number(limit.get(key)) for key in ("lower", "upper"))
+            is_continuous = kind == "continuous"
+            if is_continuous or lower >= upper:
+                if not is_continuous:
+                    empty_ranges.append(name)
                 limit.attrib.pop("lower", None)
                 limit.attrib.pop("upper", None)
     notes = []

@@ -97,7 +97,11 @@ class ModelFileReader:
 
 
 def parse_tree(files: ModelFileReader, path: Path) -> Element:
-    """Parse a file and return its root element.
+    """Parse a model file safely, and return its root element.
+
+    Python's own reader does not tell the lines of elements, and repeats entities that a hostile
+    file declares. So a parser is used whose calls for each tag build the tree, note the line of
+    every element for messages, and refuse declarations.
 
     Args:
         files: reader of the model.
@@ -185,7 +189,7 @@ class _LineTrackingTreeBuilder:
 
 
 def resolve_includes(files: ModelFileReader, root: Element) -> None:
-    """Replace ``resolve_includes`` elements by the content of their files, as MuJoCo does.
+    """Replace ``include`` elements by the content of their files, as MuJoCo does.
 
     Names are relative to the model file's folder, and no file is included twice.
 
@@ -230,7 +234,10 @@ def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
 
 
 def format_tree(root: Element) -> tuple[str, list[Element]]:
-    """Format a tree as text with one element begun in each line.
+    """Format a tree as text in which exactly one element begins in each line.
+
+    So the line in a message of MuJoCo about this text leads to the element, and to its line in the
+    user's file.
 
     Returns:
         The text, and the element that begins in each line.
@@ -264,6 +271,9 @@ FREE_TEXT_ATTRIBUTES = ("file", "class", "childclass", "filename")
 
 def rename_invalid_names(root: Element) -> list[str]:
     """Rename elements whose names contain `RESERVED_CHARACTERS`, and all references to them.
+
+    Users write the place of an effect as ``EFFECT@NAME``, so names must not contain such a
+    character. It is replaced by an underscore; further underscores make the name unique.
 
     Args:
         root: root element of the model file; it is changed in place.
