@@ -132,8 +132,8 @@ def begin_step(block: Block) -> None:
 def begin_step_1d(block: Block) -> None:
     """Do the work of `begin_step` if dry friction acts only on the first coordinate.
 
-    There is no ground. The numbers are the same. All cases are computed and one is selected, without branches, so that
-    the compiler can vectorise the loop over slots.
+    There is no ground. The numbers are the same. All cases are computed and one is selected,
+    without branches, so that the compiler can vectorise the loop over slots.
 
     Args:
         block: force program, batch elements and their buffers. Slot i holds one element: its

@@ -66,10 +66,10 @@ class ActivationFilter(NamedTuple):
     def compute_activations(
         self, controls: Array, initial: Array, step: float, is_rk4: bool
     ) -> Array:
-        """Compute activations a at the beginnings of steps of length h, with the time constant T.
+        """Compute the filter's outputs, its activations, at the beginnings of steps.
 
-        They approach the control by the share h / T in each step (Euler's method) or by
-        1 - exp(-h / T) (exactly).
+        The activation approaches the control by the share h / T in each step (Euler's method) or by
+        1 - exp(-h / T) (exactly), with the step length h and the time constant T.
 
         Shapes: S steps.
 
@@ -100,7 +100,8 @@ class ActivationFilter(NamedTuple):
 def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
     """Return the filters before those actuators of a robot that have one control.
 
-    MuJoCo's types `filter` and `filterexact` delay a control by a first-order lag.
+    MuJoCo's types `filter` and `filterexact` delay a control by a first-order lag. Actuators with
+    two controls (a set point and its rate) and those without a filter are left out.
 
     Args:
         robot: Robot with its compiled model.
@@ -118,11 +119,11 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
         low, high = model.actuator_actrange[actuator_id] if is_limited else (-np.inf, np.inf)
         filters_found.append(
             ActivationFilter(
-                actuator,
-                int(model.actuator_actadr[actuator_id]),
-                float(model.actuator_dynprm[actuator_id, 0]),
-                int(model.actuator_dyntype[actuator_id]) == filterexact_id,
-                (float(low), float(high)),
+                actuator=actuator,
+                address=int(model.actuator_actadr[actuator_id]),
+                seconds=float(model.actuator_dynprm[actuator_id, 0]),
+                exact=int(model.actuator_dyntype[actuator_id]) == filterexact_id,
+                limits=(float(low), float(high)),
             )
         )
     return tuple(filters_found)
@@ -159,6 +160,10 @@ def compute_settling_time(robot: RobotModel, initial: Mapping[str, float]) -> fl
 
 def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
     """Extend a scenario into the time before the run for which its inputs are known.
+
+    A filter's initial activation follows from the commands before the run. A recording may contain
+    them, if the run is a part of a longer one. The extended scenario begins a whole number of steps
+    earlier, so that the run's own steps stay the same.
 
     Args:
         scenario: scenario of the run.

@@ -87,7 +87,10 @@ class RunInputs(NamedTuple):
     steps: int
 
     def get_step_fractions(self, step: float, share: float, is_changed: bool) -> Array:
-        """Return the fractions of a step at which it is divided.
+        """Return the fractions of a step at which it is divided to compute mean inputs.
+
+        A step is divided into quarters, so that a command that changes within it has the right
+        time. It is not divided if nothing changes within steps.
 
         Args:
             step: step length in seconds.
@@ -136,7 +139,9 @@ def compute_inputs_over_steps(
     """Compute the applied inputs of n batch elements over S steps.
 
     An applied input is the command after all input effects (gain, delay, lag and so on). MuJoCo
-    holds a control over a step, so that each value is a mean over the step.
+    holds a control over a step, so that each value is a mean over the step. First all elements get
+    the commands without effects, which are cached; then the inputs that effects change replace
+    them.
 
     Shapes: T samples, K coefficients.
 
@@ -184,8 +189,9 @@ def compute_changed_inputs(
 ) -> Iterator[tuple[int, str, IndexArray, Array]]:
     """Compute the inputs that effects change, of several runs together.
 
-    Effects with a state are integrated step by step, and a step costs about the same for few and
-    for many batch elements.
+    Effects with a state, such as a lag, are integrated step by step, and a step costs about the
+    same for few and for many batch elements. So inputs are collected from all runs, grouped by
+    equal step times and equal effects, and each group is integrated at once.
 
     Shapes: L batch elements, S steps.
 
@@ -263,15 +269,16 @@ def _group_by_active_effects(
 ) -> Iterator[tuple[IndexArray, ActiveEffects]]:
     """Group n batch elements by the effects that act on them, without elements on which none acts.
 
-    Yields: Indices of a group's elements, and the effects with the coefficients of these
-    elements.
-
     Shapes: K coefficients.
 
     Args:
-        input_effects: effects with coefficients (K, n, 1).
+        input_effects: effects with coefficients (K, n, 1); one with zeros only does not act.
         n: number of batch elements.
+
+    Yields:
+        Indices of a group's elements, and the effects with the coefficients of these elements.
     """
+    # Row e, column l: whether effect e acts on batch element l.
     is_active = np.array([(c != 0).any(axis=(0, 2)) for _, c in input_effects], dtype=bool).reshape(
         -1, n
     )
@@ -318,7 +325,8 @@ def _compute_applied_inputs(
 ) -> Array:
     """Compute the input that each request applies over each step, (N, S) for N batch elements.
 
-    Delays and filters act within a step.
+    The requests are integrated as one batch on a time grid that divides each step at `fractions`,
+    because delays and filters act within a step. The parts are then combined to one value per step.
 
     Args:
         step: step length in seconds.
@@ -354,7 +362,7 @@ def _compute_applied_inputs(
 def _make_subdivided_grid(
     step: float, steps: int, n: int, fractions: Array, has_uniform_steps: bool
 ) -> TimeGrid:
-    """Make the plan of steps that are subdivided at the given fractions.
+    """Make the time grid of equal steps that are all divided at the given fractions.
 
     Args:
         step: step length in seconds.
@@ -373,17 +381,17 @@ def _make_subdivided_grid(
 
 
 def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
-    """Compute the inputs of steps (n, S) from their means (n, S, 4) over the quarters of each step.
+    """Compute one input for each step (n, S) from its means (n, S, 4) over the quarters of the step.
 
-    A step of length h has one constant control. Its mean is that of the command. The first moment
-    of the command about the middle of the step,
+    MuJoCo holds one control over a step of length h, so a command that changes within a step would
+    be applied too early or too late by a fraction of it. The control has the command's mean. In
+    addition, the first moment of the command about the middle of the step,
 
         D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
 
     is reproduced by adding -D to the step and +D to the next one. If a sample is at the end of the
     step and none at its beginning, -D is added to the previous step and +D to this one, since only
-    the states at samples are observed. So a command that changes within a step is applied neither
-    early nor late by a fraction of the step.
+    the states at samples are observed.
 
     Shapes: S steps.
 
@@ -396,6 +404,7 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     moments = parts @ (weights / 4.0)  # (1)
     means: Array = parts @ np.full(4, 0.25)
     last = parts.shape[1] - 1
+    # Direction of the step that shares the moment: 1 for the next one, -1 for the previous one.
     for direction, allowed in ((1, ~has_sample[1:]), (-1, has_sample[1:] & ~has_sample[:-1])):
         steps = np.flatnonzero(allowed)
         steps = steps[(steps + direction >= 0) & (steps + direction <= last)]

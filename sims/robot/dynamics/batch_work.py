@@ -51,7 +51,8 @@ class RobotRunBatch(NamedTuple):
 def list_last_read_times(work: RobotRunBatch) -> Array:
     """Return the last time, (1,), at which a sensor is read in a run, in seconds since the start.
 
-    With a slow clock the true time passes the last time stamp.
+    The simulation must last until then. Without effects on sensors it is the last time stamp. If
+    an effect makes the clock of the recording slow, the true time is later.
     """
     end = work.times[-1:]
     latest = float(end[0])

@@ -51,8 +51,10 @@ def step_in_callback(
 ) -> dict[str, Array] | None:
     """Step n batch elements S times, with effect forces computed in MuJoCo's callback.
 
-    The result equals that of `MujocoBatch.step_with_forces`, which returns to Python in each
-    step and is used if this function returns None.
+    MuJoCo then makes all steps without returning to Python. The result equals that of
+    `MujocoBatch.step_with_forces`, which returns in each step; the caller uses it if this function
+    returns None. Before the steps, dry friction of effects is prepared, the first controls and the
+    hidden states are set, and each batch element gets a context for the callback.
 
     Args:
         mujoco_batch: the batch, with initial states and effects in its model.
@@ -68,10 +70,12 @@ def step_in_callback(
 
     disable = mujoco.mjtDisableBit
     required_parts = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
-    # Loads of transmissions require evaluations within a step.
+    # Loads of transmissions require evaluations within a step. MuJoCo must compute actuators, in
+    # which it calls the callback, and dry friction.
     if compiled.loaded.any() or mujoco_batch.model.opt.disableflags & required_parts:
         return None
     callback = _get_callback()
+    # A callback that the user has set is not replaced.
     if callback is None or mujoco.get_mjcb_control() is not None:
         return None
     batch_size, steps, _ = controls.shape
@@ -108,12 +112,12 @@ class _CallbackContexts:
     def __init__(
         self, mujoco_batch: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
     ) -> None:
-        """Write one context per batch element: addresses and sizes for the compiled callback.
+        """Write one context for each batch element: addresses and sizes for the compiled callback.
 
-        Entries in `shared` are the same for all elements; those in `element_arrays` belong to one
-        element (`batch_index`). `self._arrays` keeps all of them alive, because the callback holds
-        only their addresses. The table of contexts has one row of 64-bit integers per
-        element.
+        The table of contexts has one row of 64-bit integers for each element. Arrays in `shared`
+        are common to all elements, and those in `element_arrays` belong to one. `self._arrays`
+        keeps all of them alive, because the callback knows only their addresses. The callback finds
+        its row by the entry of `self.addresses` in MuJoCo's user data.
 
         Shapes: D joints.
 
@@ -177,6 +181,9 @@ class _CallbackContexts:
     def reset_accelerations(self, first: int) -> None:
         """Set the previous accelerations of all batch elements before a call of MuJoCo.
 
+        The callback predicts the middle of a step with the acceleration of the previous one. MuJoCo
+        may not keep it between two calls, so it is copied to the registers here.
+
         Args:
             first: number of the first step of the call. The initial acceleration lacks the applied
                 forces, so it is not used.
@@ -196,10 +203,12 @@ def _get_callback() -> Any:
 
 
 def find_data_offsets() -> dict[str, int] | None:
-    """Find the offsets of fields in MuJoCo's data, in words of eight bytes.
+    """Find where MuJoCo's data stores the addresses of its arrays, in words of eight bytes.
 
-    They depend on MuJoCo's version. In the data of a model that has numbers in each of the fields,
-    the address of a field's array is stored at the field, and at empty fields before it.
+    The compiled callback reads arrays of MuJoCo through these addresses. Where they are depends on
+    MuJoCo's version, so they are sought: in the data of a small model, whose arrays are not empty,
+    each word is compared with the known addresses of the arrays. An empty array before one has the
+    same address, so the last word that matches counts.
 
     Returns:
         The offsets by the name of the field; None if a field is not found.

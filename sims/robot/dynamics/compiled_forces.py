@@ -85,11 +85,11 @@ class _Tracing:
     """Traced state of a robot, and programs of the effects that are evaluated at it."""
 
     def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
-        """Make graph inputs for everything that effects may read, and snapshots from them.
+        """Make symbols for everything that effects may read, and two states made of them.
 
-        Effects are called with these snapshots instead of numbers, which records their
-        arithmetic. There are two instants: the beginning of a step, and its middle with the
-        predicted state (midpoint rule). Time, states and inputs change in each step; the servo
+        Effects are called with these states instead of numbers, which records their arithmetic
+        as an expression graph. The two states are at the beginning of a step, and at its middle,
+        which is predicted (midpoint rule). Time, states and inputs change in each step; the servo
         stiffness is constant for a batch element.
 
         Args:
@@ -137,12 +137,12 @@ class _Tracing:
         return self._programs[key]
 
     def _compose_program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
-        """Trace all given effects, and emit one list of instructions for their outputs.
+        """Trace all given effects, and write the instructions that compute their sum.
 
         The three groups of `effects` are forces, dry frictions and effects with hidden
-        states. Outputs are the total force and the friction limit of each joint, and the
-        hidden states after the step. The order of `groups` fixes the order of the input
-        registers, see `_Program.instructions`.
+        states. Each effect is called with symbols, which records its arithmetic. The outputs are
+        the total force and the friction limit of each joint, and the hidden states after the step.
+        The order of `groups` fixes the order of the input registers, see `_Program.instructions`.
         """
         counts: Counter[type[Effect]] = Counter()
         traced: list[list[_TracedEffect]] = []
@@ -171,6 +171,7 @@ class _Tracing:
             )
             force = force + hidden_force
         limit: Any = compute_friction_limits(frictions, self._middle)  # type: ignore[arg-type]
+        # A hidden state has a position x and a rate v.
         later_parts: Any = [part for state in later_states for part in (state.x, state.v)]
         outputs = [self._get_nodes(values) for values in (force, limit, *later_parts)]
         state_inputs: Any = [part for state in states for part in (state.x, state.v)]
@@ -230,11 +231,12 @@ class CompiledForces:
     """
 
     def __init__(self, forces: EffectForces, program: _Program) -> None:
-        """Allocate registers (n, L) for L batch elements, and write everything that stays constant.
+        """Allocate registers for all batch elements, and write the values that stay constant.
 
-        Constant are the step length, the servo stiffness and the coefficients. Instructions
-        that depend only on them, from `first` to `moment`, run once here; the rest runs in
-        each step.
+        Registers are an array with a row for each value of the program and a column for each batch
+        element. Constant are the numbers of the program itself, the step length, the servo
+        stiffness and the coefficients. Instructions that depend only on them run once here; the
+        others run in each step.
 
         Args:
             forces: effects to evaluate.
@@ -261,9 +263,10 @@ class CompiledForces:
         r[stiffness:c] = forces.stiffness.T
         coefficients = [own[:, :, 0] for _, own in _list_effects(forces)]
         r[c:states] = np.concatenate(coefficients)
-        first, moment, end, _ = instructions.ends.tolist()
-        make_instruction_runner(instructions.code, first, moment, r)()
-        self._run = make_instruction_runner(instructions.code, moment, end, r)
+        # Bounds of the instructions that run once for an element, and of those for each step.
+        first_once, first_in_step, end, _ = instructions.ends.tolist()
+        make_instruction_runner(instructions.code, first_once, first_in_step, r)()
+        self._run = make_instruction_runner(instructions.code, first_in_step, end, r)
 
     @cached_property
     def _stacked_inputs(self) -> Array:
@@ -347,9 +350,11 @@ class CompiledForces:
         if self._source.applied_inputs:
             registers[self._u] = self._stacked_inputs[k]
         hidden = self._source.hidden
+        # Hidden states advance from the middle of one step to that of the next; the first time,
+        # from the beginning of the motion, by half a step.
         if hidden and k < 2:
             registers[self._state_interval] = self._source.step if k else 0.5 * self._source.step
-        if not k:
+        if k == 0:
             self.begin(joint_states)
         self._run()
         if hidden:
@@ -358,10 +363,11 @@ class CompiledForces:
 
 
 def compile_forces(forces: EffectForces) -> CompiledForces | None:
-    """Compile the forces of effects into instructions, so that MuJoCo's callback can evaluate them.
+    """Compile the forces of effects into instructions, which run in every step without Python.
 
-    The result is None if there is nothing to compile, if an effect cannot be traced, or if the
-    program would be too large; then the caller evaluates `forces` with NumPy.
+    The result is None if there is nothing to compile, if an effect cannot be traced (its arithmetic
+    cannot be recorded), or if the program would be too large; then the caller evaluates `forces`
+    with NumPy. Traces are kept by the names of the inputs, and programs by the classes of effects.
     """
     groups = [[effect for effect, _ in group] for group in _list_groups(forces)]
     if not any(groups):

@@ -86,7 +86,15 @@ class _ContactModel:
     def __init__(
         self, simulator: RobotSimulator, theta: Array, scenario: Scenario, x: Array, v: Array
     ) -> None:
-        """Take the model with the effects of `theta`, and the first inputs of the run."""
+        """Prepare MuJoCo's model and data with the effects and the inputs of the run's beginning.
+
+        Args:
+            simulator: simulator of the robot.
+            theta: (P,) parameters, of which effects have their coefficients.
+            scenario: scenario of the run, whose first commands act.
+            x: (D,) initial positions of the joints.
+            v: (D,) initial velocities.
+        """
         import mujoco
 
         acting = simulator.get_active_effects(theta[None])
@@ -110,7 +118,12 @@ class _ContactModel:
         self._joints = mujoco_batch.file_joints
 
     def evaluate(self, state: Array) -> dict[_Key, _Contact]:
-        """Return all contacts at a state (2 D,) of the joints."""
+        """Return all contacts at a state (2 D,): positions, then velocities of the D joints.
+
+        The derivative of a contact point's velocity, du/dt = J a + (dJ/dt) v, needs the change of
+        its Jacobian J with time. It is the difference to the Jacobian after the robot has moved by
+        one time step; a contact that no longer exists there counts as unchanged.
+        """
         import mujoco
 
         model, data, joints = self._model, self._data, self._joints
@@ -134,7 +147,12 @@ class _ContactModel:
         return result
 
     def _compute_jacobians(self) -> dict[_Key, tuple[Array, float, bool]]:
-        """Return Jacobian (n, nv), distance and closedness of all contacts of the data."""
+        """Return Jacobian (n, nv), distance, and whether it is closed, for each contact in the data.
+
+        The Jacobian maps the velocities (nv,) of the robot to that of one geom against the other at
+        the contact point, in the frame of the contact: along its normal first, and, with friction,
+        along two tangents. A closed contact exerts a force.
+        """
         import mujoco
 
         model, data = self._model, self._data
@@ -159,6 +177,12 @@ def settle_contacts(
     sigma: tuple[Array, Array],
 ) -> tuple[Array, Array]:
     """Return the likeliest first state of a run at which the contacts are in equilibrium.
+
+    A simulation that begins at the measured state would throw the robot up or let it fall, because
+    contacts are stiffer than a measurement is accurate. The result minimises the sum of squares (2)
+    of the module: deviations from the measured state, and motion of the contact points. Each
+    iteration linearises the contacts by finite differences, solves for a Gauss-Newton step, and
+    halves it until the sum decreases.
 
     Args:
         simulator: simulator of the robot.
@@ -185,6 +209,7 @@ def settle_contacts(
             return start
         cost = _compute_cost(present, keys)
         for _ in range(MAX_ITERATIONS):
+            # The contacts are already in equilibrium.
             if cost <= SETTLED_COST * len(keys):
                 break
             residual = _compute_residual(present, present, keys)
@@ -202,7 +227,7 @@ def settle_contacts(
                 if new_cost < cost:
                     break
                 step = step / 2.0
-            else:
+            else:  # No step decreases the cost.
                 break
             has_converged = cost - new_cost < MIN_DECREASE * cost
             state, present, cost = state + step, contacts, new_cost
@@ -213,7 +238,10 @@ def settle_contacts(
 
 
 def _solve(jacobian: Array, residual: Array, offset: Array, deviations: Array) -> Array:
-    """Return the Gauss-Newton step (2 D,) of (2).
+    """Return the Gauss-Newton step (2 D,) that minimises the sum of squares (2), linearised.
+
+    It is a linear least-squares problem in the state divided by its standard deviations, in which
+    the distance from the measured state has the unit matrix as its derivative.
 
     Args:
         jacobian: (m, 2 D) derivatives of the residual.
@@ -229,7 +257,16 @@ def _solve(jacobian: Array, residual: Array, offset: Array, deviations: Array) -
 def _compute_residual(
     contacts: dict[_Key, _Contact], reference: dict[_Key, _Contact], keys: list[_Key]
 ) -> npt.NDArray[np.float64]:
-    """Return the weighted residual of (1), with the distance of contacts that are open."""
+    """Return the residual of contact equilibrium (1), divided by its tolerances.
+
+    A closed contact must have no normal velocity and no acceleration of its point. An open one must
+    have no normal velocity and a small depth, so that it closes.
+
+    Args:
+        contacts: contacts at the state; one that does not exist there is taken from `reference`.
+        reference: contacts at the state of the linearisation, which decide what is closed.
+        keys: contacts that count.
+    """
     rows: list[Array] = []
     for key in keys:
         contact = contacts.get(key, reference[key])

@@ -97,6 +97,8 @@ class ForceRanges:
 def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
     """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
 
+    The caller multiplies the stiffness of servos by it.
+
     Shapes: D joints.
 
     Args:
@@ -140,11 +142,13 @@ class ForceLimits(NamedTuple):
 
 
 def find_stiff_force_limits(model: Any) -> ForceLimits:
-    """Find the force limits of stiff servos, at which a linearised motion jumps.
+    """Find the force limits of stiff servos, at which the simulated motion jumps.
 
     An implicit integrator takes the servo's damping into account within the step. At its force
-    limit the servo loses this damping, which changes the state abruptly. Other integrators have
-    no such limits, so that the result is empty.
+    limit the servo loses this damping, which changes the state abruptly. A linearised model does
+    not contain such jumps, so its user must know where they can occur. There are two kinds of
+    limits, on the force of an actuator and on the total actuator force at a joint. With other
+    integrators nothing jumps, and the result is empty.
     """
     import mujoco
 
@@ -159,6 +163,7 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
             if dof is None:
                 continue
             gear = abs(float(model.actuator_gear[actuator_id, 0]))
+            # Velocity gain of the servo at its joint; MuJoCo stores it with a negative sign.
             gain = -float(model.actuator_biasprm[actuator_id, 2]) * gear**2
             gains[dof] += gain
             if model.actuator_forcelimited[actuator_id] and _is_stiff(model, dof, gain):
@@ -180,7 +185,9 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
 def _compute_jump(model: Any, dof: int, force: float, gains: Array) -> Array:
     """Compute the jump of all positions (nv,) in a step in which one servo is at its force limit.
 
-    The servos of the other joints are taken as not limited.
+    A force f changes the velocity by h f / (M + h kv) in a step h, with the inertia M and the
+    servos' velocity gains kv. The jump is the difference between this with and without the gain of
+    the limited servo, times h. The servos of the other joints are taken as not limited.
 
     Args:
         model: the mujoco.MjModel.

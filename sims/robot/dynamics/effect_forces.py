@@ -134,7 +134,8 @@ class EffectForces:
 
         Left out are effects that a batch handles otherwise: those written into model
         fields, those whose force depends only on time (precomputed), and those in series
-        with joints.
+        with joints. Also note in which batch elements an effect adds dry friction or depends on the
+        loads of transmissions, because these need additional work in each step.
 
         Args:
             system: see the attributes.
@@ -181,6 +182,9 @@ class EffectForces:
 
     def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Compute forces and dry friction limits (L, D) at the middle of step k.
+
+        MuJoCo holds forces over a step. Evaluated at the predicted middle, they have an error of
+        second order only. Hidden states of effects advance to the same time.
 
         Shapes: L batch elements, D joints.
 
@@ -297,6 +301,9 @@ def compute_hidden_state_forces(
     step: float,
 ) -> tuple[Array, list[HiddenState]]:
     """Advance hidden states of effects, and compute their forces afterwards.
+
+    A hidden state is a variable that an effect has beyond the joints, such as the deflection of
+    bristles in a friction model. An effect whose first coefficient is zero exerts no force.
 
     Shapes: L batch elements, D joints.
 

@@ -106,9 +106,11 @@ class JointScales(NamedTuple):
 
 @cache_per_robot
 def compute_joint_scales(robot: RobotModel) -> JointScales:
-    """Compute typical forces and inertias over random poses within the joints' ranges.
+    """Compute typical forces and inertias of the joints, from random poses within their ranges.
 
-    The force is the larger of the largest gravity force and the force for a typical acceleration.
+    They set the sizes of finite differences and of coefficients. The force is the larger of the
+    largest gravity force and the force for a typical acceleration; the inertia is a mean. The poses
+    are the same in each call.
     """
     import mujoco
 
@@ -138,10 +140,9 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
 def coefficient_scales(robot: RobotModel) -> JointScales:
     """Compute the forces and inertias of each joint (D,) that set the ranges of coefficients.
 
-    The values are those of `compute_joint_scales`, but at least `MIN_PARENT_SHARE` times the values
-    of the parent joint
-    of the same kind. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges
-    of its joint vanish.
+    The values are those of `compute_joint_scales`, but at least `MIN_PARENT_SHARE` times those of
+    the parent joint of the same kind: the next hinge or slide towards the base. So a link whose
+    inertia the file omits (1e-9 kg m^2) does not make the ranges of its joint vanish.
 
     Shapes: D joints.
     """

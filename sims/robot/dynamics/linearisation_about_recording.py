@@ -119,9 +119,10 @@ class MeasuredLinear(RunLinearisation):
     ) -> None:
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
-        Difference quotients are held for one sample interval, but not for less than
-        `LINEARISATION_INTERVAL_SECONDS` or more than `MAX_JACOBIAN_SECONDS`. `knots` (T,) are the
-        numbers of the steps at the samples.
+        The derivatives of a step (Jacobians) are computed by differences, and held for one sample
+        interval, but not for less than `LINEARISATION_INTERVAL_SECONDS` or more than
+        `MAX_JACOBIAN_SECONDS`. `knots` (T,) are the numbers of the steps at the samples. With
+        `nearby`, a model of a similar motion, most of this work is saved.
 
         Shapes: T samples, D joints.
 
@@ -173,8 +174,10 @@ class MeasuredLinear(RunLinearisation):
     def _simulate_nominal_motion(self) -> RobotMotion:
         """Return the given motion with the commands of the run, in place of a simulated motion.
 
-        Commands, activations and joints in series come from a simulation, or from the
-        motion of `nearby`.
+        The base class linearises about a simulated motion; this overrides it. Only positions and
+        velocities of the robot's joints and its floating base are given. All else comes from a
+        simulation or from the motion of `nearby`: commands, activations, and joints in series (the
+        second joints of flexible drives).
         """
         motion = self._get_nearby_motion() or super()._simulate_nominal_motion()
         trajectory = self._trajectory or self._interpolate_samples(motion)
@@ -193,7 +196,8 @@ class MeasuredLinear(RunLinearisation):
     def _get_nearby_motion(self) -> RobotMotion | None:
         """Return the motion of `nearby` with the commands of this model, which saves a simulation.
 
-        The result is None if there is no such motion, or if more than the given joints moves.
+        The result is None if there is no such motion, or if the robot has more states than the
+        positions and velocities of its joints: these are given, all others must be simulated.
         """
         if self._nearby is None or self._trajectory is None:
             return None
@@ -235,16 +239,13 @@ class MeasuredLinear(RunLinearisation):
     # -- the model from sample to sample
 
     def interval_maps(self) -> IntervalMaps:
-        """Compose the steps between samples into linear maps (3), and linearise the readings (4).
+        """Return the linear model from sample to sample that a Kalman smoother needs.
 
-        A deviation of the state from the given motion has one map A per step; the map of an
-        interval is the product of these. The maps give the deviation at the next sample from that
-        at a sample, which a Kalman smoother needs. The defect of each step is composed in the same
-        way.
-
-        For a deviation delta at sample i: delta[i+1] = A_i delta[i] - d_i + G_i f_i + sum_k c_k
-        b_ik (3), y[i] = h + H_i delta[i] + sum_k c_k psi_ik (4), with the missing force f and the
-        effects' coefficients c.
+        Let delta be the deviation of the true state from the given motion, and f a force that the
+        model lacks. Between samples i and i + 1, delta[i+1] = A_i delta[i] - d_i + G_i f_i (3), and
+        the readings are y[i] = h + H_i delta[i] (4). A_i is the product of the derivatives of all
+        steps in the interval; the force and the defect d (the difference between the motion and the
+        model's own step) are composed in the same way. H is computed by finite differences.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]
@@ -254,6 +255,7 @@ class MeasuredLinear(RunLinearisation):
         states = np.tile(np.eye(state_size), (intervals, 1, 1))
         force = np.zeros((intervals, state_size, forces))
         points, quotients = tangent.point_of_step, tangent.quotients
+        # The first step of all intervals at once, then the second, and so on.
         for steps, active in self._list_active_intervals():
             a = quotients.states[points[steps]]
             states[active] = a @ states[active]
@@ -272,13 +274,13 @@ class MeasuredLinear(RunLinearisation):
             )
         readings = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
         return IntervalMaps(
-            states,
-            defects,
-            force,
-            self._input_responses,
-            readings,
-            self.observed,
-            self._compute_limit_jumps(),
+            states=states,
+            defects=defects,
+            forces=force,
+            inputs=self._input_responses,
+            readings=readings,
+            predicted=self.observed,
+            jumps=self._compute_limit_jumps(),
         )
 
     def compute_changes(self, similar: MeasuredLinear) -> tuple[Array, Array]:
@@ -342,10 +344,14 @@ class MeasuredLinear(RunLinearisation):
             return self._compose(errors[tangent.point_of_step])
 
     def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
-        """Return the active intervals of the first step, then of the second, and so on.
+        """Return which intervals between samples have a first step, a second step, and so on.
 
-        Each entry contains the step numbers, and the numbers of the intervals that have such a
-        step.
+        Intervals have different numbers of steps. Loops over this list treat the same step of all
+        intervals at once, instead of one interval after the other.
+
+        Returns:
+            For the first, second, ... step in an interval: the numbers (k,) of these steps in the
+            run, and the numbers (k,) of the intervals that are long enough to have it.
         """
         lengths = np.diff(self.knots)
         result = []
@@ -427,11 +433,11 @@ class MeasuredLinear(RunLinearisation):
     def _compute_direct_readings(
         self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
-        """Compute the direct changes ψ (T, C, K) of readings by K candidates.
+        """Compute the direct changes ψ (T, C, K) of readings by K candidate effects.
 
-        They do not pass through the motion, such as the bias of a sensor. Sensor effects
-        may be nonlinear, so they are applied to the predicted readings and the readings
-        without them are subtracted.
+        They do not pass through the motion; an example is the bias of a sensor. Sensor effects
+        may be nonlinear, so they are applied to the readings of the predicted motion, and the
+        readings without them are subtracted. Candidates that change no reading are skipped.
 
         Shapes: S steps, T samples, C channels.
 

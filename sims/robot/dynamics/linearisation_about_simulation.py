@@ -114,9 +114,11 @@ class RunLinearisation:
         return observed
 
     def _simulate_nominal_motion(self) -> RobotMotion:
-        """Simulate the motion of the run, plus one step that begins at the run's end.
+        """Simulate the motion of the run, about which the model is linearised.
 
-        The sensors' readings at the beginnings of these steps are kept in `_readings`.
+        One more step is added, so that the state at the run's end is the beginning of a step like
+        all others. The forces on both sides of the transmissions are noted, on which some effects
+        depend. The sensors' readings at the beginnings of the steps are kept in `_readings`.
         """
         simulator = self._simulator
         steps = self._steps + 1
@@ -184,11 +186,11 @@ class RunLinearisation:
         )
 
     def _make_tangent_model(self) -> TangentModel:
-        """Make the tangent linear model about the motion of the run.
+        """Make the tangent linear model about the motion of the run (first-order propagation).
 
-        `sizes` are the typical forces (N or N m) of the joints of the file, the joints in
-        series and the floating bodies, in this order. They determine the finite differences
-        of forces.
+        It needs typical forces, `sizes` in N or N m, for the finite differences of forces. They
+        are those of the joints of the file, the joints in series (the second joints of flexible
+        drives) and the floating bodies, in this order.
         """
         simulator = self._simulator
         outputs = [
@@ -226,9 +228,12 @@ class RunLinearisation:
     def compute_effect_responses(
         self, added: Sequence[EffectWithCoefficients]
     ) -> tuple[Array, int]:
-        """Compute the changes of the run's observations by each effect, to first order.
+        """Compute how each effect alone would change the run's observations, to first order.
 
-        Effects in series with joints have no small size, so they are simulated.
+        Effects are perturbations of forces, controls or model numbers, which are propagated along
+        the motion together, up to `MAX_SIMULTANEOUS_CHANGES` at a time. Effects in series with
+        joints, such as backlash, change the motion much however small they are; these are
+        simulated.
 
         Shapes: T samples, C channels.
 
@@ -293,9 +298,11 @@ class RunLinearisation:
         return changes, sensors
 
     def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
-        """Simulate observations (K, T, C) of the run with each effect added.
+        """Simulate observations (K, T, C) of the run with each of K effects added, one at a time.
 
-        An added effect replaces the simpler effects of the run that it contains.
+        All are simulated in one batch, in which each element has the effects of the run and one
+        more. An added effect that contains a simpler one of the run, as Stribeck friction contains
+        Coulomb friction, takes its coefficient over and replaces it.
 
         Shapes: T samples, C channels.
         """
@@ -334,6 +341,11 @@ class RunLinearisation:
 
     def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the perturbations by an effect that acts on neither inputs nor sensors.
+
+        There are three ways. An added armature (inertia of a rotor) is the force -c times the
+        joint's acceleration. An effect whose force can be computed is that force along the motion.
+        Any other effect changes numbers of MuJoCo's model: the accelerations with and without it
+        are compared, and the result is cached.
 
         Args:
             owner: number of the candidate.
@@ -382,10 +394,10 @@ class RunLinearisation:
         return bool(rest == 0.0)
 
     def _get_inputs_with_effects(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
-        """Return the inputs of the run, with one more input effect in each batch element.
+        """Return the inputs of the run with n batch elements, each with one more input effect.
 
-        The responses to input effects are computed together, with one batch element for each effect
-        and coefficient vector.
+        So the responses to all input effects are computed together. If the run itself has the same
+        effect, its coefficients are replaced in that element.
 
         Shapes: K coefficients.
 
@@ -454,13 +466,14 @@ class RunLinearisation:
 def compute_control_changes(
     runs: Sequence[RunLinearisation], added: Sequence[EffectWithCoefficients]
 ) -> list[dict[int, list[Perturbation]]]:
-    """Compute the changes of controls by added input effects.
+    """Compute the changes of controls by added input effects, such as a gain or a delay.
 
     Input effects act before the robot, so their changes are computed exactly and only propagated
-    to first order. `input_effects` lists the effects at one place each as (index in `added`,
-    effect, coefficients), one batch element for each. Each changed input is averaged over the
-    whole step, which moves the robot, and, if drive forces are observed, over an instant at its
-    beginning, which a sensor shows; `shares` are these two shares of a step.
+    to first order. All effects are evaluated as one batch, with an element for each effect at one
+    place (`input_effects`: its index in `added`, the effect, and its coefficients). A changed input
+    is averaged over the whole step, which moves the robot. If drive forces are observed, it is also
+    averaged over an instant at the beginning of the step, which is what a sensor shows; `shares`
+    are these two shares of a step.
 
     Args:
         runs: linearisations of runs of one simulator.
@@ -496,12 +509,14 @@ def compute_control_changes(
         if part.signal not in control_indices:
             continue
         column, motion = control_indices[part.signal], runs[run]._motion
+        mean_change = values_by_share[0] - motion.controls[:, column]
         change = Perturbation(
             effect_index,
             actuator=column,
-            series=values_by_share[0] - motion.controls[:, column],
-            instant=values_by_share[-1]
-            - (motion.controls, motion.instant)[len(values_by_share) - 1][:, column],
+            series=mean_change,
+            instant=values_by_share[1] - motion.instant[:, column]
+            if len(values_by_share) == 2
+            else mean_change,
         )
         changes_by_run[run].setdefault(effect_index, []).append(change)
     return changes_by_run

@@ -113,7 +113,7 @@ class LinearisationPoints:
         Also integrate the hidden states of the effects along the motion, since each point
         needs them. `self._stepwise_effects` are the effects whose forces are evaluated here,
         because no model field represents them, and `self._drive_effect_forces` (n, D) are the
-        forces that they exert in drives.
+        forces that they exert in drives, which a sensor of drive forces shows.
 
         Shapes: D joints, K coefficients.
 
@@ -203,7 +203,10 @@ class LinearisationPoints:
     def step_displaced(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects, steps: int = 1
     ) -> tuple[Array, Array]:
-        """Compute states (N, Z) and readings (N, O) after a step from each point.
+        """Compute states (N, Z) and readings (N, O) after a step from each of N points.
+
+        One number of the state or inputs is displaced. The difference to the states without
+        displacement, divided by its size, is a column of the derivative of a step.
 
         Args:
             moved: perturbed column of the initial state or inputs, and the size of the
@@ -302,7 +305,8 @@ class LinearisationPoints:
         """Place the points in the elements of the batch, as many at a time as it has elements.
 
         Each batch element gets the state, controls and forces of another step of the motion, with
-        the displacements added, and the forces of effects at this state.
+        the displacements added, and the forces of effects at this state. After each `yield` the
+        caller lets MuJoCo evaluate the batch and reads the results.
 
         Args:
             moved: displacements for a difference quotient, index and size by quantity: q position,
@@ -553,7 +557,8 @@ class LinearisationPoints:
     def _compute_dry_friction(self, joint: int, limit: Array) -> Array:
         """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
 
-        It is that of MuJoCo's constraint for friction loss
+        MuJoCo's dry friction is no jump of the force with the sign of the velocity. It is a
+        constraint that pulls the velocity to zero with a force of at most the limit
         (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
         constraint has the reference acceleration -b v with b = 2 / (d_max timeconst), and the
         regularisation R = A (1 - d) / d, with its impedance d and the inverse inertia A of the
@@ -607,7 +612,8 @@ class LinearisationPoints:
 def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, IndexArray]:
     """Choose the steps at which the model is linearised, one after every `spacing` steps.
 
-    The count begins again where a piecewise constant command jumps or an actuator is switched.
+    The count begins again where a piecewise constant command jumps or an actuator is switched,
+    because a derivative before the jump is not valid after it.
 
     Shapes: S steps.
 

@@ -106,8 +106,8 @@ class MidpointPredictor:
     ) -> None:
         """Bind MuJoCo's fields of joint states and joint forces, for the first L elements.
 
-        `self._last` (2, L, D) holds the transmission loads at the beginning of the previous
-        step.
+        A bound field is a view of MuJoCo's memory, which shows the present values. `self._last`
+        (2, L, D) holds the transmission loads at the beginning of the previous step.
 
         Shapes: D joints.
 
@@ -157,8 +157,10 @@ class MidpointPredictor:
     ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
 
-        The load at the middle is d_k + (d_{k-1, end} - d_{k-1}) / 2 (2), so that a jump with a
-        command appears in d_k alone.
+        The load at the middle is extrapolated from the change over the previous step:
+        d_k + (d_{k-1, end} - d_{k-1}) / 2 (2). Both loads of the difference have the same command,
+        so that a jump with a command appears in d_k alone. MuJoCo must evaluate the forces again
+        with a new command, or, for some integrators, always.
 
         Shapes: L batch elements, D joints.
 
@@ -201,6 +203,8 @@ def forces_are_at_step_end(model: Any) -> bool:
 
 def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
     """Compute transmission loads (2, S, D) at the middle of every step of a motion.
+
+    It is the load at the end of the step minus half its growth over the step.
 
     Shapes: S steps, D joints.
 
@@ -263,10 +267,11 @@ def advance_state(
 def integrate_state(
     effect: HiddenStateEffect, c: Array, snapshots: RobotSnapshot, step: float
 ) -> HiddenState:
-    """Integrate a hidden state along a known motion.
+    """Integrate the hidden state of an effect along a known motion.
 
-    The motion is not changed by the effect, as in a linearisation. If the rate is linear in the
-    state at all times, which is tested at three points, the steps are computed at once.
+    The motion is not changed by the effect, as in a linearisation. If the state's rate is a linear
+    function of it at all times, which is tested at three points, a fast recursion is used.
+    Otherwise the state advances step by step.
 
     Args:
         effect: effect at its place.

@@ -213,8 +213,10 @@ class MujocoBatch:
     ) -> None:
         """Compile the model, create MuJoCo's batch, and expand the model fields that effects write.
 
-        Expanded fields have separate values for each batch element. `self._file_values` keeps
-        the values of the model file, which are restored before other effects are written.
+        Expanded fields (numbers of the model, such as masses) have separate values for each batch
+        element, so that each simulates other effects. Only fields that effects can write are
+        expanded. `self._file_values` keeps the values of the model file, which are restored before
+        other effects are written.
 
         Args:
             robot: robot to simulate.
@@ -277,9 +279,12 @@ class MujocoBatch:
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def write_effects(self, acting: ActiveEffects) -> None:
-        """Write model-field effects, with coefficients (K, N, 1), into the batch's fields.
+        """Write effects that are numbers of MuJoCo's model, such as masses, into the batch's fields.
 
-        Nothing is done if the fields have them already.
+        First the fields that former effects changed get the values of the file again. Then the
+        effects are written in a fixed order, since some depend on others, and MuJoCo recomputes
+        what it derives from the changed fields. Nothing is done if the fields have these effects
+        already. Coefficients are (K, N, 1) for N batch elements.
 
         Shapes: K coefficients.
         """
@@ -429,9 +434,10 @@ class MujocoBatch:
     def _split_at_switches(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
         """Yield the steps in consecutive parts, and switch actuators on or off before each part.
 
-        Within a part no switch changes. An actuator is switched off by a force range of
-        zero. `off` (n, S, K) says which of the K actuators are off; None means that all are
-        on.
+        Within a part no switch changes, so that MuJoCo makes its steps in one call. Before the
+        next part is yielded, its switches are set here; an actuator is switched off by a force
+        range of zero. `off` (n, S, K) says which of the K actuators are off; None means that all
+        are on.
 
         Shapes: S steps.
         """
@@ -662,10 +668,10 @@ class BatchCache:
     def get_batch(
         self, added: AddedElements, derived: bool, count: int, settings: Mapping[str, float]
     ) -> MujocoBatch:
-        """Return a batch from the cache, or create it.
+        """Return a batch of simulations from the cache, or create it.
 
         Creating a batch compiles the model, which takes much longer than a simulation. A model that
-        MuJoCo rejects is stored with the reason, and is not compiled again.
+        MuJoCo rejects is stored with the reason, and is not compiled again; the user is told once.
 
         Args:
             added: elements that effects add to the model.

@@ -51,6 +51,11 @@ def sample_readings(
 ) -> Array:
     """Compute the recorded readings (L, T) of a channel, including sensor effects.
 
+    A sensor effect can shift the time at which a sample is taken (delay, drifting clock), filter
+    the signal, or change each reading (bias, gain). They are applied in this order: the values are
+    read at the shifted times, filtered signals replace them where a filter acts, and then each
+    reading is changed.
+
     Shapes: L batch elements, S steps, T samples.
 
     Args:
@@ -70,6 +75,7 @@ def sample_readings(
             instants = np.where(is_active(c), effect.times(c, instants), instants)
     instants = np.clip(instants, 0.0, step_ends[-1])
     result = _interpolate(values, slopes, step, instants)
+    # A filter needs the signal at all steps, not only at the samples.
     for filtered_elements, filters in _iterate_filters(sensors):
         grid = np.broadcast_to(step_ends, (filtered_elements.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
@@ -148,7 +154,7 @@ def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp],
 
 
 def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Interpolate values between the ends of steps.
+    """Interpolate values, which are known at the ends of steps, at the times of samples.
 
     With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
 
@@ -214,7 +220,10 @@ class DriveSensorModel:
     def shift_to_step_begin(self, readings: Array) -> None:
         """Shift readings (n, S, k) from the mean command of a step to its initial command.
 
-        The readings are changed in place.
+        MuJoCo applies the mean of a command over a step, but a sensor of the drive force shows the
+        force at the beginning. The difference of the two commands times the actuator's force per
+        unit of command is added, within its force limits. If a drive is coupled to the preceding
+        joint, that reading changes too. The readings are changed in place.
 
         Shapes: S steps.
         """

@@ -118,10 +118,11 @@ def group_by_joint(added: SeriesJoints) -> dict[str, list[str]]:
 
 
 def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
-    """Add joints in series to a robot, without changing element names.
+    """Add a second joint in series with some joints of a robot, for flexible or slack drives.
 
-    The second joint is in the same body, with the axis and position of the first one. All its
-    numbers are zero; `write_series_element` sets them for each batch element.
+    The first joint then moves the drive, and the second one the links against the drive. It is in
+    the same body, with the axis and position of the first one. All its numbers are zero;
+    `write_series_element` sets them for each batch element. Existing names do not change.
 
     Args:
         robot: robot as read from its model file.
@@ -179,9 +180,10 @@ def is_series_effect(effect: Effect | type[Effect]) -> bool:
 def write_series_effects(
     fields: Mapping[str, Any], robot: RobotModel, acting: ActiveEffects
 ) -> None:
-    """Write effects in series with joints into the model fields of a batch.
+    """Write effects in series with joints, such as backlash, into the model fields of a batch.
 
-    `convert_flank_parameters` must be called after MuJoCo has derived its constants.
+    Several effects at one joint are combined to one element. `convert_flank_parameters` must be
+    called after MuJoCo has derived its constants.
 
     Shapes: L batch elements, K coefficients.
 
@@ -228,13 +230,13 @@ def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
 def write_series_element(
     fields: Mapping[str, Any], robot: RobotModel, place: str, element: SeriesElement
 ) -> None:
-    """Write the numbers of elements in series, of L batch elements, into model fields.
+    """Write the numbers of the element between drive and links, of L batch elements, into fields.
 
-    An element is a spring with a damper (3), a gap with rigid flanks (4), or a gap with
-    compliant flanks (5). The drive's armature is its share of the joint's inertia.
-
-    With the deflection d between drive and links: a spring exerts -k d - c d' (3), rigid flanks
-    limit |d| to gap / 2 (4), compliant flanks exert -k e - c d' with e beyond the gap (5).
+    With the deflection d between drive and links: a spring with a damper exerts -k d - c d' (3),
+    rigid flanks of a gap limit |d| to gap / 2 (4), and compliant flanks exert -k e - c d' with e
+    beyond the gap (5). In MuJoCo, the first is a joint stiffness and damping, and both flanks are
+    joint limits. The drive gets its share of the joint's inertia as armature. Stiffness and damping
+    are limited to what the time step can integrate.
 
     Args:
         fields: model fields of the batch elements.
@@ -344,6 +346,9 @@ def _limit_to_stable_values(
 ) -> tuple[Array, Array]:
     """Limit stiffness and damping (L,) to values that are stable for a time step.
 
+    The oscillation between drive and links may advance by at most `MAX_PHASE` radians per step. If
+    damping is integrated implicitly, stiffness beyond this limit is replaced by damping.
+
     Shapes: L batch elements.
 
     Args:
@@ -373,7 +378,10 @@ def compute_rest_positions(
 ) -> list[Array]:
     """Compute the rest positions (n,) of joints in series while their drives are held.
 
-    A limit of MuJoCo exerts -(K e + C d') / (A + R), R = (1 - s) A0 / s (6).
+    They are the first states of links behind flexible or slack drives, which recordings do not
+    contain. The load, such as gravity, deflects a spring by load / stiffness. In a gap it moves the
+    links to the flank in its direction, or leaves them between the flanks if it is very small. The
+    stiffness of compliant flanks is read back from the parameters of MuJoCo's limit (6).
 
     Args:
         fields: model fields of the batch elements.
@@ -418,7 +426,10 @@ def list_added_elements(effect: Effect | type[Effect]) -> AddedElements:
 
 
 def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElements, list[int]]:
-    """Group the numbers of batch elements by the elements that their effects add to the model.
+    """Group batch elements by the model elements that their effects add, such as a second joint.
+
+    Each group needs a model and a batch of its own. Batch elements without such effects are a group
+    too, with the key ().
 
     Shapes: K coefficients.
 

@@ -86,11 +86,12 @@ class DifferenceQuotients(NamedTuple):
 
 
 def replace_diverging_points(quotients: DifferenceQuotients) -> DifferenceQuotients:
-    """Replace quotients across a jump by those of the nearest other point.
+    """Replace derivatives that were computed across a jump by those of the nearest other point.
 
-    Where a contact begins or ends within a difference, its quotient is a jump divided by the
-    difference. A filter would need endless forces to follow a step that multiplies deviations by
-    hundreds, although its real change is small.
+    Where a contact begins or ends within a finite difference, the difference quotient is a jump
+    divided by the difference: it multiplies deviations by hundreds, although the real change is
+    small, and a filter could not follow. Points with unusually large derivatives are suspects; they
+    are replaced if a deviation would grow by more than `MAX_STEP_GROWTH` in one step.
 
     Args:
         quotients: the quotients at all points, in the order of time.
@@ -209,12 +210,15 @@ class TangentModel:
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the derivatives of a step by states, forces and controls at all points.
 
-        They are forward differences (1); with contacts, those by positions are the smaller ones of
-        forward and backward differences. `displacements` lists the displacements as (quantity,
-        index, size). The quantities are q position, v velocity, a activation, w hidden state of an
-        effect, p and r displacement and velocity of floating bodies, f force, u control.
-        The
-        changes are those of the state after a step, or of the acceleration for (3).
+        They are forward differences (1) of the state after a step. For the Runge-Kutta method, the
+        accelerations are differentiated instead, and (3) gives the derivatives of the step. With
+        contacts, which may begin or end within a difference, derivatives by positions are the
+        smaller ones of forward and backward differences.
+
+        `displacements` lists the displacements as (quantity, index, size), for states "z", forces
+        "f" and controls "u". The quantities are q position, v velocity, a activation, w hidden
+        state of an effect, p and r displacement and velocity of floating bodies, f force, u
+        control.
         """
         joint_count = self._motion.x.shape[1]
         floating_count = self._sizes.size - joint_count
@@ -269,10 +273,11 @@ class TangentModel:
     def perturb_model_numbers(
         self, owner: int, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
     ) -> Perturbation:
-        """Return the change of motion by other model parameters, per unit of `change`.
+        """Return the perturbation by other model parameters, such as a mass, per unit of `change`.
 
-        A change da of the acceleration at the same state acts like the force M da, with the inertia
-        matrix M.
+        The accelerations at the points of the motion are computed with the changed model. A change
+        da of the acceleration at the same state acts like the force M da, with the inertia matrix
+        M, and is propagated like a force.
 
         Args:
             owner: number of the effect candidate.
@@ -367,16 +372,14 @@ class TangentModel:
     def propagate(
         self, changes: Sequence[Perturbation], count: int, initial: Array | None = None
     ) -> tuple[Array, Array]:
-        """Propagate changes along the motion by (2), added up for each owner.
+        """Propagate changes along the motion, added up for each owner.
 
-        A step multiplies a change of the state by A and adds B times the change of forces and C
-        times that of controls (2). An owner is the candidate to which a change belongs; all n
-        owners are propagated in one matrix product per step.
+        A step multiplies a change dz of the state by A, and adds B times the change df of forces
+        and C times the change du of controls: dz_{t+1} = A dz_t + B df_t + C du_t (2). An owner is
+        the candidate effect to which a change belongs; all n owners are propagated in one matrix
+        product per step.
 
-        Shapes: S steps.
-
-        dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t (2), with the derivatives A, B, C of
-        a step by state, forces and controls, and the inertia matrix M.
+        Shapes: S steps, Z state components, O readings.
 
         Args:
             changes: changes with owners from 0 to `count` - 1.
@@ -417,7 +420,11 @@ class TangentModel:
     ) -> tuple[Array, Array]:
         """Add up the forces and controls of changes, and their direct changes of readings.
 
-        Shapes: S steps.
+        A sensor of a drive force shows a change of force or command at once, before the motion
+        changes. It shows the command at the beginning of a step, while the mean over the step moves
+        the robot.
+
+        Shapes: S steps, O readings, E forces, nu controls.
 
         Args:
             changes: changes with owners from 0 to `count` - 1.
@@ -558,15 +565,13 @@ class TangentModel:
             return self._at.step_displaced({}, self._at.acting)
 
     def _interpolate_to_steps(self, values: Array) -> Array:
-        """Interpolate values (N, k) at linearisation points to all steps, (S, k).
+        """Interpolate values (N, k) at N linearisation points linearly to all S steps, (S, k).
 
-        A point lies at each change of a command and at regular distances after it. A command is
-        constant between its changes, so the motion is smooth there: values are linear in time
-        between two points of one command, and extrapolated after the last of them. Each step has
-        the value at its point plus `_share` times the difference of two neighbouring points of
-        the same command, `_earlier` and `_later`.
-
-        Shapes: S steps.
+        A point lies at each change of a command and at regular distances after it. Values are
+        interpolated between two points of one command, between which the motion is smooth, and
+        extrapolated after the last of them. So each step has the value at its point plus `_share`
+        times the difference of two neighbouring points of the same command, `_earlier` and
+        `_later`.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
@@ -596,12 +601,13 @@ class TangentModel:
 def compute_runge_kutta_step(
     by_state: Array, by_force: Array, by_control: Array, step: float
 ) -> tuple[Array, Array, Array]:
-    """Compute the derivatives of a Runge-Kutta step from those of the acceleration, by (3).
+    """Compute the derivatives of a Runge-Kutta step from those of the acceleration.
 
-    Shapes: D joints.
+    The derivative of the state's rate by the state is K = [[0, I], [da/dq, da/dv]], and by a force
+    L = [[0], [da/df]]. Held constant in a step of length h, they give the derivatives A = I + P K
+    by the state and B = P L by forces, with P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
 
-    With K = [[0, I], [da/dq, da/dv]], L = [[0], [da/df]] and the step h: A = I + P K, B = P L, P =
-    h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
+    Shapes: N points, D joints, E forces, nu controls.
 
     Args:
         by_state: (N, D, 2 D) derivatives of accelerations by positions and velocities.
