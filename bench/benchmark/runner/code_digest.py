@@ -93,13 +93,12 @@ def _convert_for_json(value: Any) -> Any:
 
 @cache
 def hash_source_folders(which: tuple[str, ...] = ()) -> str:
-    """Hash every file of some source folders; those that determine runs if none are given.
+    """Hash the version and every file of some source folders.
+
+    The hash changes with any line of code, so that results of different code are never mixed.
 
     Args:
         which: Folders relative to the project; `COMPARISON_SOURCE_FOLDERS` if empty.
-
-    Returns:
-        Digest of the version and of all files, which changes with any line of code.
     """
     return compute_digest(
         __version__,
@@ -175,9 +174,10 @@ IRRELEVANT_KEYS = {
 
 
 def select_relevant_keys(experiment: Experiment, irrelevant: Iterable[str]) -> dict[str, Any]:
-    """Return the configuration without the fields that do not affect a result.
+    """Return the fields of an experiment's configuration that affect a result, to be hashed.
 
-    A new field of `Experiment` is included until it is listed with a reason.
+    Irrelevant fields are listed instead of the relevant ones, so that a new field of `Experiment`
+    counts as relevant until it is listed with a reason.
 
     Args:
         experiment: configuration of the experiment.
@@ -248,9 +248,9 @@ def _get_top_level_package(kind: type) -> str:
 def _is_defined_in_module(kind: type) -> bool:
     """Return whether the module that a class names contains this class under its name.
 
-    Only then is the module's source the source of the class. A function may make many classes from
-    one source, each with other values. A class made by ``type(...)`` from an abstract class names
-    `abc` as its module.
+    Only then is the module's source the source of the class. Two examples are otherwise: a function
+    may make many classes from one source, each with other values; and a class that is made by
+    ``type(...)`` from an abstract class names `abc` as its module.
     """
     attribute: Any = sys.modules.get(kind.__module__)
     for name in kind.__qualname__.split("."):
@@ -259,15 +259,17 @@ def _is_defined_in_module(kind: type) -> bool:
 
 
 def _represent_class(kind: type) -> Any:
-    """Return the representation of a class in a hash.
+    """Return what represents a class in a hash: its digest, nothing, or its source.
 
-    It is empty if `hash_source_folders` covers the class; otherwise it is the source of the class.
+    A class that is made at run time has an attribute ``source_digest``. A class of this project's
+    source folders is represented by "", because `hash_source_folders` covers it. For any other
+    class, it is the source of the notebook cell, plugin file or package that defines it.
 
     Args:
         kind: Class to represent.
 
     Raises:
-        InputError: there is no source.
+        InputError: the source of the class cannot be found.
     """
     # The digest is not inherited, because a subclass behaves differently.
     if (source_digest := vars(kind).get("source_digest")) is not None:

@@ -93,6 +93,9 @@ class _Experiment:
 def _count_simulated_samples(problem: TuningProblem) -> tuple[int, float]:
     """Return the numbers of samples and of time steps that one evaluation simulates.
 
+    An evaluation simulates one point for all runs of a target. With a recording, these are its
+    fitting runs; otherwise it is one run of the experiment's sampling.
+
     Args:
         problem: Tuning problem with its simulator, true system and data.
 
@@ -118,6 +121,9 @@ def check_comparison_size(
     force: bool = False,
 ) -> None:
     """Raise an error for a comparison that is not feasible on this machine.
+
+    Memory, disk space, number of files and duration are estimated before the first run. A recording
+    is checked for anomalies too, since a comparison on damaged data would waste the time.
 
     Args:
         experiment: configuration; it may sweep over values.
@@ -146,10 +152,12 @@ def check_comparison_size(
 def estimate_comparison_need(
     experiment: Experiment, jobs: int = 2, cluster: bool = False
 ) -> ResourceNeed:
-    """Estimate the needs of all runs of an experiment; see `check_comparison_size`.
+    """Estimate the memory, disk space, files and seconds that an experiment needs.
 
-    Memory, disk space, files and seconds are sums over runs, simulations and trainings with
-    constants that were measured once; the counts explain the estimate to the user.
+    There is one run for each tuner, target and seed; a run simulates as often as its budget allows,
+    and stores one row for each simulation and one for the start. The needs are sums of these counts
+    times sizes and durations that were measured once. The counts are also part of the message that
+    explains the estimate to the user.
 
     Args:
         experiment: configuration without a sweep.
@@ -198,11 +206,11 @@ def estimate_comparison_need(
     return ResourceNeed(
         f"tuners {len(seeds_and_budgets)}, {counts_text}",
         _suggest_reduction(counts),
-        memory,
-        row_count * _ROW_DISK,
-        runs / _RUNS_PER_PART,
-        quantities.steps,
-        seconds,
+        memory=memory,
+        disk=row_count * _ROW_DISK,
+        files=runs / _RUNS_PER_PART,
+        steps=quantities.steps,
+        seconds=seconds,
     )
 
 

@@ -163,9 +163,11 @@ class ClusterPool:
         closing_thread.join(timeout=10)
 
     def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Iterate over the results of calls in the order in which they end.
+        """Execute calls on the cluster, and iterate over their results in the order they end.
 
-        See `bench.benchmark.runner.worker_pools.LocalPool`.
+        A few calls for each thread are queued at a time. A call whose worker is lost is submitted
+        again, because the loss gives no information about the call; if it loses too many workers,
+        the pool is given up. See also `bench.benchmark.runner.worker_pools.LocalPool`.
 
         Args:
             calls: functions with their arguments.
@@ -330,6 +332,10 @@ def run_on_worker(
 ) -> tuple[str, Any, bytes]:
     """Execute a call in an isolated process of this machine; runs on a worker of the cluster.
 
+    The files that the call needs were sent with it. They are written into a folder here, and their
+    paths in the arguments are replaced. Each thread of the worker has one process, which stays for
+    the next calls with the same plugins.
+
     Args:
         function: function to call.
         arguments: arguments of the call; paths in them refer to the client's machine.
@@ -339,8 +345,9 @@ def run_on_worker(
         contents: names and contents of these files, in the same order.
 
     Returns:
-        Kind, value and content: the result of the call or the error that ended it ("value"), or a
-        training with the content of its weights file ("weights").
+        Kind, value and content. The kind is "value" for the result of the call or the error that
+        ended it, with empty content; or "weights" for a training, with the content of its file,
+        which the client cannot read from this machine.
     """
     if paths:
         # All files are in one folder, because a recording's description must be next to its table.

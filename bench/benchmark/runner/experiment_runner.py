@@ -210,7 +210,8 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
 
     A worker is a new interpreter, so that no tuner finds the true parameters in its memory. It
     loads plugin files and installed packages, but does not import the script or notebook that calls
-    simgap. The same holds for the process of a tuner.
+    simgap, and so does not have classes that are defined there. The process of a tuner is a new
+    interpreter, too.
 
     Args:
         experiment: configuration of the experiment.
@@ -232,7 +233,10 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
 
 
 def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
-    """Make the error for a class that worker processes cannot load.
+    """Make the error for a class that worker processes cannot load, and say how to solve it.
+
+    A class of a module file can be passed as a plugin. A class of the main script, a notebook or an
+    interactive session must be moved to a file first.
 
     Args:
         kind: kind of the class, such as ``tuner``.
@@ -240,12 +244,13 @@ def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
         part: the class.
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
-    main = part.__module__ == "__main__"
+    is_main = part.__module__ == "__main__"
     source = "this session"
     if file:
-        source = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
-    plugin = f"{name}.py" if main or not file else str(Path(file).resolve())
-    move = f"put it into a file of its own, say {plugin}, and " if main or not file else ""
+        source = f"the script {Path(file).resolve()}" if is_main else str(Path(file).resolve())
+    must_move = is_main or not file
+    plugin = f"{name}.py" if must_move else str(Path(file).resolve())
+    move = f"put it into a file of its own, say {plugin}, and " if must_move else ""
     name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
     return InputError(
         f"{kind} {name}: class {part.__qualname__} is defined in {source}, which "
@@ -257,6 +262,9 @@ def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
 @numeric_warnings_silenced()
 def prepare_experiment(experiment: Experiment, salt: str | None = None) -> ExperimentRun:
     """Check an experiment completely before any work, and plan its runs.
+
+    Every tuner is built once, the targets (systems with true parameters to find) are drawn, and a
+    run is planned for each tuner, target and seed. Tuners that cannot be used here are skipped.
 
     Args:
         experiment: configuration of the experiment; its plugins are already registered.
@@ -312,7 +320,9 @@ def run_experiment(
 ) -> None:
     """Execute every run of a prepared experiment that is not yet stored.
 
-    Each result is appended to `results.run_sink` as soon as its run ends.
+    First learned tuners are trained; runs whose training failed are stored as failures. Then all
+    other runs are sent to workers, and each result is appended to `results.run_sink` as soon as its
+    run ends. An interrupt by the user, or the loss of the pool, is noted in `results`.
 
     Args:
         results: prepared experiment from `prepare_experiment`.
@@ -361,8 +371,7 @@ def _store_untrained_runs(
 ) -> _ReadyRuns:
     """Store runs whose training failed as failures, and return the other missing runs.
 
-    A failure is a result too, so these runs are not tried again. `failures` are the errors of
-    trainings by label of the tuner and seed.
+    A failure is a result too, so these runs are not tried again when the study is resumed.
 
     Args:
         results: Runs of the experiment and their journal.
@@ -387,7 +396,10 @@ def _store_untrained_runs(
 def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -> None:
     """Compute the Fisher-information spectrum of each target.
 
-    Only the parent process can do this, because it needs the true parameters if there are any.
+    The spectrum tells which combinations of parameters the observations determine well, and which
+    badly (stiff and sloppy directions); errors are reported separately for both. With one parameter
+    there is nothing to separate. Only the parent process can do this, because it needs the true
+    parameters if there are any.
 
     Args:
         results: the comparison; the spectra are added to it.
@@ -485,13 +497,16 @@ def _train_learned_entries(
 def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exception) -> None:
     """Store the result of a worker: an outcome, or the error that ended the run.
 
+    Every run gets rows and a status, because a failure is a result too: "timeout" if the worker was
+    killed at the time limit, "crashed" if it died or raised an error, or the status that the error
+    states.
+
     Args:
         results: results so far; the run is added to its tables and notes.
         index: position of the run in the plan.
         outcome: what the worker returned or raised.
     """
     problem, job = results.problem, results.plan[index]
-    # Every run gets rows and a status, because a failure is a result too.
     if isinstance(outcome, TimeoutError):
         reason = f"killed after its limit of {problem.experiment.timeout:g} s"
         outcome = make_unfinished_outcome(problem, job.target, "timeout", reason)

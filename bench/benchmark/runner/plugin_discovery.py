@@ -110,10 +110,11 @@ _known_plugins: dict[str, Plugin] = {}
 
 
 def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) -> None:
-    """Load or describe plugin files before an experiment runs.
+    """Load plugin files before an experiment runs, or only register descriptions of their parts.
 
-    Files whose code may run in this process are loaded; the others are inspected in an isolated
-    process.
+    This process has the true parameters, so code of a tuner must not run in it. A file with a
+    simulator or an effect that is needed is loaded. Other files are inspected in an isolated
+    process, and their tuners are registered as stubs. If tuners are trusted, all files are loaded.
 
     Args:
         paths: plugin files.
@@ -190,6 +191,9 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
 def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
     """Return what other processes need to know of plugin files and of installed tuners.
 
+    If tuners are not trusted, these are the results of their inspection, so that workers do not
+    load code of tuners either. A file that was not inspected yet is inspected now.
+
     Args:
         paths: plugin files.
         experiment: configuration of the experiment.
@@ -229,7 +233,8 @@ def _announce_installed(names: Iterable[str]) -> None:
 def must_build_isolated(entry: TunerEntry) -> bool:
     """Return whether an entry's tuner must be built in an isolated process only.
 
-    If so, it has been built there once as a test.
+    This is so for tuners of plugins, which are stubs in this process. Such a tuner is built in an
+    isolated process once as a test, so that wrong options are reported before the runs begin.
 
     Raises:
         InputError: the tuner cannot be built, or its code is already in this process.
@@ -257,9 +262,10 @@ def _try_to_build(entry: TunerEntry) -> None:
 
 
 def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
-    """Inspect plugin files, and decide which of them to load.
+    """Inspect plugin files in an isolated process, and decide which of them to load here.
 
-    A file is loaded if it defines a simulator or effect that is needed.
+    A file is loaded if it defines a simulator or effect that is needed. Its names must not be in
+    use, which is checked before its code runs.
 
     Args:
         paths: plugin files.
@@ -283,8 +289,11 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
         for part in parts:
             if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
                 _check_name_free(part["kind"], part["name"], path, paths_by_name)
-        methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _ISOLATED_REGISTRIES]
-        plugins.append(Plugin(path, bool(simulated_parts & needed_names), *methods))
+        tuners_and_diagnosers = [
+            tuple(part for part in parts if part["kind"] == kind) for kind in _ISOLATED_REGISTRIES
+        ]
+        is_loaded = bool(simulated_parts & needed_names)
+        plugins.append(Plugin(path, is_loaded, *tuners_and_diagnosers))
     return plugins
 
 
@@ -393,7 +402,10 @@ def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
 
 
 def _validate_part(part: Any, file: str) -> dict[str, Any]:
-    """Validate a part of an answer, and convert it to plain values.
+    """Validate one element of an answer about a plugin, and convert it to plain values.
+
+    Code of the plugin may have written the answer, so nothing in it is trusted: texts are shortened
+    and printable, and the hash of the source includes the content of the file.
 
     Args:
         part: one element of the answer.

@@ -51,6 +51,9 @@ RUN_IRRELEVANT_KEYS = {
 def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
     """Hash everything that must not change while an experiment is running.
 
+    The hashes are stored with the study. When it is resumed, they are computed again, and a
+    difference is reported by its name.
+
     Args:
         experiment: configuration of the experiment.
         plugins: plugin files.
@@ -157,15 +160,13 @@ class RunIds:
     """Identifiers of an experiment's runs."""
 
     def __init__(self, experiment: Experiment) -> None:
-        """Hash what all runs of the experiment share.
+        """Hash what all runs of the experiment share: configuration, simulator and code.
 
-        Tuners and targets are hashed when they are first used.
-
-        `_world` is the common hash. `_entries` and `_targets` cache the hashes by label of the
-        tuner and by name of the target.
+        Tuners and targets are hashed when they are first used. `_entries` and `_targets` cache
+        these hashes by label of the tuner and by name of the target.
         """
         self._experiment = experiment
-        self._world = compute_digest(
+        self._common_digest = compute_digest(
             select_relevant_keys(experiment, RUN_IRRELEVANT_KEYS),
             hash_recording(experiment),
             hash_class_source(get_simulator_class(experiment)),
@@ -177,7 +178,10 @@ class RunIds:
         self._targets: dict[str, str] = {}
 
     def make_run_id(self, entry: TunerEntry, target: BlindedTarget, seed: int, budget: int) -> str:
-        """Return the identifier of one run.
+        """Return the identifier of one run: ``TUNER/TARGET/SEED/HASH``.
+
+        The hash covers all that determines the run, so that an id never stands for two different
+        runs.
 
         Args:
             entry: entry of the tuner.
@@ -188,15 +192,23 @@ class RunIds:
         # Hashes are cached, because a plan may have a million runs.
         if entry.label not in self._entries:
             kind = tuners.get(entry.tuner)
-            training = self._experiment.training_budget if kind.learned else 0
-            over = [dict(self._experiment.nuisance)] if entry.randomised else []
+            training_budget = self._experiment.training_budget if kind.learned else 0
+            nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
             self._entries[entry.label] = compute_digest(
-                entry.tuner, dict(entry.options), training, hash_class_source(kind), *over
+                entry.tuner,
+                dict(entry.options),
+                training_budget,
+                hash_class_source(kind),
+                *nuisance,
             )
         if target.name not in self._targets:
             self._targets[target.name] = _hash_target(target)
         digest = compute_digest(
-            self._world, self._entries[entry.label], self._targets[target.name], seed, budget
+            self._common_digest,
+            self._entries[entry.label],
+            self._targets[target.name],
+            seed,
+            budget,
         )
         return f"{entry.label}/{target.name}/{seed}/{digest}"
 

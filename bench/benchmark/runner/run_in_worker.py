@@ -136,10 +136,12 @@ def close_problem() -> None:
 def execute_run(
     experiment: Experiment, request: RunRequest, requests: list[Array] | None = None
 ) -> RunOutcome:
-    """Execute one run; failures of the tuner or the simulator are a status of its trace.
+    """Execute one run of a tuner on a target; a failure becomes a status of the run's trace.
 
-    The tuner runs in this process if it is trusted, otherwise in an isolated one. Afterwards the
-    errors of its proposals and recommendations on the fitting and the held-out runs are computed.
+    The tuner runs in this process if it is trusted, otherwise in an isolated one. Then it is
+    checked that no simulation was made that the harness did not count. Afterwards the errors of the
+    recommended points are computed, on the target's fitted runs and on its held-out runs. An
+    isolated run is repeated if something else kills its process.
 
     Args:
         experiment: configuration of the experiment.
@@ -248,7 +250,10 @@ def _build_tuner(request: RunRequest) -> Tuner:
 def _run_isolated(
     experiment: Experiment, request: RunRequest, task: Task, evaluate: Evaluate
 ) -> tuple[RunTrace, Written, float]:
-    """Execute a run whose tuner has an isolated process.
+    """Execute a run whose tuner has an isolated process; this process simulates its proposals.
+
+    If the tuner cannot be built, the run fails without simulations. After any failure the process
+    is ended, since it may be in any state.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -270,12 +275,10 @@ def _run_isolated(
             run = IsolatedRun(tuner, make_seed_words(*names), experiment.timeout)
             trace = drive_tuner(run, task, evaluate, make_rng(*names), experiment.timeout)
             written = tuner.child.written()
-            # A failed run may have left the process in any state.
             if trace.status in FAILED_STATUSES:
                 tuner.child.end()
             return trace, written, tuner.import_seconds
     except RunEndedError as ended:
-        # The tuner could not be built, so the run has no simulations.
         trace = drive_tuner(FailedTuner(ended), task, evaluate, make_rng(*names))
         return trace, NOTHING_WRITTEN, 0.0
 

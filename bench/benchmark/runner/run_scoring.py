@@ -31,8 +31,17 @@ def make_unfinished_outcome(
         reason: reason of the status.
     """
     no_values, start = np.empty(0), target.blinded.start[None]
-    trace = RunTrace(status, reason, start[:0], no_values, start, no_values, no_values)
-    return RunOutcome(trace, np.full((1, len(problem.channels)), np.nan), None, 0.0)
+    trace = RunTrace(
+        status,
+        reason,
+        proposals=start[:0],
+        losses=no_values,
+        recommendations=start,
+        tuner_seconds=no_values,
+        simulator_seconds=no_values,
+    )
+    unknown_errors = np.full((1, len(problem.channels)), np.nan)
+    return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)
 
 
 def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) -> RunStatus:
@@ -67,8 +76,10 @@ def build_rows(
 ) -> dict[str, Any]:
     """Build the columns of runs.parquet for one run, with a row for each k = 0..simulations.
 
-    The columns are the description of the run, the loss, errors of the parameters, RMS errors of
-    the channels on fitting and held-out runs, and the seconds in tuner and simulator.
+    Row k describes the run after k simulations: its loss, the errors of the point that the tuner
+    then recommends, and the seconds in tuner and simulator. The errors are those of the parameters,
+    against the true ones, and RMS errors of the channels on fitting and held-out runs. What does
+    not exist, such as the loss in row 0, is NaN.
 
     Args:
         problem: tuning problem.
@@ -99,9 +110,9 @@ def build_rows(
     if spectrum is not None and target.truth is not None:
         # Directions combine parameters, which therefore need a common unit: training widths.
         parameter_errors = problem.cube.to_physical(trace.recommendations) - target.truth
-        widths = parameter_errors / problem.cube.compute_training_widths()
+        errors_in_widths = parameter_errors / problem.cube.compute_training_widths()
         columns["stiff_error"], columns["sloppy_error"] = spectrum.compute_directional_errors(
-            widths
+            errors_in_widths
         )
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     # All runs of a comparison have the same columns, so that their rows form one table.
@@ -123,6 +134,10 @@ def _build_parameter_columns(
     problem: TuningProblem, target: Target, outcome: RunOutcome
 ) -> dict[str, Any]:
     """Build columns of parameter errors, proposals, recommendations and true parameters.
+
+    `param_error` is the mean error of the parameters in units of their training widths; with one
+    parameter, `param_abs_error` is its error in its own unit. `outside` is the distance of the true
+    parameters from the training range.
 
     Args:
         problem: tuning problem of the experiment.

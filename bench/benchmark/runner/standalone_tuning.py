@@ -44,7 +44,7 @@ class StandaloneProblem:
 def run_tuner(
     name: str, problem: StandaloneProblem, budget: int, seconds: float, rng: np.random.Generator
 ) -> Array:
-    """Return the parameters that a registered tuner recommends at the end of its run.
+    """Run a registered tuner on a problem, and return the parameters that it recommends at the end.
 
     Args:
         name: name of the tuner, which runs with its default options.

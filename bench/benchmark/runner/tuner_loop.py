@@ -128,8 +128,8 @@ class _RunRecord:
         """Begin with no simulation; the start of the task is the recommendation for k = 0.
 
         `_recommended` has one point (dim,) for each number of simulations k = 0, 1, .... `_best` is
-        the point with the lowest loss so far. The lists of seconds have one pair (number of points,
-        seconds) for each batch.
+        the point with the lowest loss so far. `_tuner_seconds` and `_simulator_seconds` have one
+        pair (number of points, seconds) for each batch of points.
         """
         self.used = 0
         self._dim = task.dim
@@ -213,9 +213,11 @@ def drive_tuner(
 ) -> RunTrace:
     """Run a tuner on a task until its budget is used, it stops, or it fails.
 
-    Proposals outside the unit cube are moved to its boundary. A batch that would exceed the budget
-    is shortened. The `recommendations` follow `methods.tuner.Proposal`; for k = 0 the start is
-    recommended, unless the tuner recommends another point before its first simulation.
+    A tuner is a generator that yields proposals and receives their evaluations. Proposals outside
+    the unit cube are moved to its boundary. A batch that would exceed the budget is shortened. The
+    `recommendations` follow `methods.tuner.Proposal`; for k = 0 simulations the start is
+    recommended, unless the tuner recommends another point before its first simulation. The way in
+    which the loop ends becomes the status of the run.
 
     Args:
         tuner: tuner, trained if it needs training.
@@ -352,10 +354,10 @@ class ProposalEvaluator:
     def __init__(self, problem: TuningProblem, side: ObservedRuns) -> None:
         """Prepare factors that convert sums of squared errors to the loss (1) and to the RMSE (2).
 
-        `_missing` marks missing samples (T, C), or is None. `_mean_factors` and
-        `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1), for C channels
-        with N_c samples and the scale s_c. `_evaluated_squares` collects
-        the sums of squares (n, C) of all batches, from which `compute_rmse` looks up points.
+        There are C channels, of which channel c has N_c samples and the scale s_c. `_mean_factors`
+        and `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1). `_missing`
+        marks missing samples (T, C); it is None if no sample is missing. `_evaluated_squares`
+        collects the sums of squares (n, C) of all batches, in which `compute_rmse` looks up points.
 
         Args:
             problem: tuning problem.
@@ -374,7 +376,9 @@ class ProposalEvaluator:
         self._evaluated_squares: list[Array] = []
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Simulate points and compute their losses.
+        """Simulate points and compute their losses: root mean square errors by (1).
+
+        Sums of squared errors are kept for `compute_rmse`.
 
         Shapes: T samples, C channels.
 
@@ -385,8 +389,8 @@ class ProposalEvaluator:
             Observations (n, T, C) and losses (n,); NaN and infinite if the simulation failed.
         """
         observations = self._problem.simulate(points, self._scenarios)
-        single = observations.shape[0] == observations.shape[2] == 1
-        if single and self._missing is None:
+        has_one_point_and_channel = observations.shape[0] == observations.shape[2] == 1
+        if has_one_point_and_channel and self._missing is None:
             return observations, self._compute_single_loss(observations)
         squares = self._sum_squared_errors(observations)
         self._evaluated_squares.append(squares)

@@ -140,7 +140,8 @@ def _find_source_file(module: str) -> str:
 def find_preloadable_packages(file: str) -> tuple[str, ...]:
     """Return the known packages that a source file imports, directly or through simgap's tuners.
 
-    The files are parsed; their code does not run.
+    The fork server imports them once, so that not every run has to. The files are only parsed;
+    code of a plugin must not run here.
     """
     packages: dict[str, None] = {}
     files = [file]
@@ -185,7 +186,8 @@ def start_isolated_tuner(
     """Start an isolated tuner for one run or one training, or reuse an idle one.
 
     A process that failed, or that serves one run only, is ended afterwards; others wait for the
-    next run of the same tuner, seed, memory limit and weights.
+    next run of the same tuner, seed, memory limit and weights. If too many wait, the one that has
+    waited longest is ended.
 
     Args:
         tuned: specification of the tuner.

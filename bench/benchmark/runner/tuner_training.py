@@ -64,7 +64,10 @@ def train_remotely(
     stream: NDArray[np.uint32],
     watch: TrainingCallback | None,
 ) -> dict[str, Array]:
-    """Train a tuner in its isolated process.
+    """Train a tuner in its isolated process, while this process simulates for it.
+
+    The training is started by a message ``F`` ("fit"). Then the tuner's messages are answered:
+    requests of simulations and reports of progress, until it sends its trained arrays (``L``).
 
     Args:
         child: process of the tuner.
@@ -100,12 +103,17 @@ def _handle_message(
     simulators: list[TrainingSimulator],
     callback: TrainingCallback | None,
 ) -> None:
-    """Handle one message of a tuner during its training.
+    """Answer one message of a tuner during its training.
+
+    Message ``W`` reports progress, and is confirmed by ``K``. Message ``P`` requests simulations;
+    flag 1 selects the simulator for evaluation instead of that for training, which
+    exists only if there is a callback. Flag 2 is read in `_serve_simulation`.
 
     Args:
         child: process of the tuner.
         message: its message.
-        simulators: training simulators that it may use.
+        simulators: training simulators that it may use; that for evaluation is added on its first
+            use.
         callback: receives the progress; None for no progress.
 
     Raises:
@@ -119,7 +127,6 @@ def _handle_message(
         and message.flags < 4
         and (callback is not None or not message.flags & 1)
     ):
-        # The second simulator is for evaluation only, and exists only if there is a callback.
         if message.flags & 1 and callback is not None and len(simulators) == 1:
             simulators.append(callback.ground)
         _serve_simulation(child, message, simulators[message.flags & 1])
@@ -145,8 +152,10 @@ def _serve_simulation(
 ) -> None:
     """Send the properties of a simulator, and simulate if the message requests it.
 
-    It serves a learned tuner that trains in an isolated process. A request that is not valid, or
-    beyond the budget, is answered by a refusal (message X), and the training can continue.
+    It serves a learned tuner that trains in an isolated process. Flag 2 of the message
+    requests a simulation, without which only the properties are sent (message ``O``). A request
+    that is not valid, or beyond the budget, is answered by a refusal (message ``X``), and the
+    training can continue.
 
     Args:
         child: isolated process with the tuner.
@@ -272,6 +281,8 @@ TRAINING_IRRELEVANT_KEYS = {
 def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -> str:
     """Return the key of a training: a name with a hash of everything that determines the weights.
 
+    It is the name of the file of the weights, so that weights are reused only by an equal training.
+
     Args:
         experiment: configuration of the training.
         entry: entry of the tuner.
@@ -357,23 +368,26 @@ def _train_or_read_weights(
     experiment: Experiment,
     request: TrainingRequest,
     callback: TrainingCallback | None,
-    is_repeated: bool,
+    trains_anew: bool,
     earlier_requests: list[str],
 ) -> TrainingResult:
-    """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
+    """Train the tuner of a request, or check its weights in the cache; see `train_or_load`.
+
+    A trusted tuner trains in this process, others in an isolated one. The weights are written with
+    the cost of the training and its key.
 
     Args:
         experiment: experiment with simulator, training ranges and budget.
         request: names the tuner's entry and the seed, and how to build the tuner in isolation.
         callback: gets the losses of each epoch.
-        is_repeated: train even if the cache has the weights.
+        trains_anew: train even if the cache has the weights.
         earlier_requests: hashes of the simulations requested before an external kill; the repeated
             training must make the same requests.
     """
     entry, seed = request.entry, request.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
-    if path.exists() and not is_repeated:
+    if path.exists() and not trains_anew:
         simulations, seconds = _read_checked_arrays(path, name)[_COST_ARRAY]
         # Weights that do not fit must be reported now, and not in every run.
         _check_weights(request, path)
@@ -383,18 +397,18 @@ def _train_or_read_weights(
     stream = make_seed_words(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
-    learn = _train_in_process if request.tuned is None else _train_isolated
+    train = _train_in_process if request.tuned is None else _train_isolated
     randomised_simulator = RandomisedSimulator(problem) if entry.randomised else None
     simulator = _ReplayCheckedSimulator(
         problem, experiment.training_budget, earlier_requests, randomised_simulator
     )
     started = perf_counter()
-    state = learn(request, simulator, stream, callback)
+    state = train(request, simulator, stream, callback)
     seconds = perf_counter() - started
     problem.close()
     if randomised_simulator is not None:
         randomised_simulator.close()
-    # Cost and key are stored with the weights, so that an exchanged file is detected.
+    # The key is stored with the weights, so that an exchanged file is detected.
     metadata = {
         _COST_ARRAY: np.array([simulator.used, seconds]),
         _KEY_ARRAY: np.frombuffer(name.encode(), dtype=np.uint8),

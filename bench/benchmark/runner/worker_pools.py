@@ -78,8 +78,9 @@ _preparing = threading.RLock()
 def _leave_out_main_module() -> Iterator[None]:
     """Prevent processes that this thread spawns from importing the main module.
 
-    multiprocessing has no option for this. The preparation data is made inside ``Popen._launch``,
-    so the function that makes it is replaced for the calls of this thread.
+    Otherwise a user's script would run again in each of them. multiprocessing has no option for
+    this. It sends each new process preparation data, which name the main module; so the function
+    that makes these data is replaced within the block, for the calls of this thread.
     """
     with _preparing:
         original, thread = spawn.get_preparation_data, threading.get_ident()
@@ -366,9 +367,10 @@ class LocalPool:
             slot.stop()
 
     def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Iterate over the results of calls in the order in which they end.
+        """Execute calls in the workers, and iterate over their results in the order they end.
 
-        A call that exceeds its limit gives a `TimeoutError`. A call whose worker dies gives a
+        Each turn of the loop assigns waiting calls to free workers, waits for results, and returns
+        them. A call that exceeds its limit gives a `TimeoutError`. A call whose worker dies gives a
         `WorkerDiedError`; if the worker was killed externally (by the kernel or a user), only after
         `MAX_RETRIES` repetitions.
 
@@ -384,7 +386,8 @@ class LocalPool:
         """
         limit = None if math.isinf(seconds) else seconds + HARD_LIMIT_GRACE_SECONDS
         if not self._slots:
-            describe_stepping()  # executed here, because a worker cannot report what it waits for
+            # Machine code is compiled here, because a worker cannot report what it waits for.
+            describe_stepping()
         self._slots = self._slots or [_WorkerSlot(self._plugins) for _ in range(self._jobs)]
         waiting_calls = deque(_AssignedCall(place) for place in range(len(calls)))
         pace = _PrefetchPolicy()
@@ -489,10 +492,14 @@ class _WorkerSlot:
         self.given[future] = call
 
     def collect(self, waiting: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
-        """Return the calls of this worker that have ended, each with its result or exception.
+        """Return the calls of this worker that have ended, and replace the worker if it is lost.
 
-        Calls that a lost worker did not begin, or whose end is no fault of theirs, are put back to
-        the front of `waiting`. A lost worker is replaced.
+        A lost worker was killed or has died. Calls that it did not begin, and those that were not
+        the cause, are put back to the front of `waiting`. pebble does not notice a worker that ends
+        with exit code 0, so that is detected by its replacement.
+
+        Returns:
+            Each call that has ended, with its result or exception.
         """
         ended_calls: list[tuple[_AssignedCall, Any]] = []
         is_lost = False
@@ -555,16 +562,17 @@ def _loses_the_worker(error: BaseException | None) -> bool:
 
 
 def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
-    """Return whether to repeat a call, because its end gives no information about it.
+    """Return whether to repeat a call whose worker was killed or lost, and count the deaths.
 
-    It also counts the deaths of workers during the call.
+    A pool that broke has not begun the call, or has not reported its result. A worker that was
+    killed externally gives no information about the call, which is repeated a few times. Any other
+    error is the result of the call.
 
     Args:
         call: the call, whose number of deaths is increased in place.
         error: error with which it ended; None if it has a result.
     """
     code = _get_exit_code(error)
-    # A broken pool has not begun the call, or has not reported its result.
     is_repeated = isinstance(error, BrokenExecutor) or (
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
     )

@@ -381,7 +381,7 @@ def _make_subdivided_grid(
 
 
 def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
-    """Compute one input for each step (n, S) from its means (n, S, 4) over the quarters of the step.
+    """Compute one input for each step (n, S) from the means (n, S, 4) over its quarters.
 
     MuJoCo holds one control over a step of length h, so a command that changes within a step would
     be applied too early or too late by a fraction of it. The control has the command's mean. In

@@ -147,7 +147,7 @@ class _ContactModel:
         return result
 
     def _compute_jacobians(self) -> dict[_Key, tuple[Array, float, bool]]:
-        """Return Jacobian (n, nv), distance, and whether it is closed, for each contact in the data.
+        """Return Jacobian (n, nv), distance, and whether it is closed, for each contact.
 
         The Jacobian maps the velocities (nv,) of the robot to that of one geom against the other at
         the contact point, in the frame of the contact: along its normal first, and, with friction,

@@ -279,7 +279,7 @@ class MujocoBatch:
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def write_effects(self, acting: ActiveEffects) -> None:
-        """Write effects that are numbers of MuJoCo's model, such as masses, into the batch's fields.
+        """Write effects that are numbers of MuJoCo's model, such as masses, into its fields.
 
         First the fields that former effects changed get the values of the file again. Then the
         effects are written in a fixed order, since some depend on others, and MuJoCo recomputes

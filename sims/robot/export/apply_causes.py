@@ -116,6 +116,9 @@ def apply_causes(
 ) -> ModifiedModel:
     """Apply fitted causes to a copy of a robot's model, and explain each change in a comment.
 
+    The result is what a model file must contain so that MuJoCo simulates the robot with its causes,
+    such as a joint's friction or a wrong mass. The steps are:
+
     1. Add the elements that causes need: couplings, contact pairs, elements in series.
     2. Write each cause into the fields of the model. Causes that no model file can state, such as a
        sensor's bias, become notes.
@@ -151,6 +154,7 @@ def apply_causes(
     for cause in sorted(fitted_causes, key=lambda c: (get_application_order(c), _is_in_series(c))):
         before = {name: values.copy() for name, values in target_values.items()}
         places_in_series = {applied.place for applied in applied_causes if _is_in_series(applied)}
+        # The elements in series at a place are written once, with the first of their causes.
         remark = _write_cause(
             target_values, robot, cause, series if cause.place not in places_in_series else {}
         )
@@ -191,7 +195,7 @@ def apply_causes(
 
 
 def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
-    """Return the note about an effect that the file contains; None if there is none.
+    """Return what the user should know about an effect that the file contains; None if nothing.
 
     Args:
         robot: model of the robot.
@@ -273,7 +277,10 @@ def _write_cause(
 
 
 def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
-    """Return whether a frame element changes the attributes that a geometry effect changes.
+    """Return whether an element is within a ``<frame>``, which moves its position and axes.
+
+    The compiled numbers are then not those of the file, so an effect on geometry cannot be written
+    as a changed attribute.
 
     Args:
         robot: model of the robot.
@@ -286,8 +293,8 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
 def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any, Any]:
     """Change a copy of the robot's editable model until it compiles to the wanted fields.
 
-    The compiler derives fields from attributes, so a change may also modify values that should
-    stay. Several rounds are needed:
+    The compiler derives fields (numbers of the compiled model) from attributes of the file, so a
+    change may also modify values that should stay. Each of several rounds corrects this:
 
     1. Find the attributes whose fields differ from the wanted ones.
     2. Set them, and compile the model.
@@ -322,7 +329,9 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
 
 
 def _keep_masses(spec: Any, target_values: Fields) -> None:
-    """Change compiler settings so that MuJoCo uses inertials as specified.
+    """Change compiler settings so that MuJoCo uses the masses and inertias of bodies as specified.
+
+    By default settings of a file, it may compute them from shapes, or scale them to a total mass.
 
     Args:
         spec: the model as an `MjSpec`, changed in place.
@@ -401,7 +410,9 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
 def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
     """Convert a position in the parent body to the innermost of the frames around a body.
 
-    MuJoCo replaces the bodies that it fuses by such frames.
+    MuJoCo replaces bodies that it fuses into their parents by such frames. The position of a body
+    in the editable model is relative to the frame, but in the compiled model to the parent. First
+    the pose of the innermost frame in the parent is composed, from the inside to the outside.
     """
     # Importing scipy.spatial takes 0.1 s, and most model files have no fused bodies.
     from scipy.spatial.transform import Rotation

@@ -116,10 +116,11 @@ class FieldAddress(NamedTuple):
 def _make_polynomial_reader(
     first: str, higher_orders: str, address: str = "id"
 ) -> Callable[[Fields, Any], list[float]]:
-    """Return a reader of a polynomial attribute: its linear coefficient, then the others.
+    """Return a reader of an attribute that is a polynomial: damping or stiffness of a joint.
 
-    MuJoCo stores the linear coefficient in the field `first` and the others in the field
-    `higher_orders`. `address` names the attribute of `field_address` with the row in these fields.
+    MuJoCo stores its linear coefficient in the field `first` and the others in the field
+    `higher_orders`; the reader joins them. `address` names the attribute of `FieldAddress` that is
+    the row in these fields.
     """
 
     def read(fields: Fields, field_address: Any) -> list[float]:
@@ -286,7 +287,8 @@ def find_differing_statements(
 ) -> list[AttributeStatement]:
     """Find the attributes of a model file in which two sets of model fields differ.
 
-    These have to be written into the file so that it compiles to the wanted fields.
+    These have to be written into the file so that it compiles to the wanted fields. An inertial
+    (mass, centre of mass and inertia of a body) is complete if any of its values differs.
 
     Args:
         model: compiled model with the elements.
@@ -382,9 +384,10 @@ class _Actuator:
     def __init__(self, fields: Fields, robot: RobotModel, place: str) -> None:
         """Read the fields of the actuator with this name, and its properties for eqs. (1) and (2).
 
-        `gain` and `bias` are views, so that writing to them changes `fields`. `direct`
-        means without activation dynamics, `fixed` with a constant gain, `clamped` with a
-        limited activation.
+        An actuator exerts the force gain * input + bias. `gain` and `bias` are views, so that
+        writing to them changes `fields`. `direct` means that the input is the control itself,
+        without activation dynamics such as a filter; `fixed`, that the gain is constant;
+        `clamped`, that the activation is limited; `single`, that there is one control.
         """
         import mujoco
 
@@ -470,7 +473,10 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
 def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input gain a into the actuator: gain times 1 + a (1), range divided by it (2).
+    """Write an error a of the input gain into the actuator.
+
+    The actuator's gain is multiplied by 1 + a (1). Its control range is divided by the same factor,
+    since the range limits the command before the gain here, but after it in reality (2).
 
     Args:
         fields: fields of the compiled model, changed in place.
@@ -491,12 +497,11 @@ def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
 
 def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input bias b into the actuator: shift its force by gain b (1), its range by -b (2).
+    """Write an input bias b into the actuator: a constant force, and a shifted control range.
 
-    `input_factor` is the factor 1 + a of an input gain that is in the fields already.
-
-    With the command u, the input (1 + a) u + b gives the force g (1 + a) u + g b + bias (1), so
-    that b is part of the actuator's bias.
+    With the command u and an input gain 1 + a that is in the fields already (`input_factor`), the
+    input is (1 + a) u + b. So the actuator with gain g gets the additional force g b (1), and the
+    limits of its control are shifted by -b / (1 + a) (2). The gain in the fields is g (1 + a).
 
     Args:
         fields: fields of the compiled model, changed in place.
@@ -515,12 +520,12 @@ def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
 
 def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write a saturation of the input at ±s as a narrower control range, eq. (2).
+    """Write a saturation of the input at ±s as a narrower control range of the actuator.
 
-    A saturation s of zero or less has no effect, as in the simulation.
-
-    With the input w = clip((1 + a) u + b, -s, s), the command is limited to (-s - b) / (1 + a) and
-    (s - b) / (1 + a), within its control range (2).
+    The input is w = clip((1 + a) u + b, -s, s) for the command u, with a gain error a and a bias b
+    that are in the fields already. So the command is limited to the range from (-s - b) / (1 + a)
+    to (s - b) / (1 + a), within its own control range (2). A saturation s of zero or less has no
+    effect, as in the simulation.
 
     Args:
         fields: fields of the compiled model, changed in place.
@@ -679,7 +684,7 @@ def get_application_order(cause: FittedCause) -> tuple[int, int]:
     Integrator settings come first, then causes in the model, then input effects in the order in
     which a command passes them.
     """
-    # The stiffness of dry friction depends on the time step.
+    # The stiffness of dry friction depends on the time step, so that comes first.
     if cause.effect.startswith("numerics."):
         return 0, 0
     names = list(COMMAND_WRITERS)

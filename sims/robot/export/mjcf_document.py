@@ -175,6 +175,8 @@ class XmlText:
     def _render_range(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
         """Return the text between two byte positions, with changed elements replaced.
 
+        Text between changed elements is copied byte for byte.
+
         Args:
             begin: offset of the first byte.
             end: offset after the last byte.
@@ -193,7 +195,9 @@ class XmlText:
     def _render_element(self, tag: XmlElement) -> bytes:
         """Return the text of an element with its comments, changed attributes and new elements.
 
-        All text that has not changed is kept byte for byte.
+        The parts are, in order: comments before it, its start tag, inserted children, its own
+        content (rendered recursively), its end tag, and elements after it. All text that has not
+        changed is kept byte for byte.
 
         Raises:
             NotEditableError: new elements belong into an element with a self-closing tag.
@@ -392,8 +396,9 @@ class MjcfDocument:
     def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
         """Map the elements of the compiled model to those of the text.
 
-        Bodies, joints and actuators are found by their order, which is that of the text; geoms and
-        contact pairs are found by their names.
+        So a change of the compiled model leads to the place in the text. Bodies, joints and
+        actuators are found by their order, which is that of the text; geoms (shapes) and contact
+        pairs are found by their names.
 
         Args:
             model: Compiled model of MuJoCo.

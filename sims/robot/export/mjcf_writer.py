@@ -178,11 +178,11 @@ class MjcfWriter:
         return values
 
     def _format_actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
-        """Return the attributes of an actuator as text, and keep its element name if possible.
+        """Return the attributes of an actuator as text; rename its element if it must be renamed.
 
         Element names such as ``position`` or ``motor`` are shortcuts for a general actuator. If the
-        shortcut cannot state the wanted values, the element becomes ``general`` with all the
-        attributes that it needs.
+        shortcut can state the wanted values, it is kept. Otherwise the element becomes ``general``
+        with all the attributes that the shortcut implied.
 
         Args:
             tag: element of the actuator in the text; its name may be changed.
@@ -236,7 +236,8 @@ def _format_shortcut(
     """Return the gains of an actuator shortcut as attributes; None if it cannot express the values.
 
     A position actuator has force = kp (u - l) - kv l', and a velocity actuator kv (u - l'), with
-    the control u and the actuator's position l. So gain and bias must have these relations.
+    the control u and the actuator's position l. MuJoCo stores force = gain u + offset
+    + stiffness l + damping l', so a position actuator needs offset = 0 and stiffness = -gain.
 
     Args:
         name: name of the shortcut, such as ``position``.

@@ -36,7 +36,9 @@ It takes the model fields, the robot and the place.
 
 
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
-    """Return the component of gravity along the direction that the file specifies.
+    """Return the component of gravity along its direction in the file, in a list of one, m/s^2.
+
+    All readers have the same arguments.
 
     Args:
         f: fields of the model with the effects.
@@ -116,9 +118,11 @@ Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
 
 
 def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
-    """Return the values of the model file before and after all effects are applied, for the report.
+    """Return the numbers of the model file that effects change, before and after, for the report.
 
-    Several effects may change one value, such as the mass of a body; a total includes all of them.
+    A fitted coefficient is a change, such as 0.2 of a damping. Users want to see the number in the
+    file and the total, such as 0.1 and 0.3. Several effects may change one number, such as the mass
+    of a body; a total includes all of them.
 
     Args:
         robot: model of the robot as read from its file.
@@ -171,10 +175,11 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
 def _list_totals(
     robot: RobotModel, effect: type[Effect], count: int, file_fields: Fields, changed_fields: Fields
 ) -> list[Total | None]:
-    """Return the values of the model file before and after one effect.
+    """Return the numbers of the model file that one effect changes, before and after.
 
-    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. Return None
-    where the file has no such value.
+    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. The entry of
+    a coefficient is None where the file has no such number, or an infinite one. Units at a slide
+    joint may differ from those at a hinge.
 
     Args:
         robot: model of the robot as read from its file.

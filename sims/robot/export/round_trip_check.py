@@ -91,6 +91,8 @@ def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
     """Check that a written URDF loads as the model with all causes that a URDF can express.
 
+    The steps are:
+
     1. Apply the causes that a URDF can state to the original model.
     2. Load the written URDF.
     3. Compare fields, inertia tensors and a test motion. Contacts and friction stiffness, which a
@@ -173,6 +175,8 @@ def _compare_models(reloaded_model: Any, target_model: Any, name: str) -> None:
 
 def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that two models move alike in a short test simulation from the same pose.
+
+    This detects differences that a comparison of fields misses or cannot make.
 
     Args:
         reloaded_model: model compiled from the written file.

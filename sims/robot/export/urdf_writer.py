@@ -166,12 +166,11 @@ class UrdfWriter:
         return None
 
     def _write_centre_of_mass(self, cause: FittedCause) -> str | None:
-        """Move the centre of mass of each link in the body by the same vector in metres, eq. (2).
+        """Move the centre of mass of each link in the body by the same vector c in metres.
 
-        The result is None, or the reason why the URDF cannot state the cause.
-
-        The centre of mass of each fused link is moved by R' c, with the link's axes R in the frame
-        of the body (2).
+        A body may consist of several links that are fused by fixed joints. In the frame of a link,
+        whose axes in the frame of the body are R, the vector is R' c (2). The result is None, or
+        the reason why the URDF cannot state the cause.
         """
         inertials = self._find_inertials(cause)
         if inertials is None:
@@ -184,12 +183,11 @@ class UrdfWriter:
         return None
 
     def _write_joint_zero(self, cause: FittedCause) -> str | None:
-        """Move the zero of a joint by c (rad or m): turn or move its origin, by eq. (3).
+        """Move the zero of a joint by c (rad or m).
 
-        The result is None, or the reason why the URDF cannot state the cause.
-
-        The zero moves by c if the origin of the joint is turned by -c about its axis, or moved by
-        -c along it (3).
+        URDF cannot state a zero. It moves by c if the origin of the joint is turned by -c about its
+        axis, or moved by -c along it if the joint is prismatic (3). The result is None, or the
+        reason why the URDF cannot state the cause.
         """
         joint = self.joints.get(cause.place)
         if joint is None:
@@ -219,14 +217,12 @@ class UrdfWriter:
         return None
 
     def _write_link_length(self, cause: FittedCause) -> str | None:
-        """Lengthen a link: move its joint away from the joint of the parent body, by eq. (4).
+        """Lengthen a link by the share c: move the joint that carries the body.
 
-        `carrier` is the parent body in the compiled model, and `axes` are the axes of the
-        parent link in it. The result is None, or the reason why the URDF cannot state the
-        cause.
-
-        The origin of the body's joint moves by R' c p, with the position p of the body in the frame
-        of its parent, and the axes R of the joint's parent link (4).
+        With the position p of the body in the frame of its parent body (`carrier`), the joint's
+        origin moves by c p. In the frame of the joint's parent link, whose axes in the parent body
+        are R (`axes`), this is R' c p (4). The result is None, or the reason why the URDF cannot
+        state the cause.
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
         joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]
@@ -240,12 +236,13 @@ class UrdfWriter:
         return None
 
     def _write_payload(self, cause: FittedCause) -> str | None:
-        """Add a point mass to a link: new mass, centre of mass, and inertia tensor by eq. (5).
+        """Add a payload, a point mass, to a link: new mass, centre of mass, and inertia tensor.
 
         The coefficients are the mass `added_mass` in kg and its offset from the body's centre of
-        mass in m. The tensor is computed in the axes of the link about the common centre of
-        mass `middle`, and written in the axes of the inertial. The result is None, or the
-        reason why the URDF cannot state the cause.
+        mass in m. The inertia tensor is turned to the axes of the link, increased by the parallel
+        axis theorem to that about the common centre of mass `middle` (5), and turned back to the
+        axes of the inertial, in which it is written. The result is None, or the reason why the URDF
+        cannot state the cause.
         """
         body = self.robot.body(cause.place)
         link = self.links.get(body.name)
@@ -255,19 +252,15 @@ class UrdfWriter:
         mass_tag, tensor_tag = _find_child(inertial, "mass"), _find_child(inertial, "inertia")
         if mass_tag is None or tensor_tag is None:
             return "the link's inertial lacks a mass or an inertia"
-        mass, (added_mass, *offset) = (
-            float(mass_tag.get_attribute("value") or 0.0),
-            cause.coefficients,
-        )
+        mass = float(mass_tag.get_attribute("value") or 0.0)
+        added_mass, *offset = cause.coefficients
         point = self.robot.compiled.body_ipos[body.id] + offset
-        centre, axes = (
-            _read_origin(inertial, "xyz"),
-            _compute_rotation(_read_origin(inertial, "rpy")),
-        )
+        centre = _read_origin(inertial, "xyz")
+        axes = _compute_rotation(_read_origin(inertial, "rpy"))
         values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR_ATTRIBUTES]
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
-        tensor += np.triu(tensor, 1).T
+        tensor += np.triu(tensor, 1).T  # makes it symmetric
         middle = (mass * centre + added_mass * point) / (mass + added_mass)
         tensor = axes @ tensor @ axes.T
         arms = np.stack([centre - middle, point - middle])

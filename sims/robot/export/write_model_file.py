@@ -99,7 +99,7 @@ def write_model_files(
         if robot.actuator_tables:
             raise NotEditableError("its actuators are the recording's")
         text = MjcfEditor(
-            applied.robot, applied, recording, render_with_series_joints(applied)
+            applied.robot, applied, recording, render_with_added_elements(applied)
         ).to_text()
     except NotEditableError as unfit:
         if robot.format == "mjcf":
@@ -109,10 +109,12 @@ def write_model_files(
     return WrittenModelFiles(text, urdf, tuple(notes), applied)
 
 
-def render_with_series_joints(applied: ModifiedModel) -> bytes:
-    """Render the model file with elements that causes add, and a fixed base.
+def render_with_added_elements(applied: ModifiedModel) -> bytes:
+    """Return the text of the model file with the elements that causes add, and a fixed base.
 
-    These elements are joints in series, tendons of coupled drives, and pairs of geoms.
+    These elements are joints in series (second joints of flexible or slack drives), tendons of
+    coupled drives, and pairs of geoms with contact parameters of their own. Their numbers are
+    written afterwards. Without any of them, the text is unchanged.
 
     Args:
         applied: model with the causes applied.
@@ -269,7 +271,7 @@ class MjcfEditor:
     def __init__(
         self, robot: RobotModel, applied: ModifiedModel, recording: str, text: bytes
     ) -> None:
-        """Compile the unchanged document, which is the reference for later comparisons.
+        """Compile the document before its attributes change, as a reference for what must change.
 
         Args:
             robot: robot with the text.
@@ -288,10 +290,11 @@ class MjcfEditor:
         return document
 
     def to_text(self) -> str:
-        """Return the text with all wanted attributes.
+        """Return the text with all wanted attributes, checked by compiling it.
 
-        Attributes are written, the text is compiled, and attributes that still differ are
-        written again, for at most `MAX_CORRECTION_ROUNDS` rounds.
+        MuJoCo derives its numbers from attributes in many ways, so a change may have no effect, or
+        change other numbers too. So the attributes are written, the text is compiled, and what
+        still differs is written as well, for at most `MAX_CORRECTION_ROUNDS` rounds.
 
         Raises:
             NotEditableError: the edited text does not compile to the wanted model.
@@ -397,6 +400,10 @@ def _format_default_element(
 ) -> tuple[str, dict[str, str]]:
     """Return the tag of an element in a default class, and its attributes as text.
 
+    Attributes with MuJoCo's default values are omitted, and those that belong to the pose of one
+    joint. An actuator that is a position servo becomes ``position`` with its gains; any other one
+    becomes ``general``.
+
     Args:
         element: the joint or actuator.
         values: its values by MJCF attribute.
@@ -445,7 +452,10 @@ def render_model_using_class(
     name: str,
     text: str,
 ) -> str:
-    """Render the model file with all causes, where a joint and its actuator use the class.
+    """Render the model file with all causes, where a joint and its actuator use a default class.
+
+    The class has their numbers, so these are removed from their own elements. The result is
+    compiled to check that it is the same model.
 
     Args:
         robot: robot as read from its model file.
