@@ -64,6 +64,9 @@ def _receive_request(link: socket.socket) -> tuple[dict[str, Any], list[int]] | 
 def serve_fork_requests(descriptor: int) -> None:
     """Serve requests until the client closes the socket or has ended.
 
+    Each request names modules to import, and may ask for a new process, which this process forks.
+    The fork becomes a supervisor; this process continues with the next request.
+
     Args:
         descriptor: file descriptor of the socket.
     """
@@ -103,8 +106,9 @@ def _preload_modules(modules: list[str]) -> None:
 def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: list[str]) -> None:
     """Act as supervisor: fork the process that runs the service, and report how it ended.
 
-    The supervisor is needed because a new process namespace begins with the next child. It never
-    runs the tuner's code.
+    The supervisor enters a new process namespace, which begins with its next child, and mounts the
+    empty folder of the process. It never runs the tuner's code. It reports the exit code on the
+    control socket, and kills the process if that socket is closed.
 
     Args:
         request: request of the harness: function of the service, its folder, readable paths and

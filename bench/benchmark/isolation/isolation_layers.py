@@ -186,9 +186,12 @@ class AffinityController:
         self._pinned = False
 
     def record_exchange(self) -> int:
-        """Count an exchange, and return flags that tell the other side where to run.
+        """Count an exchange of messages, and return flags that tell the other side where to run.
 
-        0 means no change, 255 any processor, and n + 1 processor n.
+        0 means no change, 255 any processor, and n + 1 processor n. After every
+        `_MEASURED_EXCHANGES` exchanges, their mean duration decides: fast exchanges pin both sides
+        to one processor, slow ones release them. A pin is also released after some time, to measure
+        without it.
         """
         self._count += 1
         if self._count % _MEASURED_EXCHANGES:
@@ -318,6 +321,9 @@ def _list_readable_paths(hidden: tuple[str, ...], packages: tuple[str, ...]) -> 
 
 def enter_namespaces() -> list[str]:
     """Enter new user, network and IPC namespaces; children inherit them.
+
+    In a namespace, a process has no access to the network, the shared memory and the privileges
+    outside. What the kernel does not permit is left out.
 
     Returns:
         Names of the active isolation layers.

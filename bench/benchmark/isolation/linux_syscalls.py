@@ -247,8 +247,9 @@ def get_landlock_version() -> int:
 def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> None:
     """Restrict this process and its children to some files and folders, by Landlock.
 
-    Newer versions of Landlock also block TCP connections, signals and abstract sockets to processes
-    outside.
+    Landlock is a part of Linux with which a process gives up rights for ever. A set of rules is
+    created, a rule for each path is added, and the set is applied. Newer versions of Landlock also
+    block TCP connections, signals and abstract sockets to processes outside.
 
     Args:
         readable: readable files and folders; missing ones are ignored.

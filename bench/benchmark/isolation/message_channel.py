@@ -186,6 +186,10 @@ class MessageChannel:
     def receive(self, limit: int = MAX_TEXT_BYTES, deadline: float = float("inf")) -> Message:
         """Receive the next message from the process at the other end.
 
+        Its header says how long the body is. The length is checked before memory is allocated, and
+        data after the message is an error, since each side sends only in response to the other. A
+        message that fits into the buffer is returned as a view of it.
+
         Args:
             limit: maximum size of the body in bytes.
             deadline: latest time, as of `time.perf_counter`.
@@ -268,6 +272,9 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
 def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     """Unpack the arrays of a body that `pack_arrays` made.
 
+    The first line lists name, type and shape of each array; their bytes follow. Code of a tuner may
+    have made the body, so everything is checked.
+
     Raises:
         ProtocolError: the body is not valid.
     """
@@ -304,7 +311,7 @@ _NAME_LENGTH = 500
 def _read_array(
     data: memoryview, offset: int, kind: str, shape: Sequence[int]
 ) -> tuple[NDArray[Any], int]:
-    """Read the array at a position.
+    """Read the array at a position of a message, after checking its type, shape and size.
 
     Args:
         data: bytes of all arrays.

@@ -115,6 +115,10 @@ class ArgumentRule(NamedTuple):
 def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | ArgumentRule]:
     """Return the verdict or the rule for each system call that is not allowed in general.
 
+    Listed calls fail with EPERM (not permitted) unless another verdict is stated. Calls that are
+    harmless with some arguments have a rule that depends on an argument; for example, a process may
+    send signals to itself only.
+
     Args:
         process: process id of the process that is restricted.
         has_memory_limit: True if calls that allocate uncounted memory are blocked too.
@@ -200,7 +204,10 @@ def _emit_rule(rule: int | ArgumentRule) -> list[BpfInstruction]:
 
 
 def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[BpfInstruction]:
-    """Build the filter program; calls without a rule are allowed.
+    """Build the filter program, in BPF instructions that the kernel executes for each system call.
+
+    A call of another architecture kills the process. The number of the call is compared with each
+    known number; calls without a rule are allowed.
 
     Args:
         machine: machine, as of `platform.machine`.
@@ -218,9 +225,10 @@ def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[
 
 
 def install_syscall_filter(has_memory_limit: bool = False) -> None:
-    """Install a filter that blocks new processes, signals to others, and the network.
+    """Install a seccomp filter that blocks new processes, signals to others, and the network.
 
-    Threads stay allowed. All capabilities of a superuser are given up before.
+    Threads stay allowed. All capabilities of a superuser are given up before. The filter cannot be
+    removed again.
 
     Args:
         has_memory_limit: True if the process has a memory limit; calls that allocate uncounted

@@ -225,7 +225,10 @@ class ForkServerClient:
         hidden: Iterable[str] = (),
         modules: Iterable[str] = (),
     ) -> IsolatedProcess:
-        """Start an isolated process.
+        """Start an isolated process, by a request to the fork server.
+
+        Two pipes for messages and a control socket to its supervisor are made. Their ends for the
+        process are sent with the request and closed here.
 
         Args:
             service: module and function that the process runs, as ``MODULE:FUNCTION``; it gets a
@@ -369,7 +372,10 @@ class IsolatedProcess:
             raise KilledExternallyError(f"a tuner's process did not start ({self.end()})") from None
 
     def end(self, kill: bool = True) -> int | None:
-        """End the process.
+        """End the process, and return its exit code.
+
+        Closing the channel asks the process to end by itself. If it does not, or if it is to be
+        killed, closing the control socket makes its supervisor kill it.
 
         Args:
             kill: True to kill it at once; False to let it end by itself first.

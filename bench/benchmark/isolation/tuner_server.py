@@ -47,7 +47,10 @@ from methods.tuner import (
 
 
 def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers: list[str]) -> None:
-    """Serve requests until the harness closes the channel.
+    """Serve requests until the harness closes the channel; the harness is the process that scores.
+
+    First the active isolation layers are reported. An error in the tuner's code is reported and
+    ends its run, but not this process.
 
     Args:
         channel: message channel to the harness.
@@ -233,7 +236,11 @@ def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
 
 
 def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
-    """Send proposals to the harness, and evaluations to the tuner.
+    """Send proposals to the harness, and evaluations to the tuner, until one of them ends the run.
+
+    A message ``A`` ("ask") contains the recommended point, if the tuner states one, and the points
+    to simulate. The answer ``E`` ("evaluation") contains n points as they were simulated, their n
+    losses, and their observations, one after the other. Any other answer ends the run.
 
     Args:
         channel: message channel to the harness.
@@ -261,6 +268,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         answer = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
         if answer.kind != b"E":
             raise GeneratorExit
+        # The flags say on which processor to run, see `isolation_layers.AffinityController`.
         if answer.flags:
             _set_processor(answer.flags - 1)
         numbers, point_count = answer.to_array(), answer.size

@@ -34,6 +34,9 @@ def compute_bootstrap_interval(
 ) -> tuple[Array, Array]:
     """Compute the 95 % percentile-bootstrap interval of a statistic over the rows of an array.
 
+    Targets are drawn with replacement many times; the statistic of each resample is computed, and
+    the interval contains 95 % of these values.
+
     Args:
         values: (n, m) measured values, one row per target; rows that are not finite are left out.
         statistic: `compute_resampled_means` or `compute_resampled_medians`.
@@ -63,6 +66,7 @@ def draw_resample_counts(n: int, resamples: int, rng: np.random.Generator) -> Re
         (n, resamples) counts.
     """
     indices = rng.integers(n, size=(resamples, n))
+    # Numbers of each resample in a range of its own, so that all are counted at once.
     indices += n * np.arange(resamples)[:, None]
     counts = np.bincount(indices.ravel(), minlength=resamples * n)
     return np.ascontiguousarray(counts.reshape(resamples, n).T.astype(np.min_scalar_type(n)))
@@ -86,7 +90,10 @@ def compute_resampled_means(values: Array, counts: ResampleCounts) -> Array:
 
 
 def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
-    """Compute medians of resampled rows.
+    """Compute medians of resampled rows, without building the resamples.
+
+    The values are sorted once. The number of times that each value occurs in a resample then tells
+    which of them are in the middle; for an even number of rows the median is the mean of two.
 
     Args:
         values: (n, m) one row per target.

@@ -62,7 +62,7 @@ class ComparisonStatistics:
     """
 
     def __init__(self, stored: StoredComparison) -> None:
-        """Select the deciding metric, its curves and thresholds.
+        """Select the deciding metric, its curves (errors by number of simulations) and thresholds.
 
         Other statistics are computed when they are used. `floor` is the error below which tuners
         count as equal. `_curves` and `_medians` cache the results of other metrics by name.
@@ -78,8 +78,8 @@ class ComparisonStatistics:
         self.runtime_thresholds, self.levels = select_thresholds(self.curves, in_widths)
         self.floor = stored.experiment.negligible_error
         if not in_widths:
-            # For a recording no error is known to be zero; the smallest median error is used
-            # instead.
+            # A recording has errors that no parameters could remove, so tuners that are close to
+            # the smallest median error count as equal.
             self.floor = (1.0 + self.floor) * _find_lowest_median(self.curves)
         self.all_runs = stored.runs
         self._curves: dict[str, RunCurves] = {}
@@ -160,6 +160,8 @@ class ComparisonStatistics:
 
     def get_error_floor(self, metric: str) -> float | None:
         """Return the error below which tuners count as equal, in the unit of a metric.
+
+        The absolute error of a single parameter decides too, in its own unit.
 
         Returns:
             Error; None for a metric that does not decide the comparison.

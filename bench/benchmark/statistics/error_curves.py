@@ -168,7 +168,7 @@ class RunRowTable:
 
 
 def average_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array:
-    """Compute the mean of each target's rows, ignoring NaN.
+    """Compute the mean over the runs of each target, which differ in their seeds, ignoring NaN.
 
     Args:
         values: (R, ...) one row per run.
@@ -182,7 +182,7 @@ def average_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Ar
     with warnings.catch_warnings():
         # NumPy warns about the mean of NaN alone; the result NaN is intended.
         warnings.simplefilter("ignore", RuntimeWarning)
-        # Targets with the same number of seeds are averaged in one array operation.
+        # Targets with the same number of runs are averaged in one array operation.
         for count in np.unique(counts):
             target_indices = np.flatnonzero(counts == count).tolist()
             run_rows = np.array([groups[target] for target in target_indices])
@@ -254,7 +254,8 @@ def build_error_table(
     """Build the table of a comparison in long form.
 
     There is one row per tuner, range, number of simulations and error measure: median, mean and
-    interval over targets, counts of runs and failures, and training and tuning costs.
+    interval over targets, counts of runs and failures, and training and tuning costs. A skipped
+    tuner has one row without errors.
 
     Args:
         runs: rows of runs.parquet.
@@ -277,6 +278,7 @@ def build_error_table(
         ["experiment", "tuner", "range"], sort=False
     ):
         tuner_rows = part.index.to_numpy()
+        # Simulations and seconds of a training; zero for a tuner that is not trained.
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
         seconds = [
             np.full(len(points), np.nan) if s is None else s[tuner_rows][:, points].mean(axis=0)
@@ -297,6 +299,7 @@ def build_error_table(
     # A tuner that could not be used has a row too, so that the table names every tuner.
     skipped = statuses[statuses["status"] == "skipped"]
     name = runs["experiment"].iloc[0] if len(runs) else ""
+    # Columns from simulations on: no errors, 0 runs, 1 failure, no costs.
     empty_cells = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
     lines += [(name, tuner, "", *empty_cells) for tuner in skipped["tuner"]]
     return pd.DataFrame(lines, columns=ERROR_TABLE_COLUMNS)
@@ -444,9 +447,10 @@ def find_coinciding_curves(
 ) -> dict[str, str]:
     """Find curves that cannot be seen because another one is drawn above them.
 
-    A curve coincides with a later one up to k if the two differ by less than
-    `_MAX_INVISIBLE_DIFFERENCE` in every panel up to k, and if they have halved the initial error by
-    then. Before that most tuners are equal.
+    A reader would miss a tuner in the figure, so a note names the tuner that covers it. A curve
+    coincides with a later one up to k simulations if the two differ by less than
+    `_MAX_INVISIBLE_DIFFERENCE` in every panel up to k, and if the error has halved by then. Before
+    that most tuners are equal.
 
     Args:
         curves_by_tuner: curves of each tuner in drawing order, one per panel: medians by number of
@@ -499,6 +503,7 @@ def compute_medians_by_distance(
 ) -> pd.DataFrame:
     """Compute median errors by distance from the training range, after few and all simulations.
 
+    It shows how well learned tuners do on targets that differ from those of their training.
     Targets inside the training range are one group (bin 0). Those outside are sorted by distance
     and divided into at most `_MAX_GROUPS` groups of equal size.
 

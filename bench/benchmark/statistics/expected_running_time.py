@@ -32,9 +32,10 @@ ERT_TARGET_LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 
 
 def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
-    """Choose thresholds of the runtime distribution and of the ERT table.
+    """Choose error thresholds of the runtime distribution and of the table of running times (ERT).
 
-    For a recording, they are between the median initial error and the smallest final error.
+    In simulation they are fixed shares of the training range. For a recording, whose errors have
+    other units, they are between the median initial error and the smallest final error.
 
     Args:
         curves: values of the deciding metric.
@@ -55,6 +56,9 @@ def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[
 
 def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:
     """Compute the number of simulations after which the error stays at or below a threshold.
+
+    An error that rises above it again later does not count, because a user cannot know when it is
+    low for the first time. A failed run reaches nothing.
 
     Args:
         curves: values of the metric.
@@ -127,7 +131,10 @@ def _divide_by_successes(
 def compute_effort(
     curves: RunCurves, threshold: float, budget: int, tuner_seconds: Array | None = None
 ) -> ThresholdEffort:
-    """Compute the effort of one tuner's runs to reach a threshold.
+    """Compute the effort of one tuner's runs to reach a threshold, added up for each target.
+
+    A run counts with its simulations until it reaches the threshold; one that does not, with all of
+    its simulations, and a failed one with the whole budget.
 
     Args:
         curves: curves of one tuner and range.

@@ -36,7 +36,7 @@ _FAILED_RUN_LOG_ERROR = 1e3
 
 
 def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
-    """Compute the logarithms of errors after k simulations.
+    """Compute the logarithms of errors after k simulations, by target and tuner.
 
     The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
     as failed on this target.
@@ -157,7 +157,11 @@ class PairedTest(NamedTuple):
 
 
 def compare_pair(a: Array, b: Array) -> PairedTest:
-    """Compare two tuners by Wilcoxon's signed-rank test.
+    """Compare two tuners on the same targets by Wilcoxon's signed-rank test.
+
+    The differences of their log errors are ranked by size. The p-value tells how likely such
+    differences are if neither tuner is better; the effect size is the share of ranks in favour of a
+    minus that in favour of b. Without differences, the effect is 0 and the p-value 1.
 
     Args:
         a: (n,) logarithms of the errors of tuner a; NaN where it has none.

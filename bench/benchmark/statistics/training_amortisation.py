@@ -72,6 +72,8 @@ class TuningCost:
     def compute_seconds_per_target(self, cost: Array, targets: float) -> Array:
         """Compute the seconds per target for a given duration of one simulation.
 
+        They are the time of a target itself, simulations and tuner, and its share of a training.
+
         Args:
             cost: duration of one simulation in seconds, any shape.
             targets: number of targets that share the cost of one training.
@@ -80,9 +82,12 @@ class TuningCost:
             Seconds per target, in the shape of `cost`.
         """
         # The measured time of the training simulations is replaced by their time at the given cost.
-        learning = max(self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0)
-        marginal = self.effort.compute_ert() * cost + self.effort.compute_tuner_seconds()
-        result: Array = marginal + (self.fit_simulations * cost + learning) / targets
+        learning_seconds = max(
+            self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0
+        )
+        tuning_seconds = self.effort.compute_ert() * cost + self.effort.compute_tuner_seconds()
+        training_seconds = self.fit_simulations * cost + learning_seconds
+        result: Array = tuning_seconds + training_seconds / targets
         return result
 
 
@@ -121,10 +126,11 @@ def compute_tuning_costs(
 def compute_break_even_targets(
     learned: TuningCost, search: TuningCost, picked: NDArray[np.int64] | None = None
 ) -> Array:
-    """Compute the number of targets from which training pays.
+    """Compute the number of targets from which training a learned tuner pays.
 
-    This is the n that solves fit + n ert_learned = n ert_search, with the expected running times
-    (ERT) of both tuners.
+    Training costs `fit` simulations once; then the learned tuner needs fewer simulations for each
+    target than the search tuner. The break-even number n of targets solves
+    fit + n ert_learned = n ert_search, with the expected running times (ERT) of both tuners.
 
     Args:
         learned: cost of the learned tuner.
@@ -136,11 +142,13 @@ def compute_break_even_targets(
         training never pays.
     """
     # Solved for n: fit / (ert_search - ert_learned).
-    hopeless = np.isinf(learned.effort.compute_ert(picked))
+    never_succeeds = np.isinf(learned.effort.compute_ert(picked))
     # The difference is NaN or not positive if both tuners fail or need the same number.
     with np.errstate(invalid="ignore", divide="ignore"):
         saving = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
-        result: Array = np.where(hopeless | ~(saving > 0), np.inf, learned.fit_simulations / saving)
+        result: Array = np.where(
+            never_succeeds | ~(saving > 0), np.inf, learned.fit_simulations / saving
+        )
     return result
 
 

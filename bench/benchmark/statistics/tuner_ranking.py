@@ -143,8 +143,8 @@ class _Ranking(NamedTuple):
 def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
     """Compute the ranking of the tuners after each number of simulations of `list_ranking_points`.
 
-    Tuners are ordered by median log error, then mean, then earlier ranks; those whose runs all
-    failed come last. Errors at or below `floor` count as equal.
+    A rank follows from the median log error over targets. Within equal ranks, tuners are ordered by
+    the mean, then by the ranks after fewer simulations. Those whose runs all failed come last.
 
     Args:
         curves: errors of all runs.
@@ -364,15 +364,18 @@ def compute_kendall_tau(first: Array, second: Array) -> float:
 def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgreement:
     """Compare the rankings of the same tuners on the same targets under two conditions.
 
+    Tuners are ranked on each target, and ordered by their mean rank. Kendall's tau of the two
+    orders is 1 if they are equal; its interval is a bootstrap over targets, and its p-value tests
+    that no tuner's mean rank changes.
+
     Args:
         first: (targets, tuners) errors in the first condition.
         second: (targets, tuners) errors in the second condition.
         names: names of the comparison, which determine the random stream.
     """
     rng = make_rng("agreement", *names)
-    ranks = np.stack(
-        [_rank_within_targets(first), _rank_within_targets(second)]
-    )  # (2, targets, tuners)
+    # (2, targets, tuners)
+    ranks = np.stack([_rank_within_targets(first), _rank_within_targets(second)])
     count = ranks.shape[1]
     observed = compute_kendall_tau(*ranks.mean(axis=1))
     resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
@@ -389,12 +392,13 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
 
 
 def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
-    """Compute the permutation p-value for changes of rank (targets, tuners).
+    """Compute the p-value of changes of rank between two conditions, by a permutation test.
 
-    The null hypothesis is that no tuner's mean rank changes. The statistic is the sum over tuners
-    of the squared mean change. Exchanging the conditions of a target changes the signs of its rank
-    changes. Tau itself is not a suitable statistic: mean ranks that are all reversed stay reversed,
-    only less so, under any exchange.
+    The null hypothesis is that no tuner's mean rank changes. Under it, the two conditions of each
+    target can be exchanged, which changes the signs of its rank changes. The p-value is the share
+    of such random exchanges whose statistic, the sum over tuners of the squared mean change, is at
+    least the observed one. Tau itself is not a suitable statistic: mean ranks that are all reversed
+    stay reversed, only less so, under any exchange.
 
     Args:
         changes: (targets, tuners) change of each rank.

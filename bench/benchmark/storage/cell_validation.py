@@ -179,13 +179,17 @@ def check_cells(
     at_start: Mask | None = None,
     is_recording: Mask | None = None,
 ) -> None:
-    """Check that every cell fits the declaration of its column.
+    """Check that every cell fits the declaration of its column: words, range, and empty cells.
+
+    A column may have to be empty in some rows, and only there: before the first simulation (k = 0),
+    or for a recording, which has no true parameters. This is not checked if it is not known which
+    rows these are.
 
     Args:
         column: Declaration of the column: type, range, allowed words, and empty cells.
         values: Result of `parse_parquet_column`, `parse_csv_column` or `parse_json_column`.
-        at_start: Mask of rows with k = 0.
-        is_recording: Mask of rows of a recording.
+        at_start: Mask of rows with k = 0; None if unknown.
+        is_recording: Mask of rows of a recording; None if unknown.
 
     Raises:
         CellError: The first cell that does not.
@@ -205,18 +209,16 @@ def check_cells(
     if not column.infinite:
         outside |= np.isinf(numbers)
     _raise_for_bad_row(column, outside, format_cell)
-    is_empty_required = {
+    must_be_empty = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
-        EmptyCellRule.MAY: empty,
+        EmptyCellRule.MAY: empty,  # Whatever is empty may be so.
         EmptyCellRule.AT_START: at_start,
         EmptyCellRule.RECORDING_ONLY: is_recording,
     }[column.empty]
-    if is_empty_required is None:
+    if must_be_empty is None:
         return
-    _raise_for_bad_row(column, empty & ~is_empty_required, format_cell)
-    _raise_for_bad_row(
-        column, is_empty_required & ~empty, format_cell, f"nothing {column.empty.value}"
-    )
+    _raise_for_bad_row(column, empty & ~must_be_empty, format_cell)
+    _raise_for_bad_row(column, must_be_empty & ~empty, format_cell, f"nothing {column.empty.value}")
 
 
 def _check_texts(column: ColumnSpec, values: pa.Array) -> None:

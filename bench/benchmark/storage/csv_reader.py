@@ -279,6 +279,9 @@ def read_checked_runs(
 ) -> pd.DataFrame:
     """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
 
+    A run has one row for each number of simulations k, in consecutive rows. The rows come in
+    batches that may divide a run, so each batch is checked together with the last row before it.
+
     Args:
         batches: The rows, as consecutive tables.
         names: Names of the columns.
@@ -321,7 +324,10 @@ def read_checked_runs(
 def _convert_batch(
     batch: pa.Table, columns: list[ColumnSpec], last_row: pa.Table | None, offset: int
 ) -> pa.Table:
-    """Convert a batch to its declared types and prepend the last row of the previous batch.
+    """Convert a batch of rows to its declared types, check it, and prepend the last row before it.
+
+    That row is needed to check a run that begins in one batch and continues in the next. Errors
+    name the row of the whole file.
 
     Args:
         batch: rows as text.
@@ -384,10 +390,9 @@ def _find_changes(values: pa.ChunkedArray) -> Mask:
 
 
 def _check_counts(rows: pa.Table, goes_on: bool) -> None:
-    """Check that k counts 0, 1, 2, ... in every run.
+    """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
 
-    `rows` is one batch of the file; `goes_on` is True if its first row continues the last run of
-    the batch before.
+    `goes_on` is True if the first row is the last one of the batch before; it was checked there.
 
     Raises:
         CellError: k has another value, so that a row is missing or added.
@@ -395,7 +400,7 @@ def _check_counts(rows: pa.Table, goes_on: bool) -> None:
     k: NDArray[np.int64] = rows["k"].to_numpy()
     expected = np.append(0, k[:-1] + 1)
     expected[_find_run_starts(rows)] = 0
-    if goes_on:  # The first row was checked with the previous batch.
+    if goes_on:
         expected[0] = k[0]
     is_wrong = k != expected
     if is_wrong.any():
@@ -433,8 +438,9 @@ def _check_same(rows: pa.Table) -> None:
 def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
     """Return one line for each run that begins in these rows, a batch of a larger file.
 
-    `goes_on` is True if the first row belongs to the last run of the batch before. `offset` is the
-    number of rows before the batch, so that ``row`` is the row of the file at which the run begins.
+    A line has the values that are constant within the run, and in ``row`` the row of the file at
+    which it begins. `goes_on` is True if the first row is the last one of the batch before, which
+    begins no run. `offset` is the number of rows before the batch.
     """
     new = _find_run_starts(rows)
     if goes_on:

@@ -92,6 +92,9 @@ def check_complete(
 ) -> None:
     """Check that each tuner with runs has all of its runs, and no more.
 
+    It has one run for each target and seed. Tuners without any run were skipped, and are checked
+    elsewhere.
+
     Args:
         executed_runs: Tuner, target and seed of each run; the index is the row in the file.
         experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -127,7 +130,9 @@ def check_complete(
 def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
     """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
 
-    It equals `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
+    A deterministic tuner has one seed, whatever the experiment states. If more than one seed
+    occurs, the tuner is not deterministic, and need not be loaded to find out. The result equals
+    `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
     """
     seed_count = entry.seeds or experiment.seeds
     if seed_count == 1 or largest > 0:
@@ -347,8 +352,9 @@ def check_rows_match_statuses(
 ) -> None:
     """Check that rows and statuses describe the same runs consistently.
 
-    Every row belongs to an executed run, every executed run has rows, and the number of
-    simulations, tuner, simulator, target and seed agree.
+    Two files contain the runs: the rows with one line per simulation, and the statuses with one
+    line per run. Every row must belong to an executed run, every executed run must have rows, and
+    the number of simulations, tuner, simulator, target and seed must agree.
 
     Args:
         runs: One line per run, as read from `file`.
@@ -362,6 +368,7 @@ def check_rows_match_statuses(
     """
     import pandas as pd
 
+    # Row of each run among the statuses; -1 if it is not there.
     status_rows = pd.Index(statuses["run"]).get_indexer(runs["run"])
     file_rows = runs["row"].to_numpy()
     names = runs["run"]

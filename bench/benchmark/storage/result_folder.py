@@ -278,6 +278,8 @@ class StoredComparison(NamedTuple):
 def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> StoredComparison:
     """Read and check the folder of a finished or interrupted comparison.
 
+    Columns that a folder of an older version lacks get their default values.
+
     Args:
         folder: Folder of the comparison.
         columns: Columns of the runs to read, if present; None for all.
@@ -350,6 +352,9 @@ def _compute_training_costs(training: pd.DataFrame) -> dict[str, tuple[float, fl
 
 def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Experiment, str | None]:
     """Draw or take the secret salt of a new study, and commit to it by its hash.
+
+    The salt determines the random targets. As long as it is secret, no tuner can be made for these
+    targets; its hash proves afterwards that it was not chosen after the results.
 
     Args:
         experiment: The experiment; a salt in it is public.

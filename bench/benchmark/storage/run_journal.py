@@ -49,6 +49,9 @@ _PLAN_INDEX = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
 def encode_record(plan_index: int, status: RunStatus, rows: pa.Table) -> bytes:
     """Encode a finished run as a record of a journal, with a checksum.
 
+    A record is a header (mark, length, checksum) and the rows of the run as an Arrow stream, in
+    whose metadata are the index and the status.
+
     Args:
         plan_index: Index of the run in the plan.
         status: How the run ended.
@@ -199,6 +202,9 @@ def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
 def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunStatus]]]:
     """Yield the statuses of the finished runs of a study by file; see `read_finished_statuses`.
 
+    Files are journals of single runs, and parts, into which full journals are converted. Another
+    process may do this at the same time, so a journal may disappear, or its runs come twice.
+
     Args:
         folder: Result folder of the study.
     """
@@ -256,9 +262,10 @@ class RunJournal:
     def __init__(self, folder: Path, part_runs: int = RUNS_PER_PART) -> None:
         """Lock the folder against other processes, and recover all runs that it contains.
 
-        `_index` are the plan indices of the runs in each finished part. `_records` are the runs in
-        the current journal, and `_number` is the number of this journal. A journal of `part_runs`
-        runs is converted to a part.
+        Runs are appended to a journal; a journal of `part_runs` runs is converted to a part, a
+        compressed file. `_index` are the plan indices of the runs in each part, `_records` the runs
+        in the current journal, and `_number` the number of this journal. What a killed process has
+        left is repaired: an incomplete part is deleted, and so is a journal whose part exists.
         """
         self.folder = folder / SEGMENTS_FOLDER
         try:

@@ -432,7 +432,7 @@ def get_force_program(
 
     If possible, it consists of instructions, from a trace of their Python functions. Otherwise,
     for example because a user's effect contains an ``if``, the program calls these functions with
-    NumPy, which is slower; the user is told the reason once.
+    NumPy, which is slower; the reason is printed once.
 
     Args:
         batch: whole batch.

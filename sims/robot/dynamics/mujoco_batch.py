@@ -671,7 +671,7 @@ class BatchCache:
         """Return a batch of simulations from the cache, or create it.
 
         Creating a batch compiles the model, which takes much longer than a simulation. A model that
-        MuJoCo rejects is stored with the reason, and is not compiled again; the user is told once.
+        MuJoCo rejects is stored with the reason, which is printed, and is not compiled again.
 
         Args:
             added: elements that effects add to the model.
