@@ -93,10 +93,11 @@ def read_sources(
     columns: Mapping[str, Mapping[str, Any]],
     extra: Mapping[str, Mapping[str, Any]],
 ) -> RecordingSources:
-    """Read the locations of all columns from a description.
+    """Read from a description in which files and columns of the logs the signals are.
 
-    A source says in which file and column a signal is, and in which unit; runs may be in folders or
-    files of their own.
+    The table ``[time]`` states the stamps, each signal its file and columns, and ``[runs.NAME]``
+    the folder or file of a run. If nothing is stated, the table was written for simgap, and its
+    columns have the names of the signals.
 
     Args:
         path: Path of the description, for messages.
@@ -131,21 +132,25 @@ def read_sources(
     has_files = any("file" in table for table in tables)
     has_files = has_files or bool(folders) or bool({"column", "unit", "rate"} & time.keys())
     return RecordingSources(
-        signals,
-        time_column,
-        seconds_per_unit,
-        check_finite(path, "time.offset", time.get("offset", 0.0)),
-        folders,
-        has_columns or has_files,
-        rate,
-        run_files,
-        has_columns and not has_files,
-        {name: _read_source(path, f"extra.{name}", table, name) for name, table in extra.items()},
+        signals=signals,
+        time=time_column,
+        second=seconds_per_unit,
+        offset=check_finite(path, "time.offset", time.get("offset", 0.0)),
+        folders=folders,
+        stated=has_columns or has_files,
+        rate=rate,
+        files=run_files,
+        is_renaming=has_columns and not has_files,
+        extra={
+            name: _read_source(path, f"extra.{name}", table, name) for name, table in extra.items()
+        },
     )
 
 
 def _read_source(path: Path, key: str, table: Mapping[str, Any], default: str = "") -> SignalSource:
     """Read the location of one signal: `file`, `column` and `matrix` of its table.
+
+    A signal is one column, or a weighted sum of several columns, whose weights are `matrix`.
 
     Args:
         path: Path of the description, for messages.

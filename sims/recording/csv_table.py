@@ -237,7 +237,8 @@ class RecordingTable:
     def _check_header(self, cells: list[str]) -> list[str]:
         """Check the names of the columns against the declared ones, and return them.
 
-        Every declared column must exist, and no other column may.
+        Every declared column must exist, and no other column may: a forgotten signal must not be
+        ignored silently.
 
         Args:
             cells: Cells of the first row.
@@ -300,6 +301,9 @@ class RecordingTable:
     def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
 
+        Python's `float` converts all cells at once. Cells that it converts to something not finite,
+        or that it accepts but an instrument would not write, are checked one by one.
+
         Args:
             name: Name of the column.
             cells: Text of each cell.
@@ -358,6 +362,7 @@ class RecordingTable:
         for name in self.channels:
             if np.isnan(columns[name]).all():
                 raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
+        # First row of each run, and the number of rows.
         edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
         self._check_times_increase(columns["t"], edges)
         runs: dict[str, CsvRun] = {}

@@ -47,12 +47,13 @@ class DriveSwitch(NamedTuple):
     def off(self, run: Run) -> Mask:
         """Return whether the drive is off at each sample (T,).
 
-        A missing cell has the value of the previous one.
+        A missing cell has the value of the previous one, and before the first value, that value. A
+        column without any value never switches the drive off.
         """
         values = run.extra[self.column]
         is_recorded = np.isfinite(values)
+        # Index of the last recorded sample up to each sample; -1 before the first one.
         last = np.maximum.accumulate(np.where(is_recorded, np.arange(values.size), -1))
-        # Before its first value, the column is assumed to have that value.
         first = int(np.argmax(is_recorded)) if is_recorded.any() else 0
         filled = values[np.where(last < 0, first, last)]
         off: Mask = (filled == 0) == self.zero_is_off
@@ -155,7 +156,7 @@ class Switched(NamedTuple):
 def apply_drive_switches(
     path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]
 ) -> Switched:
-    """Add to each run at which samples its drives are off.
+    """Add to each run at which samples its drives are off, with notes for the user.
 
     Args:
         path: Path of the table, for messages.

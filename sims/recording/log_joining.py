@@ -37,9 +37,9 @@ def read_logs(
     """Read the runs of a recording from its logs.
 
     The rows of a run are all times at which a sensor or an input has a stamp, from the first to the
-    last sample of a sensor. The cells of a sensor are empty between its own stamps; an input has
-    its held or interpolated value at all times, and an extra column its held value. So measurements
-    are not resampled.
+    last sample of a sensor. The cells of a sensor are empty between its own stamps, so that
+    measurements are not resampled; an input has its held or interpolated value at all times, and an
+    extra column its held value.
 
     Args:
         path: Table in which signals without a file are found.
@@ -153,6 +153,7 @@ class _FolderLogs:
             values = self._read_signal(channel, rows_of[log.path])
             if not np.isfinite(values).any():
                 raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
+            # Write the channel into the rows of the table that have its own stamps.
             stamps = rows_of[log.path].stamps
             values_at_times = np.full(times.size, np.nan)
             row_indices = np.searchsorted(times, stamps - SAME_INSTANT_SECONDS)
@@ -243,6 +244,8 @@ class _FolderLogs:
     ) -> Array:
         """Return the values of an input or an extra column at all times of a run.
 
+        Its own stamps differ from these times, so its last value is held, or it is interpolated.
+
         Args:
             signal: Name of the signal.
             rows_of: Rows of each log that are used.
@@ -274,6 +277,8 @@ class _FolderLogs:
 
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
+
+        Without stamps, they follow from the sampling rate.
 
         Args:
             log: log: its columns of numbers by name.

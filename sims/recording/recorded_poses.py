@@ -76,6 +76,9 @@ def convert_quaternions(
 ) -> dict[str, Array]:
     """Replace the quaternion of a floating body among the channels of a run by its three angles.
 
+    In the simulation the body has three hinges in place of its quaternion, whose coordinates are
+    these angles.
+
     Args:
         channels: channels of the run by name, each (T,).
         base: name of the free or ball joint.

@@ -131,7 +131,10 @@ class Run:
         )
 
     def _get_input_history(self, name: str, row: int) -> Array:
-        """Return the stored history of an input before a sample.
+        """Return the history of an input before a sample, which is stored with a part of a run.
+
+        Effects such as a delay need the inputs before the part. The history that the run itself has
+        comes first; everything older than `memory` seconds is dropped.
 
         Args:
             name: Name of the input.
@@ -247,6 +250,8 @@ def _assemble_recording(
 ) -> Recording:
     """Make a recording in SI units from the tables of its runs and its description.
 
+    All ways to read a recording end here: from a table, from logs or from a data frame.
+
     Args:
         table: path of the table.
         parts: rows of each run.
@@ -259,15 +264,15 @@ def _assemble_recording(
         table, [_make_run(table, part, description) for part in parts], description.switches
     )
     return Recording(
-        table,
-        description.system,
-        description.title,
-        description.constants,
-        description.noise,
-        switched.runs,
-        description.extra,
-        model,
-        (*(note for part in parts for note in part.notes), *switched.notes),
+        path=table,
+        system=description.system,
+        title=description.title,
+        constants=description.constants,
+        noise=description.noise,
+        runs=switched.runs,
+        extra=description.extra,
+        model=model,
+        notes=(*(note for part in parts for note in part.notes), *switched.notes),
     )
 
 
@@ -368,7 +373,9 @@ _HELD_OUT_STRIDE = 3
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description.
 
-    Units are converted, quaternions become angles, and wrapped angles are unwrapped.
+    Units are converted, quaternions become angles, and wrapped angles are unwrapped (their whole
+    turns are restored). The initial pose of a floating body, which no channel shows, is the first
+    cell of an extra column, unless the description states it.
 
     Args:
         table: CSV file of the run, for error messages.
@@ -394,16 +401,16 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
         name: float(value) for name, value in initial_values.items() if np.isfinite(value)
     }
     return Run(
-        part.name,
-        part.times,
-        channels,
-        inputs,
-        metadata.constants,
-        {**initial_pose, **metadata.initial},
-        bool(metadata.held_out),
-        extra,
-        description.linear,
-        description.sources.offset,
+        name=part.name,
+        times=part.times,
+        channels=channels,
+        inputs=inputs,
+        constants=metadata.constants,
+        initial={**initial_pose, **metadata.initial},
+        held_out=bool(metadata.held_out),
+        extra=extra,
+        linear=description.linear,
+        offset=description.sources.offset,
     )
 
 
@@ -434,7 +441,11 @@ def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> A
 
 
 def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
-    """Divide the runs into runs for fitting and held-out runs; see `split_held_out`.
+    """Divide the runs into runs for fitting and held-out runs, on which predictions are tested.
+
+    Runs that the description marks are held out. Without marks, it is the last third of a single
+    run, or every third of several runs. With `folds`, two or three unmarked runs get a number each,
+    and each is predicted from the others (cross-validation).
 
     Args:
         path: path of the recording, for messages.
@@ -474,15 +485,15 @@ def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
     """
     count = len(run.times)
     split_index = (2 * count) // _HELD_OUT_STRIDE
-    halves = (
+    parts = (
         replace(run.part(slice(split_index)), held_out=False),
         replace(run.part(slice(split_index, None)), held_out=True),
     )
-    for part in halves:
+    for part in parts:
         measured = any(np.isfinite(values).any() for values in part.channels.values())
         if len(part.times) < 2 or not measured:
             raise InputError(
                 f"{path}: the only run is too short to hold its last third out: {count} rows; "
                 "expected at least 4, with samples in both parts"
             )
-    return halves
+    return parts

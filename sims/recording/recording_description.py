@@ -159,6 +159,9 @@ def model_in(
 ) -> ModelFileReference | None:
     """Return the model file that a description states; None if it states a system.
 
+    It comes with what the description adds to the file: actuators, engine settings, the floating
+    joints whose pose is recorded, and free parameters.
+
     Args:
         description: Path of the description, for messages; the path of the model file is relative
             to its folder.
@@ -352,9 +355,10 @@ def _read_wrapped_channels(
     inputs: Mapping[str, _Column],
     declared: DeclaredSignals,
 ) -> dict[str, str]:
-    """Return the channels whose whole turns are restored.
+    """Return the channels whose whole turns are restored: angles recorded within one turn.
 
-    Each has the name of the input that determines the turn, or an empty name.
+    Such a channel has an entry `unwrap`: true, or the name of the command whose turn it shares. The
+    result has this name, or "" for true.
 
     Args:
         path: path of the description, for messages.
@@ -570,10 +574,10 @@ def _read_columns(
 
 
 def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Flatten entries whose names contain dots.
+    """Join the names of nested tables, where the joined names are those of signals.
 
-    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` becomes the entry
-    ``q.elbow``.
+    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` is a table ``elbow``
+    in a table ``q``. Here it becomes the entry ``q.elbow``.
 
     Args:
         entries: Entries as read from TOML.
@@ -596,15 +600,15 @@ def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]
 def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     """Check the table of one channel or input, and compute its conversion to SI units.
 
+    The table states a unit, and perhaps a scale s and an offset o, such as those of an encoder.
+    With the conversion x -> g x + b of the unit, a value x of the log becomes g (s x + o) + b.
+
     Args:
         path: Path of the description, for messages.
         kind: ``channel`` or ``input``.
         name: Name of the signal.
         value: Table from the description.
         unit: SI unit of the signal.
-
-    With scale s and offset o of the log, and the conversion of the unit x -> g x + b, a value x
-    of the log becomes g (s x + o) + b.
     """
     location, usual = f"{kind} {name}", f'unit = "{unit}"'
     table = check_table(path, location, value, f"a table with {usual}")
@@ -657,10 +661,10 @@ def _read_interpolation(path: Path, name: str, column: _Column) -> bool:
 def _read_noises(
     path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
 ) -> dict[str, float]:
-    """Return the noise of each channel where stated, SI units.
+    """Return the standard deviation of each channel's noise where stated, in SI units.
 
-    The standard deviation is stated in the unit of the column. Values beyond plausible sizes
-    are refused, since the unit is probably wrong.
+    It is stated in the unit of the column. Values beyond plausible sizes are refused, since the
+    unit is probably wrong.
 
     Args:
         path: path of the description, for messages.

@@ -80,8 +80,9 @@ def build_frame_description(
 ) -> dict[str, Any]:
     """Build the description of a frame's columns, as it would be written in `NAME.toml`.
 
-    A column is the channel or input of its name unless `meta` says otherwise. Its unit is taken
-    from `units`, from `meta`, or from ``frame.attrs["units"]``.
+    So data frames and files are checked by the same rules. A column is the channel or input of its
+    name unless `meta` says otherwise. Its unit is taken from `units`, from `meta`, or from
+    ``frame.attrs["units"]``.
 
     Args:
         path: Name of the frame, for messages.
@@ -227,7 +228,7 @@ class _FrameTable(RecordingTable):
         return f"{self.path}.iloc[{record}]"
 
     def read_frame(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
-        """Return the runs of a frame.
+        """Return the runs of a frame, with columns by the names of the signals.
 
         Args:
             frame: Data frame.

@@ -104,10 +104,10 @@ def is_unit(unit: str) -> bool:
 
 
 def _is_simple_unit(unit: str) -> bool:
-    """Return whether a text is a simple unit.
+    """Return whether a text is a simple unit, which can be given to pint's parser safely.
 
     A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
-    power.
+    power. A text such as 9**9**9 would keep the parser busy for ever.
     """
     position, previous_token = 0, "operator"
     while position < len(unit):
@@ -140,7 +140,10 @@ def _get_unit_registry() -> Any:
 
 
 def unwrapped(positions: Array, command: Array | None = None) -> Array:
-    """Restore the whole turns of a wrapped position; NaN stays NaN.
+    """Restore the whole turns of a position that was recorded within one turn; NaN stays NaN.
+
+    Jumps of more than half a turn between samples are removed. The first sample may still be off by
+    whole turns; with a command, the position is moved to the turn of the command.
 
     Args:
         positions: (T,) positions, rad.

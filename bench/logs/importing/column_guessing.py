@@ -119,6 +119,9 @@ def split_name(text: str) -> list[str]:
 def guess_role(column: LogColumn) -> Role | None:
     """Return the role of a column by its name and unit, else by its file's name, or None.
 
+    Words for a command come first: ``position_command`` is a command. Then the quantity of the
+    column's unit decides, such as "torque" for N*m, and then other words of the names.
+
     Args:
         column: Column of a log, with name, unit and file.
 
@@ -167,12 +170,14 @@ def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
 def _guess_role(words: set[str]) -> Role | None:
     """Return the role of a signal that words indicate; None if they indicate none.
 
+    Clear words decide first. `current` in "current position" is not an electric current, and a
+    joint state may be a velocity; so words such as `current`, `load`, `joint` and `state` only
+    decide if no other word does.
+
     Args:
         words: Words of a column's or file's name, in lower case.
     """
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
-    # `current` in "current position" is not an electric current, and a joint state may be a
-    # velocity.
     for word_subset in (
         words - _WEAK_ROLE_WORDS,
         words & {"current", "currents", "load", "loads"},
@@ -186,6 +191,8 @@ def _guess_role(words: set[str]) -> Role | None:
 
 def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
     """Return the joint whose name is part of a column's name; the longest if there are several.
+
+    If no whole name matches, names without common words are tried: ``elbow`` for ``elbow_joint``.
 
     Args:
         column: Column of a log.
@@ -230,6 +237,8 @@ def match_numbered_joints(
     columns: Sequence[LogColumn], joints: Sequence[Joint]
 ) -> dict[str, Joint]:
     """Assign joints to numbered columns of one kind, in the order of the model.
+
+    The column with the smallest number, such as ``q0`` or ``q1``, belongs to the first joint.
 
     Args:
         columns: Columns with a number in their names.
@@ -296,6 +305,9 @@ def guess_time_unit(stamps: Array) -> str | None:
 
 def guess_position_unit(values: Array, joint: Joint) -> str | None:
     """Return the unit of a position, rad or deg (m or mm for a slide joint), by the joint's range.
+
+    It is the first of these units in which the positions lie within the widened range. For a joint
+    without a range, angles of more than two turns in rad are taken for degrees.
 
     Args:
         values: (T,) positions.

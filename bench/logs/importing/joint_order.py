@@ -75,6 +75,10 @@ def find_order_by_model(
 ) -> PreferredOrder | None:
     """Find the order of columns with which a model explains a motion best.
 
+    A log often does not name the joints of its columns. In the right order, the forces that the
+    motion needs by inverse dynamics are those that the actuators exert under the recorded commands;
+    in a wrong order they are not. Velocities and accelerations come from smoothed positions.
+
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         driven: Joints with their actuators, in the model's order.
@@ -143,12 +147,12 @@ def _iterate_orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
 def _compute_order_residual(
     robot: RobotModel, driven: Sequence[tuple[Joint, Actuator]], commands: Array, motion: Array
 ) -> float:
-    """Compute the RMS force that actuators do not explain, relative to their forces (1).
+    """Compute how badly the actuators explain the motion if the columns have this order.
 
-    It is infinite if joints would be far beyond their ranges.
-
-    With the force f_j that joint j needs and the force a_j that its actuator exerts, R = sqrt(sum_j
-    mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order, about 1 otherwise.
+    With the force f_j that joint j needs for the motion and the force a_j that its actuator exerts,
+    it is R = sqrt(sum_j mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order,
+    about 1 otherwise. It is infinite if joints would be far beyond their ranges. Contacts and joint
+    limits are switched off.
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -171,9 +175,9 @@ def _compute_order_residual(
     joints = [joint for joint, _ in driven]
     with capture_mujoco_warnings():
         forces = motion_forces(model, joints, np.swapaxes(motion, 1, 2), controls)
-    missing = float(np.sum((forces.needed - forces.driven) ** 2))
+    unexplained_square = float(np.sum((forces.needed - forces.driven) ** 2))
     total_square = float(np.sum(forces.driven**2))
-    return float(np.sqrt(missing / total_square)) if total_square > 0 else np.inf
+    return float(np.sqrt(unexplained_square / total_square)) if total_square > 0 else np.inf
 
 
 MAX_DISTANCE_RATIO = 0.5
@@ -223,12 +227,11 @@ def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
 
 
 def find_best_order(distances: Array) -> list[int]:
-    """Return the order of columns with the smallest sum of mean square distances (1).
+    """Return the order in which the positions are closest to the commands.
 
-    All orders of a few joints are compared; for more it is found by linear assignment.
-
-    It minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1) over permutations p, with commands
-    u_i and positions q_j.
+    It is the permutation p that minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1), with
+    commands u_i and positions q_j. All permutations of a few joints are compared; for more it is
+    found by linear assignment.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns).
@@ -287,7 +290,11 @@ class _ServoSignals(NamedTuple):
 def assign_order(
     logs: RunLogs, signals: SignalAssignment, is_normalised: bool, result: ImportResult
 ) -> Mapping[str, str]:
-    """Check each position against its command if the order of joints is a guess, and exchange both.
+    """Correct the order of joints in unnamed columns, and report which order is a guess.
+
+    Such columns were assigned in the order of the model. If positions follow the commands better in
+    another order, columns are exchanged. If both orders are guesses that agree, the order is sought
+    in which the model explains the motion.
 
     Args:
         logs: Logs that are imported.
@@ -299,24 +306,27 @@ def assign_order(
         For each joint, the joint at whose index its column is, if positions were exchanged.
     """
     servos = _collect_servo_signals(logs, signals)
-    by_order = [
+    are_commands_guessed, are_positions_guessed = (
         all(table[name].placement.is_order for name in names)
         for table, names in (
             (signals.inputs, servos.inputs),
             (signals.channels, [f"q.{joint}" for joint in servos.joints]),
         )
-    ]
+    )
     if not servos.commands:
         _report_order(signals, [], result)
         return {}
-    exchanged = _follow_commands(signals, servos, by_order[0]) if any(by_order) else {}
+    exchanged = {}
+    if are_commands_guessed or are_positions_guessed:
+        exchanged = _follow_commands(signals, servos, are_commands_guessed)
     is_following = follow(servos.commands, servos.positions) or bool(exchanged)
-    if all(by_order) and is_following and not exchanged and not is_normalised:
+    are_both_guessed = are_commands_guessed and are_positions_guessed
+    if are_both_guessed and is_following and not exchanged and not is_normalised:
         preferred = _prefer_model(logs, signals, servos, result)
         if preferred:
             return preferred
     _report_order(signals, servos.joints if is_following else [], result)
-    return exchanged if by_order[1] and not by_order[0] else {}
+    return exchanged if are_positions_guessed and not are_commands_guessed else {}
 
 
 def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
@@ -386,7 +396,7 @@ def _follow_commands(
 def _prefer_model(
     logs: RunLogs, signals: SignalAssignment, servos: _ServoSignals, result: ImportResult
 ) -> dict[str, str]:
-    """Exchange unnamed columns if the model then explains the motion far better.
+    """Exchange columns whose joints the log does not name, if the model then explains the motion.
 
     The forces that the motion needs are compared with those that the actuators exert under the
     recorded commands, for the possible orders of the columns.

@@ -55,6 +55,10 @@ class NormalisedPositions:
     def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
         """Return the unit of a column's positions, and their conversion to it.
 
+        The calibration of a motor gives angles in degrees. Without one, the normalised range is
+        mapped to the range of the joint in the model. Grippers count from 0 to 100, others from
+        -100 to 100.
+
         Args:
             column: Name of the column.
             values: (T,) numbers of the column.
@@ -85,7 +89,10 @@ class NormalisedPositions:
 def find_position_conversion(
     log: Path, largest: float, stated_unit: str, calibration: Path | None
 ) -> NormalisedPositions | None:
-    """Return the conversion of positions to angles; None if they are angles already.
+    """Return the conversion of normalised positions to angles; None if they are angles already.
+
+    They are normalised if the user says so or names a calibration file, or if they lie within -100
+    to 100 and the dataset has a calibration file.
 
     Args:
         log: Log that contains the positions.

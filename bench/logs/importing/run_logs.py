@@ -44,8 +44,9 @@ class RunFiles(NamedTuple):
 def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
     """Group logs by run: those of each folder, bag or episode, or the files themselves.
 
-    The files of one folder are one run, unless all of them have the same columns: then each file is
-    a run.
+    A bag (ROS) and an episode of a dataset (LeRobot) are one run each. The files of one folder are
+    one run, unless all of them have the same columns: then each file is a run. The
+    only run may have the name "".
 
     Raises:
         InputError: There is no log.
@@ -294,10 +295,11 @@ class RunLogs:
     # -- time stamps
 
     def _choose_clock(self, logs: Mapping[str, LogFile]) -> None:
-        """Find the time stamps of all files, which have a common name and unit.
+        """Find the time stamps of all files, which must have a common name and unit.
 
-        The name and unit that the files with the most recognised columns have are used for all
-        files; times count from the earliest first stamp.
+        Each file has candidates; a name that all files share is preferred. The name and unit of the
+        files with the most recognised columns are used, and files with other stamps are left out.
+        Times count from the first stamp of each file; `_starts` is its distance from the earliest.
 
         Args:
             logs: Logs of the first run by file.

@@ -98,7 +98,10 @@ class LostSamples(NamedTuple):
 
 
 def find_lost_samples(times: Array) -> LostSamples:
-    """Find lost samples: intervals that are a multiple of the median interval.
+    """Find lost samples: where an interval is a multiple of the median interval.
+
+    An interval of about three median intervals has lost two samples. Intervals that are not close
+    to a whole multiple, within the jitter of the clock, count as they are.
 
     Args:
         times: (T,) sample times, s; at least three.
@@ -142,12 +145,13 @@ def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
 
 
 def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
-    """Insert evenly spaced samples without readings into a run.
+    """Insert evenly spaced samples into a run, with interpolated inputs and without readings.
 
     Args:
         run: the run.
         counts: (T - 1,) number of samples to insert into each interval.
     """
+    # For each inserted sample, the index of the sample before its interval.
     first = np.repeat(np.arange(counts.size), counts)
     inserted_before = np.cumsum(counts) - counts
     fractions = (np.arange(first.size) - inserted_before[first] + 1.0) / (counts[first] + 1.0)
@@ -183,8 +187,8 @@ def _compute_sampling_rate(run: Run) -> float:
 def _preserves_motion(recording: Recording, stride: int) -> bool:
     """Return whether every k-th sample still shows the whole motion.
 
-    The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
-    than if every second sample is kept, which is noise.
+    The motion between the kept samples is interpolated by a spline. If every second sample is kept,
+    the error of this is only noise. With every k-th one it may hardly be larger.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -250,11 +254,12 @@ LARGEST_SHARE = 0.5
 
 
 def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
-    """Leave out the first samples of runs whose first activations are not known.
+    """Leave out the first samples of runs whose first activations (filter outputs) are not known.
 
-    A run keeps all of its samples if its filters take more than half of it to settle, or if the
-    robot has floating bodies, whose later poses are not recorded; its filters then begin at the
-    first commands.
+    A filter before an actuator depends on commands before the run; after a few time constants this
+    is forgotten. A run keeps all of its samples if its filters take more than half of it to settle,
+    or if the robot has floating bodies, whose later poses are not recorded; its filters then begin
+    at the first commands.
 
     Args:
         recording: Recording as it was read.

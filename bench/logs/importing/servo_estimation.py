@@ -96,7 +96,10 @@ def estimate_added_servo(
 
 
 def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> ServoResponse | None:
-    """Estimate how a position follows its command.
+    """Estimate how a position follows its command: natural frequency and damping of the servo.
+
+    For each pair of a grid, the response (1) to the commands is computed. The pair with the
+    smallest residual is taken, if it explains most of the position's variance.
 
     Args:
         runs: For each run (T,) times in s, about uniform, (T,) commands, each held to the next
@@ -133,15 +136,15 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
 def _compute_transfer_functions(
     responses: Sequence[ServoResponse], step: float
 ) -> tuple[Array, Array]:
-    """Discretise (1) for commands that are held over a step.
+    """Compute the response of servos from sample to sample, for commands that are held over a step.
 
-    With the poles p1, p2 = -w (d -+ sqrt(d^2 - 1)), which must differ, the response of (1) to a
-    unit step is
+    The servo is q'' = w^2 (u - q) - 2 d w q' (1), with the command u, natural frequency w and
+    damping ratio d. With the poles p1, p2 = -w (d -+ sqrt(d^2 - 1)), which must differ, its
+    response to a unit step is
 
         q(t) = 1 - (p2 exp(p1 t) - p1 exp(p2 t)) / (p2 - p1)                                     (2)
 
-    The servo is q'' = w^2 (u - q) - 2 d w q' (1), with the command u, natural frequency w and
-    damping ratio d.
+    Sampled, it is a filter of second order: a ratio of two polynomials in z, the shift by a step.
 
     Args:
         responses: n pairs of natural frequency w in rad/s and damping ratio d.

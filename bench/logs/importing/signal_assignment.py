@@ -241,6 +241,10 @@ def assign_velocities(
 ) -> None:
     """Assign the columns that are the derivative of their joint's position and do not lag it.
 
+    A robot's velocity signal may be filtered, scaled or of another time; then it would mislead a
+    fit. So each column is compared with the derivative of the position, which also confirms its
+    unit. Columns of one kind, which one logger wrote in the same way, are decided together.
+
     Args:
         logs: Logs that are imported.
         signals: Signals to which velocities are added.
@@ -316,10 +320,11 @@ def _confirm_unit(comparison: VelocityComparison | None, column: LogColumn, join
 def _assign_kind(
     candidates: Sequence[_Candidate], signals: SignalAssignment, result: ImportResult
 ) -> None:
-    """Assign velocity columns that agree with the derivative of their position.
+    """Assign velocity columns of one kind that agree with the derivative of their position.
 
-    All are left out if the velocities lag behind the positions. A joint that hardly moves gets the
-    unit of the others.
+    All are left out if the velocities lag behind the positions, or are ahead of them. A joint that
+    hardly moves gets the unit of the others. Each column that is left out is reported with the
+    reason.
 
     Args:
         candidates: columns of one kind, which share a unit and a filter.
@@ -457,10 +462,11 @@ class ColumnAssigner:
     def _make_position_signal(
         self, column: LogColumn, joint: Joint, placement: Placement
     ) -> Signal | None:
-        """Determine the unit of a position or a position command.
+        """Determine the unit of a position or a position command, and make its signal.
 
-        The unit is the one that the log states, or the user, or the one that fits the range of the
-        joint. Return None, with a message, if there is no such unit.
+        The unit is the first of these: the one that the log states; that of normalised positions;
+        the one that the user states; the one that fits the range of the joint. Return None, with a
+        message, if there is no such unit.
 
         Args:
             column: column of the log.
@@ -645,9 +651,10 @@ class ColumnAssigner:
     def assign_efforts(self) -> None:
         """Assign measured torques to motors without a command and to undriven joints.
 
-        Columns with a torque are used as the command of a motor, or as the force on a joint of a
-        model that has no actuators. If several columns fit one input, the only measured one is
-        taken.
+        A motor exerts its command, so its measured torque can replace a command that was not
+        recorded. In a model without actuators, the torque is a force on the joint. If several
+        columns fit one input, the only measured one is taken; if none or several are measured, no
+        column is taken.
         """
         signals = self._signals
         columns = [column for column in self._select_by_role("force") if _is_torque(column)]
