@@ -88,7 +88,7 @@ def read_answers(folder: Path) -> AnswersByCase:
 
 
 def _add_line(answers: AnswersByCase, document: Mapping[str, Any]) -> None:
-    """Add one line of the file of the answers to the answers in memory.
+    """Add one line of the file of the answers to `answers`.
 
     A case has several lines if diagnosers were asked in different sessions. The newest line
     replaces the case, and the rows of its own diagnosers only.

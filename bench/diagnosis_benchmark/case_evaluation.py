@@ -90,6 +90,9 @@ def evaluate_case(
 ) -> dict[str, Any]:
     """Draw a case and evaluate it with several diagnosers, one after the other.
 
+    The case is drawn anew from its specification (``question``) and the salt unless it is known.
+    Each diagnoser receives a request with the recording of the case, but not its true causes.
+
     Args:
         question: case specification as JSON.
         seed: seed of the public case set.
@@ -105,13 +108,10 @@ def evaluate_case(
         (``item``, {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
     case_spec = CaseSpec.from_json(question)
-    case = (
-        case_spec.draw_case(seed, salt)
-        if known_case is None
-        else BenchmarkCase.from_json(known_case)
-        if known_case
-        else None
-    )
+    if known_case is None:
+        case = case_spec.draw_case(seed, salt)
+    else:
+        case = BenchmarkCase.from_json(known_case) if known_case else None
     if case is None:
         return {"question": case_spec.name, "item": {}, "rows": []}
     recording_text = render_recording(case)
@@ -131,11 +131,11 @@ def evaluate_case(
             "seconds": limits.seconds,
             "seed": make_seed_words("diagnosis", diagnoser.label, case_spec.name).tolist(),
         }
-        rows.append(_evaluate_case(diagnoser, request, case_spec.name, limits, hidden))
+        rows.append(_ask_diagnoser(diagnoser, request, case_spec.name, limits, hidden))
     return {"question": case_spec.name, "item": case.to_json(), "rows": rows}
 
 
-def _evaluate_case(
+def _ask_diagnoser(
     diagnoser: EvaluatedDiagnoser,
     request: dict[str, Any],
     question: str,
@@ -222,6 +222,7 @@ def _diagnose_isolated(
 
     The process ends after this answer, so that nothing passes from one case to the next. Its
     messages have a kind of one letter: L sends the trained arrays, Q the case, and A is the answer.
+    The time limit begins with the case; starting the process and loading the arrays do not count.
 
     Args:
         code: where the code of the diagnoser is.
@@ -233,8 +234,9 @@ def _diagnose_isolated(
     Raises:
         RunEndedError: the diagnoser failed.
     """
-    robots = ("mujoco",) if request["beside"] else ()
-    child = _start_process(code, limits.memory, hidden, robots)
+    # Only the recording of a robot has further files: its model file.
+    extra_modules = ("mujoco",) if request["beside"] else ()
+    child = _start_process(code, limits.memory, hidden, extra_modules)
     try:
         if trained_arrays:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
@@ -326,6 +328,9 @@ def train_isolated(
     code: TunerSpec, request: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
 ) -> tuple[dict[str, Array], int, float]:
     """Train a diagnoser for a system, in an isolated process unless it is trusted.
+
+    The process gets the request in a message of kind F, and answers with kind L: the trained arrays
+    and, as one more array, the number of simulations.
 
     Args:
         code: where its code is.

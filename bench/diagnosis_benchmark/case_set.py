@@ -111,6 +111,9 @@ def find_equivalent_effects(case: BenchmarkCase, effect: str) -> frozenset[str]:
 def list_coefficient_names(system: str, name: str) -> list[str]:
     """List the names of an effect's coefficients, in the order of the numbers in a case.
 
+    They may depend on the system, as the number of directions does; those of the robot arm arm2
+    do not.
+
     Args:
         system: name of the system, such as ``pendulum``.
         name: name of the effect, with or without a place.
@@ -217,7 +220,7 @@ def read_config(experiment: Experiment) -> BenchmarkConfig:
         experiment: Experiment with the table.
 
     Raises:
-        InputError: a key or value is not allowed.
+        InputError: a key or value is not allowed; the message names it and what is allowed.
     """
     subject = f"experiment {experiment.name}"
     entries = check_entries(
@@ -309,15 +312,19 @@ class CaseSpec:
         Returns:
             The first case whose hidden cause is observable; None if all attempts fail.
         """
-        first = self._get_first_seed(seed, salt)
-        items = (
-            draw_case(self.kind, self.system, first + k, self.effect, self.size, self.asked)
-            for k in range(MAX_DRAW_ATTEMPTS)
-        )
-        return next((case for case in items if case is not None), None)
+        first_seed = self._get_first_seed(seed, salt)
+        for attempt in range(MAX_DRAW_ATTEMPTS):
+            case = draw_case(
+                self.kind, self.system, first_seed + attempt, self.effect, self.size, self.asked
+            )
+            if case is not None:
+                return case
+        return None
 
     def _get_first_seed(self, seed: int, salt: str) -> int:
         """Return the seed of the first attempt to draw the case; attempt k uses this seed plus k.
+
+        Seeds are multiples of ten, so that the attempts of two cases share no seed.
 
         Args:
             seed: seed of the public case set; unused with a secret salt.
@@ -336,7 +343,8 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     """Build the list of all cases of a comparison.
 
     The order of the tables in the experiment determines the order of the cases; with `sample`, a
-    random subset is selected.
+    random subset is selected. Cases that hide the same effect in the same system get the numbers
+    0, 1, ... (`index`), from which their seeds follow.
 
     Raises:
         InputError: an effect cannot be hidden in a system.
@@ -344,13 +352,13 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     last_index_by_group: dict[tuple[Any, ...], int] = {}
     questions = []
     for request in settings.case_requests:
-        for kind, system, effect, size, circumstances in _iterate_combinations(request):
-            key = kind, system, effect, size, circumstances
-            # Sizes are not part of the key, so cases of two sizes have different seeds.
+        for kind, system, effect, size, conditions in _iterate_combinations(request):
+            # The size is not part of the group, so cases of two sizes have different seeds.
+            group = kind, system, effect
             for _ in range(request.count):
-                group = kind, system, effect
-                last_index_by_group[group] = last_index_by_group.get(group, -1) + 1
-                questions.append(CaseSpec(*key, index=last_index_by_group[group]))
+                index = last_index_by_group.get(group, -1) + 1
+                last_index_by_group[group] = index
+                questions.append(CaseSpec(kind, system, effect, size, conditions, index=index))
     if not settings.sample or settings.sample >= len(questions):
         return questions
     rng = make_rng("diagnosis", "sample", settings.seed)
@@ -401,16 +409,18 @@ def _list_hidden_effects(request: CaseRequest, system: str) -> list[str | None]:
                 f"diagnosis.questions: of {request.kind} questions no effects are named"
             )
         return [None]
-    foreign = request.kind == "foreign"
-    available_effects = list_unmodelled_causes(system) if foreign else list_hideable_effects(system)
-    known_effects = (
-        {n for s in ALL_SYSTEMS for n in list_unmodelled_causes(s)}
-        if foreign
-        else set(library.registry.names())
-    )
+    # A foreign case hides a cause that no effect of the library describes. A name is unknown only
+    # if no system has it: a table may list effects that not all of its systems have.
+    is_foreign = request.kind == "foreign"
+    if is_foreign:
+        available_effects = list_unmodelled_causes(system)
+        known_effects = {name for other in ALL_SYSTEMS for name in list_unmodelled_causes(other)}
+    else:
+        available_effects = list_hideable_effects(system)
+        known_effects = set(library.registry.names())
     for name in request.effects:
         if name not in known_effects:
             raise make_unknown_name_error(
-                "foreign cause" if foreign else "effect", name, available_effects
+                "foreign cause" if is_foreign else "effect", name, available_effects
             )
     return [name for name in available_effects if not request.effects or name in request.effects]

@@ -98,6 +98,8 @@ class DiagnoserReportData:
     ) -> tuple[Series, ...]:
         """Make one series of points with error bars for each diagnoser.
 
+        A series names the rows and columns that it shows; the chart reads them from its table.
+
         Args:
             y: column with the value.
             is_shifted: whether the points of the diagnosers are shifted sideways, so that they do
@@ -163,7 +165,9 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     """Build the tables of the charts that are not tables of the comparison.
 
     A chart of the page reads a table with one column per coordinate. Category axes need a column
-    ``place`` with the number of the category.
+    ``place`` with the number of the category. The tables: diagnosed single causes with false alarms
+    (``board``, in per cent), all shares by metric, frequencies of p-values with the ideal line of
+    diagnoser "", answers by size of their sets, and diagnosed single causes with costs.
 
     Args:
         data: graded answers and result tables of all diagnosers.
@@ -389,11 +393,12 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
     false alarms cannot lead, because a diagnoser that always alarms finds every cause.
 
     Returns:
-        The best diagnoser; None if there are no clean cases.
+        The best diagnoser, with name "" if all have too many false alarms; None if there are no
+        clean cases, in which false alarms could be counted.
     """
-    table = data.tables["table"]
-    alarms = index_by_diagnoser(table, "false alarms")
-    named_shares = index_by_diagnoser(table, PRIMARY_METRIC)
+    metrics = data.tables["table"]
+    alarms = index_by_diagnoser(metrics, "false alarms")
+    named_shares = index_by_diagnoser(metrics, PRIMARY_METRIC)
     if not any(row["of"] for row in alarms.values()):
         return None
     with_few_alarms = [
@@ -404,28 +409,31 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
         return Leader("")
     leader = max(candidates, key=lambda name: float(named_shares[name]["share"]))
     other_names = [name for name in candidates if name != leader]
-    low, high = (format_percent(named_shares[leader][end]) for end in ("low", "high"))
+    named = named_shares[leader]
+    low, high = format_percent(named["low"]), format_percent(named["high"])
     share_text = (
-        f"{int(named_shares[leader]['count'])} of {int(named_shares[leader]['of'])}, "
-        f"{format_percent(named_shares[leader]['share'])} (95 % interval {low} to {high})"
+        f"{int(named['count'])} of {int(named['of'])}, "
+        f"{format_percent(named['share'])} (95 % interval {low} to {high})"
     )
-    row, text = alarms[leader], ""
-    if row["high"] > TARGET_FALSE_ALARM_RATE:
-        text = f"{int(row['count'])} false alarm{'s' if row['count'] != 1 else ''}"
-    significance = _format_significance(data, leader, other_names)
+    leader_alarms, alarms_text = alarms[leader], ""
+    if leader_alarms["high"] > TARGET_FALSE_ALARM_RATE:
+        plural = "" if leader_alarms["count"] == 1 else "s"
+        alarms_text = f"{int(leader_alarms['count'])} false alarm{plural}"
     return Leader(
         leader,
         tuple(candidates),
         share_text,
-        significance,
-        int(row["of"]),
-        text,
-        float(row["high"]),
+        significance=_format_significance(data, leader, other_names),
+        clean=int(leader_alarms["of"]),
+        alarms=alarms_text,
+        alarm_limit=float(leader_alarms["high"]),
     )
 
 
 def _format_significance(data: DiagnoserReportData, best: str, other_names: list[str]) -> str:
     """Say whether simgap as the best diagnoser differs significantly from the others.
+
+    The p-values are those of McNemar's test, corrected by Holm's method for several comparisons.
 
     Args:
         data: tables of the comparison.

@@ -178,7 +178,7 @@ def diagnose_case(
 
 
 def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:
-    """Train a diagnoser for a system.
+    """Train a diagnoser for a system, with counted and limited simulations.
 
     Args:
         request: request with ``wanted``, ``system``, ``budget`` and ``seed``.

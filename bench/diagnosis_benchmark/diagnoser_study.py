@@ -87,6 +87,9 @@ _CASE_DRAW_SECONDS = 300.0
 class DiagnosisStudy(Study):
     """Comparison of diagnosers on cases, stored in a folder; implements `study.Study`.
 
+    A diagnoser finds the hidden cause (an effect that a simulator lacks) of a recording. A case, or
+    question, is a simulated recording with known hidden causes.
+
     Args:
         folder: result folder of a comparison of diagnosers.
 
@@ -324,8 +327,9 @@ class _EvaluationRun:
         required_systems = {question.system for question in self._study.cases}
         systems = sorted(required_systems & set(simulators.names()))
         codes = {name: make_diagnoser_spec(name) for name in self._study.usable_diagnosers}
-        learned_names = [name for name in codes if diagnosers.get(name).learned]
-        untrained = [(name, system) for name in learned_names for system in systems]
+        learning_diagnosers = [name for name in codes if diagnosers.get(name).learned]
+        # calls[i] is the training of trainings[i].
+        trainings = [(name, system) for name in learning_diagnosers for system in systems]
         budget = self._experiment.training_budget
         calls: list[Call] = [
             (
@@ -340,13 +344,13 @@ class _EvaluationRun:
                     trusted,
                 ),
             )
-            for name, system in untrained
+            for name, system in trainings
         ]
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
         training_costs = []
         step = self._progress("training", len(calls)) if calls else None
         for index, result in workers.iterate_results(calls, math.inf) if calls else ():
-            name, system = untrained[index]
+            name, system = trainings[index]
             if isinstance(result, TrainedDiagnoser):
                 files[name][system] = result.path
                 training_costs.append(
@@ -389,8 +393,10 @@ class _EvaluationRun:
             )
             calls.append((evaluate_case, (*case_args, self._limits, self._hidden)))
         step = self._progress("asking", len(calls))
-        longest = _CASE_DRAW_SECONDS + len(evaluated) * (self._limits.seconds + _CASE_DRAW_SECONDS)
-        for index, result in workers.iterate_results(calls, longest):
+        max_seconds = _CASE_DRAW_SECONDS + len(evaluated) * (
+            self._limits.seconds + _CASE_DRAW_SECONDS
+        )
+        for index, result in workers.iterate_results(calls, max_seconds):
             if isinstance(result, BaseException):
                 result = _make_failed_answers(
                     questions[index], [answer.label for answer in calls[index][1][4]], result
@@ -434,6 +440,8 @@ def _make_failed_answers(
 
 def make_diagnoser_spec(name: str) -> TunerSpec:
     """Return where the code of a diagnoser is, and the packages to preload for it.
+
+    The code is not imported here: only the process of the diagnoser runs it.
 
     Args:
         name: registered name of the diagnoser, of simgap, a plugin file or an installed package.
@@ -503,6 +511,7 @@ def _compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict
     Returns:
         Hashes by a description for the user.
     """
+    # A secret salt is revealed in the configuration at the end, which must not change the hash.
     public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
     sources = []
     for name in read_config(experiment).diagnosers:

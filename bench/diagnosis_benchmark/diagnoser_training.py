@@ -66,6 +66,9 @@ def train_or_load(
 ) -> TrainedDiagnoser:
     """Train a diagnoser for a system, or load the cached result.
 
+    The file name in the cache contains a hash of everything that determines the result. The arrays
+    are written before their cost, so that a file with a cost belongs to a complete training.
+
     Args:
         code: where its code is.
         source: hash of its code.

@@ -70,6 +70,9 @@ class Grade:
 def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
     """Grade the verdict of a diagnoser on one benchmark case.
 
+    The grade depends on the named causes; of a correct answer, the 95 % intervals of its numbers
+    are compared with the true values, too.
+
     Args:
         case: the case with its true causes.
         verdict: the answer as a dictionary; None for a missing answer.
@@ -129,7 +132,7 @@ def _grade_library(
 
     An answer is right if each effect is in a set of its own and no set is without an effect. The
     sets are matched twice: to the effects themselves (`exact_matches`), and to effects that are
-    equivalent in any data (`equivalent_matches`).
+    equivalent in any data (`equivalent_matches`). Outcomes are tested from the worst to the best.
 
     Args:
         effects: the hidden effects.
@@ -165,6 +168,9 @@ def _match_sets_to_effects(
 ) -> dict[str, int]:
     """Assign effects to sets, each set to at most one effect.
 
+    An effect that takes the first set in which it is may leave none for the other effect. With at
+    most two effects, it suffices to try both orders of effects and of sets.
+
     Args:
         effects: the hidden effects, at most two.
         sets: sets of effects that an answer names; those of one set are alternatives.
@@ -175,7 +181,7 @@ def _match_sets_to_effects(
     """
     most_matches: dict[str, int] = {}
     for order in (list(effects), list(effects)[::-1]):
-        for reverse in (False, True):
+        for takes_last_set in (False, True):
             matches: dict[str, int] = {}
             for effect in order:
                 matching_sets = [
@@ -184,7 +190,7 @@ def _match_sets_to_effects(
                     if is_in_set(effect, names) and i not in matches.values()
                 ]
                 if matching_sets:
-                    matches[effect] = matching_sets[-1 if reverse else 0]
+                    matches[effect] = matching_sets[-1 if takes_last_set else 0]
             most_matches = max(most_matches, matches, key=len)
     return most_matches
 
@@ -203,6 +209,9 @@ def _count_covered_intervals(
     case: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
 ) -> dict[str, bool | None]:
     """Compare the intervals of base parameters and of leading causes with the true values.
+
+    A diagnoser that is right must also be sure for good reason: about 95 % of its intervals should
+    contain the true value.
 
     Args:
         case: the case with its true causes.

@@ -32,7 +32,8 @@ _NOISE_SIGMA = 1e-3
 def _warm_up_search(system: str) -> None:
     """Fit a simulated recording of a system and compute the direction of each effect.
 
-    The result is discarded: the call makes Python import and compile what every diagnosis needs.
+    The result is discarded: the call makes Python import and compile what every diagnosis needs,
+    once for all processes that are forked from this one.
 
     Args:
         system: name of the system, such as ``pendulum``.

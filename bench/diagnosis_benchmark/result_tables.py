@@ -148,7 +148,7 @@ def _build_diagnoser_table(
     order: Sequence[str],
     list_lines: Callable[[pd.DataFrame], Iterator[TableRow]],
 ) -> pd.DataFrame:
-    """Build a table from the lines of each diagnoser.
+    """Build a table from the lines of each diagnoser; its first column is the diagnoser's name.
 
     Args:
         rows: one row per answer.
@@ -259,6 +259,7 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
         order: names of the diagnosers.
     """
     graded_rows = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
+    # Cases without an effect of the library are counted under their kind, as "(clean)".
     graded_rows["hidden"] = graded_rows["hidden"].where(
         graded_rows["kind"] == "single", "(" + graded_rows["kind"] + ")"
     )
@@ -291,7 +292,8 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     """Compare each diagnoser with simgap on the same cases by McNemar's test.
 
     The test counts only the cases that exactly one of the two answered correctly. P-values are
-    Holm-corrected over the diagnosers, within each metric.
+    corrected by Holm's method for the number of diagnosers, within each metric. The table is empty
+    if simgap takes no part.
 
     Args:
         rows: one row per answer.
@@ -299,20 +301,23 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     """
     columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
     lines = []
+    other_diagnosers = [name for name in order if name != REFERENCE_DIAGNOSER]
     for metric in PAIR_METRICS:
         part = metric.select(rows)
         results_by_diagnoser = part.assign(right=metric.predicate(part)).pivot(
             index="question", columns="diagnoser", values="right"
         )
-        other_names = [
-            name for name in order if name != REFERENCE_DIAGNOSER and name in results_by_diagnoser
-        ]
-        for name in other_names if REFERENCE_DIAGNOSER in results_by_diagnoser else ():
-            paired_results = results_by_diagnoser[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
-            only_simgap = int((paired_results[REFERENCE_DIAGNOSER] & ~paired_results[name]).sum())
-            only_other = int((~paired_results[REFERENCE_DIAGNOSER] & paired_results[name]).sum())
+        if REFERENCE_DIAGNOSER not in results_by_diagnoser:
+            continue
+        for name in other_diagnosers:
+            if name not in results_by_diagnoser:
+                continue
+            # Cases without a result of either of the two are left out.
+            pairs = results_by_diagnoser[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
+            only_simgap = int((pairs[REFERENCE_DIAGNOSER] & ~pairs[name]).sum())
+            only_other = int((~pairs[REFERENCE_DIAGNOSER] & pairs[name]).sum())
             p_value = compute_mcnemar_p_value(only_simgap, only_other)
-            lines.append((metric.name, name, len(paired_results), only_simgap, only_other, p_value))
+            lines.append((metric.name, name, len(pairs), only_simgap, only_other, p_value))
     frame = pd.DataFrame(lines, columns=columns)
     frame["p_holm"] = frame.groupby("metric")["p_value"].transform(
         lambda p_values: correct_holm(p_values.to_numpy())
@@ -321,7 +326,10 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
-    """Compute the p-value of McNemar's exact test, two-sided.
+    """Compute the p-value of McNemar's exact test, two-sided: are two diagnosers equally good?
+
+    If they are, each case that only one of them answered correctly is as likely to be the first
+    one's as the second one's. Without such cases the p-value is 1.
 
     Args:
         first_only: number of cases that only the first diagnoser answered correctly.

@@ -105,6 +105,10 @@ def compute_heights_by_scale(
 ) -> BallHeights:
     """Compute heights without a camera, scaled by the ball's diameter or by the fall.
 
+    Up to the scale, the heights follow from equation (2) with q, the position along the fall over
+    the ball's radius, both in pixels. Only the factor S remains: the known radius, or the factor
+    with which the ball falls at g. If both are known but differ, a note says so.
+
     Args:
         track: Track of the ball in the image.
         diameter: Diameter of the ball in metres; None to scale by the fall.
@@ -113,41 +117,45 @@ def compute_heights_by_scale(
     Raises:
         InputError: The film does not show what the method needs.
     """
-    distance_ratio = _compute_fall_position(track) / _smooth_radius(track)
-    arcs = _fit_free_flights(track.times, distance_ratio)
-    ground = _estimate_ground_position(track, distance_ratio, arcs)
-    fallen = _compute_gravity_scale(arcs)
+    q = _compute_fall_position(track) / _smooth_radius(track)
+    flights = _fit_free_flights(track.times, q)
+    q_ground = _estimate_ground_position(track, q, flights)
+    factor_by_fall = _compute_gravity_scale(flights)
     notes = []
     if diameter is None or scale == "fall":
-        if fallen is None:
+        if factor_by_fall is None:
             raise InputError(
                 "the scale is unknown: no flight of this film shows gravity clearly; "
                 "give the ball's diameter"
             )
-        factor = fallen
+        factor = factor_by_fall
         method = f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s²; drag would bias the scale)"
         # Without a diameter, assume the radius that a level camera would give.
-        ball = diameter / 2 if diameter else factor
+        radius = diameter / 2 if diameter else factor
     else:
-        factor = ball = diameter / 2
+        factor = radius = diameter / 2
         method = "scaled by the ball's diameter, for a horizontal camera"
-        if fallen is not None and abs(fallen / factor - 1) > _REPORTED_SCALE_DIFFERENCE:
+        difference = 0.0 if factor_by_fall is None else factor_by_fall / factor - 1
+        if abs(difference) > _REPORTED_SCALE_DIFFERENCE:
             notes.append(
-                f"the fall gives {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
+                f"the fall gives {difference:+.0%} for all heights: the camera is tilted, "
                 "or gravity is not 9.81 m/s²; the scale 'fall' uses the fall"
             )
-    return BallHeights(
-        ball + factor * (ground - distance_ratio), ball, method, tuple(notes)
-    )  # Equation (2).
+    z = radius + factor * (q_ground - q)  # Equation (2).
+    return BallHeights(z, radius, method, tuple(notes))
 
 
 def _compute_fall_position(track: BallTrack) -> Array:
-    """Return the position along the line of the fall, downwards positive, in pixels.
+    """Return the position (T,) along the line of the fall, downwards positive, in pixels.
 
-    The perspective along that line is described by `_smooth_radius`.
+    A camera may be rolled, so the line need not be vertical in the image. It is the direction in
+    which the centres of the ball vary most.
 
     Args:
-        track: Centres (u, v) of the ball in the frames.
+        track: Centres (u, v) of the ball in the T frames.
+
+    Raises:
+        InputError: The line is closer to the horizontal.
     """
     visible_frames = track.visible_frames
     points = np.stack([track.u[visible_frames], track.v[visible_frames]], axis=1)
@@ -166,7 +174,8 @@ def _compute_fall_position(track: BallTrack) -> Array:
 def _smooth_radius(track: BallTrack) -> Array:
     """Smooth the radius (T,) of the ball in pixels, as a linear function of its position.
 
-    The outline in a single frame is too noisy. Frames far from the line get a small weight.
+    The outline in a single frame is too noisy, so a line is fitted to the radii of all frames. It
+    is fitted several times; frames far from the previous line get a small weight.
 
     Args:
         track: Centres and radii of the ball in the frames.
@@ -187,22 +196,28 @@ def _smooth_radius(track: BallTrack) -> Array:
 def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     """Divide the motion of the ball at its bounces, and fit a parabola to each free flight.
 
+    A bounce is a frame in which the ball is lower than in the frames next to it. The parts between
+    bounces that are too short, or do not fit a parabola, are left out.
+
     Args:
         times: (T,) times of the frames, s.
         q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
     """
     visible_frames = np.flatnonzero(np.isfinite(q))
     last_index = len(visible_frames) - 1
-    # q counts downwards: the ball is lowest where q is largest.
-    lowest = [
+    # q counts downwards: the ball is lowest where q is largest. Bounces and the two ends are
+    # indices into visible_frames.
+    bounces = [
         i
         for i in range(1, last_index)
         if q[visible_frames[i - 1]] < q[visible_frames[i]] >= q[visible_frames[i + 1]]
     ]
-    arcs = []
-    for a, b in pairwise([0, *lowest, last_index]):
+    flights = []
+    for begin, end in pairwise([0, *bounces, last_index]):
         # The frame of the bounce itself belongs to no flight.
-        flight_frames = visible_frames[a + (a > 0) : b - (b < last_index) + 1]
+        first = begin if begin == 0 else begin + 1
+        last = end if end == last_index else end - 1
+        flight_frames = visible_frames[first : last + 1]
         if len(flight_frames) < _MIN_FLIGHT_FRAMES or np.ptp(q[flight_frames]) < _MIN_FLIGHT_EXTENT:
             continue
         flight_times = times[flight_frames]
@@ -215,15 +230,9 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
         # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
         if scatter < 0.05 * np.ptp(q[flight_frames]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
-            arcs.append(
-                _Flight(
-                    curve,
-                    flight_times[0],
-                    flight_times[-1],
-                    len(flight_times) * float(flight_times[-1] - flight_times[0]) ** 4,
-                )
-            )
-    return arcs
+            weight = len(flight_times) * float(flight_times[-1] - flight_times[0]) ** 4
+            flights.append(_Flight(curve, flight_times[0], flight_times[-1], weight))
+    return flights
 
 
 def _compute_gravity_scale(arcs: list[_Flight]) -> float | None:
@@ -236,27 +245,28 @@ def _compute_gravity_scale(arcs: list[_Flight]) -> float | None:
     return float(DEFAULT_GRAVITY / mean)  # Equation (3).
 
 
-def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -> float:
+def _estimate_ground_position(track: BallTrack, q: Array, flights: list[_Flight]) -> float:
     """Return the position q, in ball radii, at which the ball touches the ground.
 
-    It is where two successive flights meet, or the lowest position if there is only one flight.
+    It is where two successive flights meet: the bounce itself falls between two frames, so the
+    parabolas of the flights before and after it are extended until they intersect. The median over
+    all bounces is returned, or about the lowest position if no two flights meet.
 
     Args:
         track: the tracked ball, with the times of the frames.
         q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
-        arcs: fitted flights in order.
+        flights: fitted flights in order.
     """
     crossings = []
-    for earlier_arc, later_arc in pairwise(arcs):
-        roots = np.roots(earlier_arc.curve - later_arc.curve)
+    for earlier, later in pairwise(flights):
+        intersection_times = np.roots(earlier.curve - later.curve)
         # Two parabolas have up to two intersections: the bounce, and one outside both flights.
-        begin, end = (
-            earlier_arc.end - _BOUNCE_SEARCH_SECONDS,
-            later_arc.begin + _BOUNCE_SEARCH_SECONDS,
-        )
+        begin, end = earlier.end - _BOUNCE_SEARCH_SECONDS, later.begin + _BOUNCE_SEARCH_SECONDS
         # Roots with a smaller imaginary part are real up to rounding.
-        real_roots = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
-        crossings += [float(np.polyval(earlier_arc.curve, r)) for r in real_roots[:1]]
+        bounce_times = [
+            t.real for t in intersection_times if abs(t.imag) < 1e-9 and begin < t.real < end
+        ]
+        crossings += [float(np.polyval(earlier.curve, t)) for t in bounce_times[:1]]
     if crossings:
         return float(np.median(crossings))
     # Without two flights, use the lowest position, but ignore frames with tracking errors.
@@ -277,9 +287,9 @@ def estimate_height_noise(times: Array, z: Array) -> float:
         Standard deviation (1 sigma) in m; NaN without a flight.
     """
     squares, degrees_of_freedom = 0.0, 0
-    for arc in _fit_free_flights(times, -z):
-        is_in_flight = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
-        t = times[is_in_flight] - arc.begin
+    for flight in _fit_free_flights(times, -z):
+        is_in_flight = (times >= flight.begin) & (times <= flight.end) & np.isfinite(z)
+        t = times[is_in_flight] - flight.begin
         if len(t) > _MIN_FLIGHT_FRAMES:
             cubic = np.polyfit(t, z[is_in_flight], 3)
             squares += float(np.sum((z[is_in_flight] - np.polyval(cubic, t)) ** 2))

@@ -152,6 +152,8 @@ def _estimate_height_noise(
 ) -> float:
     """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights.
 
+    Neighbouring frames show fast noise; the deviations from smooth flights show slow errors, too.
+
     Args:
         track: the tracked ball, with the times of the frames.
         heights: heights of the ball, m.
@@ -230,6 +232,9 @@ def write_film(
 ) -> tuple[int, float]:
     """Film one run with a camera drawn from a seed, whose parameters are published with the film.
 
+    The run's positions of the ball are read and rendered as images; they must be complete. The
+    camera and the look of the scene (colours, light) are random.
+
     Args:
         recording: Path of a recording of system ball.
         out: Path of the video.
@@ -272,11 +277,11 @@ def write_film(
     )
     rng = make_rng("film", seed)
     camera, appearance = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
-    stage = BallScene(camera, appearance, radius, rng)
+    scene = BallScene(camera, appearance, radius, rng)
     filmed = FilmDescription(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
     # The camera is published with the film, so that exact heights follow from the images.
     description = {get_camera_file_path(out): format_camera_file(filmed)}
-    write_video(out, stage.render_frames(positions), chosen_run.times, appearance.crf, description)
+    write_video(out, scene.render_frames(positions), chosen_run.times, appearance.crf, description)
     return len(positions), float(chosen_run.times[-1] - chosen_run.times[0])
 
 

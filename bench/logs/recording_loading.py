@@ -94,6 +94,9 @@ def get_simulator_class(
 ) -> type[Simulator]:
     """Find the simulator of the system or robot of a recording.
 
+    A robot's simulator is made from its model file; other simulators are registered by name. What
+    the caller gives precedes what the recording states.
+
     Args:
         source: The recording, or its path.
         system: Registered system to use instead of the one that the recording names.
@@ -123,7 +126,7 @@ def get_simulator_class(
 
 
 def check_value_sizes(recording: Recording) -> None:
-    """Reject values whose squares overflow.
+    """Reject values that are so large that sums of their squares, as in an error, may overflow.
 
     Raises:
         InputError: There is such a value; the message is one line.
@@ -157,6 +160,9 @@ def check_simulation_size(
 ) -> None:
     """Refuse a recording that this machine cannot simulate.
 
+    The need for memory, disk and time is estimated from the number of samples and of simulation
+    steps, before anything is simulated.
+
     Args:
         runs: Number of runs.
         samples: Number of samples of each run.
@@ -186,6 +192,9 @@ def check_simulation_size(
 
 def check_recording_size(recording: Recording, simulator: Simulator, force: bool = False) -> None:
     """Refuse a recording that this machine cannot fit.
+
+    A fit simulates each run many times, several of them at once. Its minimum need is estimated
+    from the longest run.
 
     Args:
         recording: Recording to explain or score.
@@ -273,6 +282,9 @@ def read_frame_recording(
 ) -> Recording:
     """Read the recording in a data frame; only runs that are marked so are held out.
 
+    The data frame replaces a table, and `frame_description` the description file next to it. What
+    is given by name (system, model, constants) precedes the entries of its description.
+
     Args:
         frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
         frame_description: Description by the user.
@@ -347,9 +359,11 @@ def compute_recording_digest(path: Path, further_text: str = "") -> str:
 
 
 def read_content(path: Path) -> bytes:
-    """Return the hash of a file and of the files that it includes, or of the bag or episode.
+    """Return a hash of the content of a file, a model file with its includes, a bag or an episode.
 
-    Missing files contribute nothing; reading them later reports the error.
+    The hash tells whether a recording has changed since it was explained. A bag is a folder or file
+    of ROS, hashed as a whole; an episode of a LeRobot dataset consists of several files. Missing
+    files contribute nothing; reading them later reports the error.
     """
     episode = split_episode_path(path)
     if episode is not None:
@@ -390,6 +404,10 @@ def load_joined(
 ) -> tuple[Recording, type[Simulator]]:
     """Read several recordings, join them into one, and find their simulator.
 
+    Each recording is read and, unless the runs are few, divided into runs for fitting and held-out
+    runs on its own. Then the runs are renamed, as several logs may have the same run names, and
+    put together.
+
     Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
     runs that it would hold out alone, at least one. A constant that the recordings state
     differently becomes a constant of the runs; a noise that they state differently is replaced by
@@ -422,17 +440,20 @@ def load_joined(
         _refuse_other(first_recording, kind, recording, other_kind)
     recordings = [recording for recording, _ in loaded]
     runs_of_all = [run for recording in recordings for run in recording.runs]
-    folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
-    if not folds:
+    is_cross_validated = len(runs_of_all) <= MAX_FOLDS and not any(
+        run.held_out for run in runs_of_all
+    )
+    if not is_cross_validated:
         recordings = [split_held_out(recording) for recording in recordings]
     names = make_log_names([recording.path for recording in recordings])
-    constants = {
+    common_constants = {
         key: value
         for key, value in first_recording.constants.items()
         if all(recording.constants.get(key) == value for recording in recordings)
     }
     default_values = {c.name: c.value for c in kind.constants}
-    differing = {key for recording in recordings for key in recording.constants} - set(constants)
+    stated_keys = {key for recording in recordings for key in recording.constants}
+    differing = stated_keys - common_constants.keys()
     runs = [
         replace(
             run,
@@ -449,12 +470,14 @@ def load_joined(
         first_recording,
         title=f"{first_recording.title or first_recording.path.stem} and {other_count} more "
         f"log{'s' if other_count > 1 else ''}",
-        constants=constants,
+        constants=common_constants,
         noise=_compute_rms_noise(recordings),
         runs=tuple(runs),
         notes=tuple(note for recording in recordings for note in recording.notes),
     )
-    return (split_held_out(joined_recording, folds=True) if folds else joined_recording), kind
+    if is_cross_validated:
+        joined_recording = split_held_out(joined_recording, folds=True)
+    return joined_recording, kind
 
 
 def _get_constant(
@@ -467,6 +490,9 @@ def _refuse_other(
     first: Recording, kind: type[Simulator], other: Recording, other_kind: type[Simulator]
 ) -> None:
     """Reject a recording that cannot be joined with the first one.
+
+    Both must be of one system (robots: one model file) and have the same channels and inputs, since
+    the joined recording is fitted with one simulator.
 
     Args:
         first: the first recording.

@@ -248,8 +248,8 @@ def _run_row(run: Run) -> tuple[str, ...]:
 def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
     """Yield a row of the table of signals for each channel and input: unit, range, gaps and noise.
 
-    `role` is the kind of the signal. The stated noise is "-" for a channel whose noise is not
-    stated; steps are quantisation steps.
+    The stated noise is "-" for a channel whose noise is not stated, and empty for an input, which
+    has none; steps are quantisation steps.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -291,6 +291,9 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
     """Describe a constant's value, and list the runs with each value if it differs.
+
+    A run may state its own value; the value of the recording, or else the default, holds for the
+    other runs.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -357,7 +360,7 @@ def _pluralise(word: str, count: int) -> str:
 
 
 def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Yield lines about signals missing in the log and signals beyond their limits.
+    """Yield lines about a robot's signals missing in the log and signals beyond their limits.
 
     Args:
         recording: Recording to check.
@@ -394,6 +397,8 @@ def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[s
 def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:
     """Yield a line for each signal that leaves its range.
 
+    Checked are the positions and forces of joints with one coordinate, and the commands.
+
     Args:
         recording: recorded runs, with their channels, inputs and constants.
         robot: model of the robot, with its ranges.
@@ -417,9 +422,9 @@ def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[s
 def _format_exceeded_range(
     recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
 ) -> Iterator[str]:
-    """Yield a line if a recorded signal leaves the range that the model file states.
+    """Yield a line if a recorded signal clearly leaves the range that the model file states.
 
-    The line has the runs and the extreme values.
+    The line names the runs and the extreme values, and asks whether unit, sign or zero is wrong.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.

@@ -55,7 +55,9 @@ def segment_recording(
     """Cut the runs of a recording into segments if it is too long or if the user requests it.
 
     Runs for fitting are reduced to segments that together cost `MAX_RECORDING_COST`, and so are
-    held-out runs; at least one segment of each run is kept.
+    held-out runs; at least one segment of each run is kept. A run keeps the same share of its
+    duration as every other run. Of robots with floating bodies only the beginnings of runs are
+    used, because the pose of the body is known there only.
 
     Args:
         recording: Recording as it was read.
@@ -79,20 +81,21 @@ def segment_recording(
             f"{recording.path}: expected no --pieces: {recording.system} has a floating base, "
             "whose pose at the start of a piece is not known; leave it out"
         )
-    budget = np.inf if whole or not kind.has_model else _compute_affordable_seconds(kind)
+    is_limited = kind.has_model and not whole
+    affordable_seconds = _compute_affordable_seconds(kind) if is_limited else np.inf
     segments: list[Run] = []
     notes = []
     for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
         total_seconds = sum(map(_compute_duration, runs))
-        if total_seconds <= budget and seconds is None:
+        if total_seconds <= affordable_seconds and seconds is None:
             segments += runs
             continue
-        share = min(budget / total_seconds, 1.0) if total_seconds > 0 else 1.0
+        share = min(affordable_seconds / total_seconds, 1.0) if total_seconds > 0 else 1.0
         cut_run = _take_beginning if floats else _cut_run
         new_segments = [
-            p
+            segment
             for run in runs
-            for p in cut_run(run, share * _compute_duration(run), seconds or SEGMENT_SECONDS)
+            for segment in cut_run(run, share * _compute_duration(run), seconds or SEGMENT_SECONDS)
         ]
         segments += new_segments
         used_seconds = sum(map(_compute_duration, new_segments))
@@ -103,10 +106,8 @@ def segment_recording(
     if not notes:
         return SegmentedRecording(recording, "")
     summary = " and ".join(notes)
-    left_out = budget < max(sum(map(_compute_duration, recording.training())), 0.0)
-    origin_note = (
-        " from the whole recording (--whole uses all of it)" if left_out and not whole else ""
-    )
+    is_reduced = affordable_seconds < sum(map(_compute_duration, recording.training()))
+    origin_note = " from the whole recording (--whole uses all of it)" if is_reduced else ""
     note = f"of the recording {summary} were used{origin_note}"
     return SegmentedRecording(replace(recording, runs=tuple(segments)), note)
 
@@ -126,10 +127,11 @@ def _compute_duration(run: Run) -> float:
 
 
 def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
-    """Cut a run into segments of at most `max_length` seconds that last `seconds` in total.
+    """Cut a run into segments of at most `max_length` seconds that last about `seconds` in total.
 
-    The segments are spread over the run. Each begins at the sample before which the commands have
-    changed least.
+    The run is divided into equal parts, one for each segment. Within its part, a segment begins at
+    the sample before which the commands have changed least: the unknown motion before it then
+    matters least.
     """
     length = min(max_length, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.

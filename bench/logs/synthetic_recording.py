@@ -393,12 +393,16 @@ def _make_parameters(
 ) -> dict[str, float]:
     """Return every parameter's value by name, in the simulator's order.
 
+    Parameters that are not named have their nominal value. Values outside of their bounds are
+    refused.
+
     Args:
         values: values by name, or all in order.
         kind: simulator class, which declares the parameters.
 
     Raises:
-        InputError: there are too few or too many values, or a name is unknown.
+        InputError: there are too few or too many values, a name is unknown, or a value is out of
+            its bounds.
     """
     names = [p.name for p in kind.parameters]
     if not isinstance(values, Mapping):
@@ -432,12 +436,12 @@ def _make_coefficients(
         kind: class of the simulator.
     """
     if isinstance(stated_values, Mapping):
-        of_system = (
+        coefficients = (
             library.find_effect(name, kind.system).on(kind.system)
             if issubclass(kind, SystemSimulator)
             else ()
         )
-        names = [c.name for c in of_system]
+        names = [c.name for c in coefficients]
         check_known_names(f"coefficient of effect {name}", stated_values, names)
         return [_check_number(f"effect {name}:", c, stated_values.get(c, 0.0)) for c in names]
     values = [stated_values] if isinstance(stated_values, int | float) else list(stated_values)
@@ -449,6 +453,9 @@ def _make_coefficients(
 def _repeat_for_places(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
     """Repeat the coefficients of one place for all places of an effect family.
 
+    A family, such as a drag at each joint, has a member for each place. Values that are not the
+    coefficients of exactly one member are returned unchanged.
+
     Args:
         name: name of the effect; that of a family ends with ``@*``.
         values: coefficients of one place, or of all places.
@@ -458,9 +465,9 @@ def _repeat_for_places(name: str, values: list[float], kind: type[Simulator]) ->
         return values
     effect = library.find_effect(name, kind.system)
     members = getattr(effect, "members", ())
-    of_one = len(members[0].coefficients) if members else 0
-    is_common = len(values) == of_one < len(effect.coefficients)
-    return values * len(members) if is_common else values
+    member_size = len(members[0].coefficients) if members else 0
+    are_for_one_place = len(values) == member_size < len(effect.coefficients)
+    return values * len(members) if are_for_one_place else values
 
 
 def _make_noise_table(
@@ -487,14 +494,14 @@ def _make_noise_table(
 
 
 def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tuple[float, float]:
-    """Return the interval (low, high) from which an initial state is drawn.
+    """Return the interval (low, high) from which an initial state is drawn; a value is both ends.
 
     Args:
         name: name of the initial state.
         stated_range: a value, or lowest and highest value.
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither, or low is above high.
     """
     limits = (
         (stated_range, stated_range)

@@ -61,7 +61,8 @@ class FlightDynamics:
         Args:
             t: time.
             y: position and velocity, (6,).
-            middle: a time within the integrated interval, which decides whether a gust acts.
+            middle: a time within the integrated interval, which decides whether a gust acts: it
+                begins and ends at ends of intervals.
         """
         ax, ay, az = 0.0, 0.0, -self.g
         for law, c in self.laws:
@@ -270,7 +271,7 @@ def _integrate_flight(
 
 
 def _compute_bounce(true_system: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
-    """Compute the state after an impact on the ground.
+    """Compute the state after an impact on the ground, for which the ball needs no time.
 
     Restitution reverses the vertical velocity, and contact friction slows the horizontal one by at
     most the friction coefficient times the vertical impulse, (1 + e) times the impact speed.

@@ -32,7 +32,7 @@ def compute_rms(values: Array) -> float:
 
 
 def compute_orthonormal_basis(columns: Array) -> Array:
-    """Compute an orthonormal basis of the span of columns by a singular value decomposition.
+    """Compute an orthonormal basis (N, K) of the span of columns by singular value decomposition.
 
     Directions with a singular value below 1e-6 of the largest are left out, because they come from
     columns that are nearly dependent.
@@ -52,6 +52,9 @@ def fit_coefficients(
     compute_residual: Callable[[Array], Array], start: Array, low: Array, high: Array, steps: int
 ) -> Array:
     """Minimise a sum of squares within bounds by the Levenberg-Marquardt method.
+
+    Each step solves the damped normal equations with a Jacobian by finite differences. A step that
+    makes the residual larger is tried again with more damping; the fit ends if no damping helps.
 
     Args:
         compute_residual: residual (N,) as a function of the scaled coefficients.
@@ -93,7 +96,7 @@ def fit_coefficients(
 
 
 def find_strength_for_size(
-    compute_residual: Callable[[float], float],
+    compute_size: Callable[[float], float],
     target_size: float,
     largest: float,
     first: float = FIRST_STRENGTH,
@@ -102,10 +105,12 @@ def find_strength_for_size(
 ) -> tuple[float, float] | None:
     """Find the strength at which the size of a cause has the requested value.
 
-    The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
+    The strength scales the coefficients of a cause; the size is the residual that the cause leaves
+    in a fit without it, in units of the noise. The method is the secant method on logarithmic
+    scales, within a bracket as soon as there is one, with at most twelve trials.
 
     Args:
-        compute_residual: size as a function of the strength, increasing from zero.
+        compute_size: size as a function of the strength, increasing from zero.
         target_size: requested size.
         largest: maximum strength.
         first: first strength to try.
@@ -114,12 +119,12 @@ def find_strength_for_size(
         tolerance: relative tolerance of the size.
 
     Returns:
-        The strength and the size there; None if the strength is not below `largest`.
+        The strength and the size there; None if no strength up to `largest` is found.
     """
     # Bracket: (strength, size) below and above the requested size.
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
-        size = compute_residual(strength)
+        size = compute_size(strength)
         if abs(size / target_size - 1) < tolerance:
             return strength, size
         if size < target_size:

@@ -290,7 +290,8 @@ def _draw_power_law(
 ) -> CoefficientFunction:
     """Return a power law of the input that keeps the peak of the input unchanged.
 
-    The gain that keeps the peak is peak^-s - 1 at the strength s, which is also the power.
+    The effect multiplies the input u by (1 + gain) |u|^s, with the strength s as power. The gain
+    that keeps the peak is peak^-s - 1.
 
     Args:
         coefficient_scale: unused here.

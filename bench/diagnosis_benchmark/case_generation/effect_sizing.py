@@ -80,11 +80,9 @@ class NuisanceFitter:
         """
         kind = SIMULATORS[setting.system]
         self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
-        self.scenarios, self.sigma, self.states = (
-            list(setting.scenarios),
-            setting.noise_sigmas,
-            list(kind.states),
-        )
+        self.scenarios = list(setting.scenarios)
+        self.sigma = setting.noise_sigmas
+        self.states = list(kind.states)
         true_values = [setting.parameters[p.name] for p in kind.system.parameters]
         self.theta = np.array(
             [*true_values, *(p.nominal for p in self.simulator.parameters[len(true_values) :])]
@@ -93,14 +91,10 @@ class NuisanceFitter:
             [[s.initial[name] for name in self.states] for s in setting.scenarios]
         )
         low, high = np.array([p.bounds for p in self.simulator.parameters]).T
-        self.low, self.high = (
-            low,
-            np.where(np.arange(low.size) < len(true_values), high, low + 2 * (high - low)),
-        )
-        # Coefficients are scaled by a tenth of their ranges.
-        self.scales = np.where(
-            np.arange(low.size) < len(true_values), self.theta, 0.1 * (high - low)
-        )
+        is_base_parameter = np.arange(low.size) < len(true_values)
+        self.low = low
+        self.high = np.where(is_base_parameter, high, low + 2 * (high - low))
+        self.scales = np.where(is_base_parameter, self.theta, 0.1 * (high - low))
 
     def __call__(
         self,
@@ -111,8 +105,9 @@ class NuisanceFitter:
     ) -> ResidualFit:
         """Fit observations by the Levenberg-Marquardt method.
 
-        A step that does not decrease the sum of squares increases the damping, another one
-        decreases it. The fit stops when the RMS residual hardly decreases.
+        The unknowns are base parameters, coefficients and the initial states of each run. A step
+        that does not decrease the sum of squares increases the damping, another one decreases it.
+        The fit stops when the RMS residual hardly decreases.
 
         Shapes: R runs, T samples, C channels.
 
@@ -175,7 +170,12 @@ class NuisanceFitter:
     def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """Compute the residual and its Jacobian by finite differences.
 
-        Shapes: R runs, T samples, C channels.
+        All variants are simulated in one batch: for each run, the given values, each parameter
+        changed, and each initial state changed. The initial states of a run influence only its own
+        rows of the Jacobian.
+
+        Shapes: R runs, T samples, C channels, S states, N = R T C residuals, P = parameters,
+        coefficients and R S initial states.
 
         Args:
             observed: observations, (R, T, C).
@@ -188,10 +188,8 @@ class NuisanceFitter:
         """
         runs, state_count, count = len(starts), len(self.states), theta.size
         variant_count = 1 + count + state_count
-        thetas, initial_states = (
-            np.tile(theta, (runs, variant_count, 1)),
-            np.tile(starts[:, None], (1, variant_count, 1)),
-        )
+        thetas = np.tile(theta, (runs, variant_count, 1))
+        initial_states = np.tile(starts[:, None], (1, variant_count, 1))
         for i in range(count):
             thetas[:, 1 + i, i] += FINITE_DIFFERENCE_STEP * self.scales[i]
         for i in range(state_count):
@@ -210,11 +208,8 @@ class NuisanceFitter:
         slope = np.zeros((*residual.shape, count + runs * state_count))
         for run_index in range(runs):
             slope[run_index, :, :count] = slopes[run_index, :count].T
-            slope[
-                run_index,
-                :,
-                count + run_index * state_count : count + (run_index + 1) * state_count,
-            ] = slopes[run_index, count:].T
+            first = count + run_index * state_count
+            slope[run_index, :, first : first + state_count] = slopes[run_index, count:].T
         is_finite = (np.abs(observations) < DIVERGED_VALUE).all()
         return residual.ravel() if is_finite else np.full(residual.size, np.inf), slope.reshape(
             residual.size, -1
@@ -303,6 +298,8 @@ def compute_refitted_residual(
 ) -> float:
     """Compute the residual after base parameters, initial states and an effect are refitted.
 
+    It tells whether this effect can explain a recording with another hidden cause.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -324,6 +321,9 @@ def compute_refitted_residual(
 def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str, float]:
     """Find the effect of the library that leaves the smallest residual.
 
+    All effects are ranked by their residual to first order; only the most promising ones are
+    refitted. Effects of the input are left out if nothing drives the system.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -338,12 +338,13 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     names = [
         n for n in usable if setting.is_driven or not (n.startswith("input.") or n == "backlash")
     ]
-    first = {n: _rank_starts(setting, observed, n, base_fit)[0] for n in names}
-    promising_names = sorted(first, key=lambda n: first[n][0])[:MAX_REFITTED_EFFECTS]
-    residuals = {
-        n: NuisanceFitter(setting, [n])(observed, first[n][1], base_fit.starts).rms_residual
-        for n in promising_names
-    }
+    best_starts = {n: _rank_starts(setting, observed, n, base_fit)[0] for n in names}
+    promising_names = sorted(best_starts, key=lambda n: best_starts[n][0])[:MAX_REFITTED_EFFECTS]
+    residuals = {}
+    for n in promising_names:
+        _, theta = best_starts[n]
+        refit = NuisanceFitter(setting, [n])(observed, theta, base_fit.starts)
+        residuals[n] = refit.rms_residual
     name = min(residuals, key=lambda n: residuals[n])
     return name, min(residuals[name], base_fit.rms_residual)
 
@@ -352,6 +353,9 @@ def _rank_starts(
     setting: RecordingConditions, observed: Array, name: str, base_fit: ResidualFit
 ) -> list[tuple[float, Array]]:
     """List starting points for refitting an effect, the best first.
+
+    A least-squares fit finds only the minimum near its start, so effects with a shape (a period, a
+    time, a place) start from several shapes.
 
     Shapes: R runs, T samples, C channels.
 
@@ -433,7 +437,9 @@ def _estimate_linear_step(
 ) -> tuple[float, Array]:
     """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
 
-    Shape parameters that the system does not have are omitted.
+    theta consists of the base parameters, the linear coefficients of the effect (zero at first) and
+    its shape parameters, which the step does not change. Shape parameters that the system does not
+    have are omitted.
 
     Shapes: R runs, T samples, C channels.
 
@@ -446,15 +452,15 @@ def _estimate_linear_step(
     Returns:
         RMS residual of the linear model, and theta after the step.
     """
-    base, count = base_fit.theta.size, fit.theta.size
-    shape = shape[: count - base - 1]
-    scaled = count - len(shape)
-    theta = np.array([*base_fit.theta, *[0.0] * (scaled - base), *shape])
+    base_count, count = base_fit.theta.size, fit.theta.size
+    # At least one coefficient is linear.
+    shape = shape[: count - base_count - 1]
+    fitted_count = count - len(shape)
+    theta = np.array([*base_fit.theta, *[0.0] * (fitted_count - base_count), *shape])
     residual, slope = fit.linearise(observed, theta, base_fit.starts)
-    slope = np.delete(slope, np.s_[scaled:count], axis=1)
+    slope = np.delete(slope, np.s_[fitted_count:count], axis=1)
     # Almost no damping, because the model is linear here.
-    step = fit.compute_step(residual, slope, 1e-9)
-    theta[:scaled] += step[:scaled] * fit.scales[:scaled]
-    return float(np.sqrt(np.mean((residual - slope @ step) ** 2))), np.clip(
-        theta, fit.low, fit.high
-    )
+    step = fit.compute_step(residual, slope, damping=1e-9)
+    theta[:fitted_count] += step[:fitted_count] * fit.scales[:fitted_count]
+    rms_residual = float(np.sqrt(np.mean((residual - slope @ step) ** 2)))
+    return rms_residual, np.clip(theta, fit.low, fit.high)

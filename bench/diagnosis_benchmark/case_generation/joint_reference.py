@@ -204,6 +204,9 @@ class ReferenceLoad(ABC):
     def force(self, x: float, v: float, y: float, w: float) -> float:
         """Compute the force of the load on the drive side.
 
+        It is the reaction to the force that accelerates the load, and the load's share of the
+        weight is subtracted, since `JointDynamics` adds all the weight to the drive side.
+
         Args:
             x: position of the drive side.
             v: velocity of the drive side.
@@ -215,7 +218,7 @@ class ReferenceLoad(ABC):
         ) - self.share * self.weight(x)
 
     def rates(self, x: float, v: float, y: float, w: float) -> tuple[float, float]:
-        """Compute the time derivatives of the load's states.
+        """Compute the time derivatives of the load's states: its velocity and its acceleration.
 
         Args:
             x: position of the drive side.
@@ -474,6 +477,9 @@ def simulate_joint(
 ) -> Array:
     """Simulate one run of a joint with a hidden cause.
 
+    The input is constant or smooth within each of its intervals, which are divided further where a
+    gust begins or ends: the solver would lose its accuracy at a jump.
+
     Args:
         true_system: true system of a case: constants, parameters and hidden effects.
         scenario: scenario of the run: times, initial state, inputs and constants.
@@ -532,9 +538,9 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     """Integrate until the next standstill, break-away or end of the input interval.
 
     A resting coordinate that dry friction can hold is not moved: only its hidden states are
-    integrated, or the time of break-away is searched. Otherwise friction opposes the direction of
-    motion `direction` (+1 or -1), and an event stops the integration when the velocity changes its
-    sign.
+    integrated, or the time of break-away (at which it begins to slide) is searched. Otherwise
+    friction opposes the direction of motion `direction` (+1 or -1), and an event stops the
+    integration when the velocity changes its sign.
 
     Args:
         joint: the equation of motion, with its input interval.
@@ -549,11 +555,9 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     if joint.limits and v == 0.0:
         force = joint.compute_force(start, x, 0.0, *z)
         if abs(force) <= joint.compute_friction_limit(start, x, 0.0):
-            return (
-                _integrate_stuck(joint, start, state)
-                if z
-                else (_find_break_away(joint, start, x), state, None)
-            )
+            if z:
+                return _integrate_stuck(joint, start, state)
+            return _find_break_away(joint, start, x), state, None
         direction = copysign(1.0, force)
 
     def compute_derivatives(t: float, y: Array) -> list[float]:
@@ -578,15 +582,12 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
 
     stop_event: Any = compute_directed_velocity
     stop_event.terminal, stop_event.direction = True, -1
-    events, first_step = (
-        (stop_event, min(MAX_FIRST_STEPS[0], end - start))
-        if joint.limits
-        else (None, min(MAX_FIRST_STEPS[1], end - start))
-    )
+    events = stop_event if joint.limits else None
+    max_first_step = MAX_FIRST_STEPS[0] if joint.limits else MAX_FIRST_STEPS[1]
     settings: dict[str, Any] = {
         "dense_output": True,
         "max_step": MAX_STEP,
-        "first_step": first_step,
+        "first_step": min(max_first_step, end - start),
         **SOLVER_TOLERANCES,
     }
     method: Any = "RK45" if end - start < INTERPOLATION_INTERVAL else "DOP853"
@@ -638,8 +639,9 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
 def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
     """Find the time at which the coordinate breaks away, or the end of the input interval.
 
-    Within an input interval only time-dependent forces and limits change while the coordinate
-    rests.
+    It breaks away when the force exceeds the friction limit. A grid of times brackets that instant,
+    and Brent's method finds it. Within an input interval only time-dependent forces and limits
+    change while the coordinate rests.
 
     Args:
         joint: equation of motion in the present input interval.

@@ -70,7 +70,10 @@ class SensorNoise:
     stated: bool = True
 
     def add_to(self, observed: Array, rng: np.random.Generator) -> Array:
-        """Add noise to observations.
+        """Add noise to observations: rounding, noise with memory (AR(1)), or white noise.
+
+        All three have the standard deviation `sigma`. Before the rounding, white noise (dither) is
+        added, as a real sensor has it.
 
         Shapes: T samples, C channels.
 
@@ -84,7 +87,7 @@ class SensorNoise:
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded
-        if self.kind == "ar1":
+        if self.kind == "ar1":  # each sample is a share of the previous one plus new white noise
             for sample in range(1, len(white)):
                 white[sample] = (
                     self.phi * white[sample - 1] + np.sqrt(1 - self.phi**2) * white[sample]
@@ -168,6 +171,8 @@ def draw_conditions(
 ) -> RecordingConditions:
     """Draw recording conditions in which the hidden effects can be observed.
 
+    Some effects need an input or horizontal motion; conditions without it are not drawn for them.
+
     Args:
         system: name of the system, such as ``pendulum``.
         rng: random generator.
@@ -209,17 +214,19 @@ def _draw_sensor_noise(
         channels: names of the recorded channels.
     """
     sigma = float(np.exp(rng.uniform(*np.log(NOISE_RANGES[system]))))
-    faster = float(rng.uniform(*FREQUENCY_RANGES[system])) if system in FREQUENCY_RANGES else 1.0
-    by_channel = {name: sigma * (faster if name in ("qd", "v") else 1.0) for name in channels}
+    rate_factor = (
+        float(rng.uniform(*FREQUENCY_RANGES[system])) if system in FREQUENCY_RANGES else 1.0
+    )
+    by_channel = {name: sigma * (rate_factor if name in ("qd", "v") else 1.0) for name in channels}
     kind = str(rng.choice(NOISE_KINDS))
+    # Everything is drawn for every kind of noise, in this order, so that later draws do not depend
+    # on the kind.
     return SensorNoise(
         by_channel,
         kind,
-        # Correlation of neighbouring samples, if the noise is autocorrelated.
-        float(rng.uniform(0.3, 0.9)),
-        # Standard deviation of the dither, in rounding steps.
-        float(rng.uniform(0.3, 0.6)),
-        bool(rng.random() < 0.5),
+        phi=float(rng.uniform(0.3, 0.9)),
+        dither=float(rng.uniform(0.3, 0.6)),
+        stated=bool(rng.random() < 0.5),
     )
 
 
@@ -339,7 +346,7 @@ def draw_input_signal(
     """Generate an input signal of amplitude one.
 
     Args:
-        form: steps (between random levels), sine or chirp.
+        form: steps (between random levels), sine, or chirp (a sine whose frequency increases).
         times: sample times, (T,).
         rng: random generator.
         hertz: range of frequency, Hz.
@@ -354,9 +361,10 @@ def draw_input_signal(
         return levels
     log_low, log_high = np.log(hertz)
     low, high = np.sort(np.exp(rng.uniform(log_low, log_high, 2)))
-    cycles = (
-        low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
-    )
+    # Number of cycles up to each time, the integral of the frequency.
+    cycles = low * times
+    if form == "chirp":
+        cycles = cycles + (high - low) * times**2 / (2 * times[-1])
     signal: Array = np.sin(2 * np.pi * (cycles + rng.random()))
     return signal
 
@@ -429,7 +437,7 @@ class BenchmarkCase:
         min_beyond: float,
         **changes: Any,
     ) -> BenchmarkCase | None:
-        """Hide causes in a case.
+        """Hide causes in a case, unless a wrong answer would explain the recording as well.
 
         Args:
             effects: coefficients of the causes by name.

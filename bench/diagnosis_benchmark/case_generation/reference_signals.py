@@ -74,6 +74,10 @@ def compute_applied_input(
 ) -> list[InputSegment]:
     """Compute the first input as applied to the plant, from time 0 to `end_time`.
 
+    The hidden effects change the commands between sensor and plant. The result is divided into
+    segments in which the input is constant or approaches a constant exponentially, so that a solver
+    never meets a jump. Without an input, only a constant offset remains.
+
     Args:
         scenario: scenario of the run: times, initial state, inputs and constants.
         effects: coefficients of the hidden effects by name.
@@ -89,6 +93,7 @@ def compute_applied_input(
     )
     changes = np.flatnonzero(np.diff(levels)) + 1
     starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    # With a lag, each segment begins at the level that the one before it has reached.
     segments, state = [], levels[0]
     for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
         if start < end_time:
@@ -140,6 +145,9 @@ def apply_input_effects(
 def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
     """Divide each interval into parts, to approximate an input between hold and linear.
 
+    A command is usually held until the next sample; an input that is interpolated moves on to the
+    next value meanwhile. It is approximated by short constant parts.
+
     Args:
         levels: input at each sample.
         edges: time of each sample.
@@ -157,6 +165,9 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
 def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Array, Array]:
     """Limit the rate of an input, in short parts of constant level.
 
+    The output follows each level on a ramp of the largest rate. The ramp is divided into parts of
+    at most `SLEW_STEP` seconds, each with its mean value.
+
     Args:
         levels: (N,) levels of the input.
         edges: (N,) times at which they begin, s.
@@ -172,15 +183,16 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
         while start < end and state != level:
             end_of_step = min(start + SLEW_STEP, end)
             deviation = level - state
-            ramp_duration = min(abs(deviation) / max_rate, end_of_step - start)
+            seconds_to_level = abs(deviation) / max_rate
+            ramp_duration = min(seconds_to_level, end_of_step - start)
             next_state = (
                 level
-                if ramp_duration >= abs(deviation) / max_rate
+                if ramp_duration >= seconds_to_level
                 else state + copysign(max_rate * ramp_duration, deviation)
             )
-            # mean over the part, in which the rise may end
-            values.append(0.5 * (state + next_state) * ramp_duration / (end_of_step - start))
-            values[-1] += next_state * (1 - ramp_duration / (end_of_step - start))
+            # Mean over the part, in which the ramp may end.
+            ramp_share = ramp_duration / (end_of_step - start)
+            values.append(0.5 * (state + next_state) * ramp_share + next_state * (1 - ramp_share))
             starts.append(start)
             state, start = next_state, end_of_step
         if start < end:

@@ -82,6 +82,9 @@ def simulate_with_scipy(
 ) -> Array:
     """Simulate a run with scipy and return noise-free sensor readings.
 
+    A delay or a wrong clock of the sensors changes the times at which the motion is read, a lag
+    needs the motion between the samples, and the other sensor effects change the readings.
+
     Args:
         true_system: true system of a case: constants, parameters and hidden effects.
         scenario: scenario of the run: times, initial state, inputs and constants.

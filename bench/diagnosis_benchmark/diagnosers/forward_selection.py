@@ -302,6 +302,8 @@ class ForwardChi2(_ForwardSelection):
 def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
     """Compute sum of squares and number of parameters of a fit, by which models are compared.
 
+    Unknown initial states count as parameters.
+
     Args:
         evidence: base fit, noise, and directions of the effects on a recording.
         fit: a fitted model. A fit that diverged gets an infinite sum of squares.
@@ -318,7 +320,8 @@ def _refit_with_one_more_effect(
     """Add each of the most promising effects to a model, and refit all parameters by least squares.
 
     Promising are the `REFITS_PER_ROUND` effects that decrease the sum of squares most to first
-    order. Each is fitted from several starting values.
+    order, when parameters and initial states may change, too. Each is fitted from several starting
+    values.
 
     Args:
         evidence: fitted base model and directions of the effects.
@@ -421,7 +424,8 @@ def _compute_intervals(
     """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit.
 
     They are the linear least-squares intervals: value plus or minus 1.96 standard errors, with the
-    noise variance estimated from the residual.
+    noise variance estimated from the residual. The columns of the Jacobian are scaled to equal
+    length before the inversion, since parameters have different units.
 
     Args:
         evidence: base fit, noise, and directions of the effects on a recording.

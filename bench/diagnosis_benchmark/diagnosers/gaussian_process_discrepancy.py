@@ -78,23 +78,26 @@ def _compute_gain_p_value(
         return 1.0
     centre, scale = fitted.state.mean(axis=0), fitted.state.std(axis=0)
     moving = scale > 0
-    inputs = (fitted.state - centre)[:, moving] / scale[moving]
-    unseen = (held_out.state - centre)[:, moving] / scale[moving]
+    fitted_inputs = (fitted.state - centre)[:, moving] / scale[moving]
+    held_out_inputs = (held_out.state - centre)[:, moving] / scale[moving]
     training_indices = np.sort(
-        rng.choice(len(inputs), min(TRAINING_SAMPLE_COUNT, len(inputs)), replace=False)
+        rng.choice(
+            len(fitted_inputs), min(TRAINING_SAMPLE_COUNT, len(fitted_inputs)), replace=False
+        )
     )
+    # A smooth function (RBF) plus noise; fitting finds its size, its length scales and the noise.
     kernel = ConstantKernel(1.0, VARIANCE_BOUNDS) * RBF(
-        np.ones(inputs.shape[1]), LENGTH_BOUNDS
+        np.ones(fitted_inputs.shape[1]), LENGTH_BOUNDS
     ) + WhiteKernel(1.0, NOISE_BOUNDS)
     process = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        process.fit(inputs[training_indices], fitted.residual[training_indices])
-    predicted = process.predict(unseen)
+        process.fit(fitted_inputs[training_indices], fitted.residual[training_indices])
+    predicted = process.predict(held_out_inputs)
     gains = np.square(held_out.residual) - np.square(held_out.residual - predicted)
     edges = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
     block_means = np.array([gains[a:b].mean() for a, b in pairwise(edges.tolist())])
-    spread = float(block_means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
-    if spread == 0:
+    standard_error = float(block_means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
+    if standard_error == 0:
         return 1.0
-    return float(students.sf(block_means.mean() / spread, HELD_OUT_BLOCK_COUNT - 1))
+    return float(students.sf(block_means.mean() / standard_error, HELD_OUT_BLOCK_COUNT - 1))

@@ -146,6 +146,8 @@ def _run_command(prompt: str, seconds: float) -> str:
 def parse_answer(text: str) -> Answer:
     """Find the last JSON object with a verdict in a text; models often write words around it.
 
+    Decoding is tried from every opening brace, since braces occur in the words, too.
+
     Raises:
         InputError: there is none, or it is not a valid answer.
     """

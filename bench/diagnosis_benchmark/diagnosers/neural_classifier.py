@@ -110,16 +110,17 @@ class NeuralClassifier(Diagnoser):
     def diagnose(self, case: DiagnosisCase) -> Answer:
         """Name the most probable effects.
 
-        The answer is "adequate" unless "no effect" is less probable than
-        `CLEAN_PROBABILITY_THRESHOLD`. Effects at least `ALTERNATIVE_PROBABILITY_RATIO` as probable
-        as the best are its alternatives. Without trained weights the answer is "unidentifiable".
+        The network was trained with all effects of the system; those that the recorded signals
+        cannot show get the probability zero. The answer is "adequate" unless "no effect" is less
+        probable than `CLEAN_PROBABILITY_THRESHOLD`. Effects at least
+        `ALTERNATIVE_PROBABILITY_RATIO` as probable as the best are its alternatives. Without
+        trained weights the answer is "unidentifiable".
         """
         if not case.learned:
             return Answer("unidentifiable")
         classes = ["", *sorted(library_of(case.kind.system))]
         image, _ = _compute_network_input(case.kind, case.recording)
         probabilities = _predict_probabilities(case.learned, image, len(classes))
-        # Effects that the recorded signals cannot show are excluded.
         is_possible = np.array([not name or name in case.library for name in classes])
         probabilities = np.where(is_possible, probabilities, 0.0)
         probabilities = probabilities / probabilities.sum()
@@ -128,9 +129,8 @@ class NeuralClassifier(Diagnoser):
             return Answer("adequate", p_value=None)
         order = [int(i) for i in np.argsort(-probabilities) if i]
         max_probability = float(probabilities[order[0]])
-        named_classes = [
-            i for i in order if probabilities[i] >= ALTERNATIVE_PROBABILITY_RATIO * max_probability
-        ]
+        min_probability = ALTERNATIVE_PROBABILITY_RATIO * max_probability
+        named_classes = [i for i in order if probabilities[i] >= min_probability]
         if float(probabilities[named_classes].sum()) < MIN_NAMED_PROBABILITY:
             return Answer("unknown")
         most_probable, *alternatives = (classes[i] for i in named_classes)
@@ -255,8 +255,8 @@ def _compute_network_input(
         fit = fit_base_model(evaluator, noise).fit
         residual = (evaluator.observed - fit.simulated) / noise.sigma
         rms = float(np.sqrt(np.nanmean(np.square(residual))))
-        names = [recorded_index.name for recorded_index in kind.channels]
-        inputs = [recorded_index.name for recorded_index in kind.inputs]
+        names = [channel.name for channel in kind.channels]
+        inputs = [channel.name for channel in kind.inputs]
         image = np.zeros(
             (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
         )
@@ -264,6 +264,7 @@ def _compute_network_input(
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
             relative_times = np.linspace(0.0, 1.0, size)
+            # The channels have fixed rows of the image; rows of those not recorded remain zero.
             for recorded_index, name in enumerate(evaluator.channels):
                 channel_index = names.index(name)
                 is_recorded = np.isfinite(residual[run_index, :size, recorded_index])

@@ -83,7 +83,7 @@ class RegressionData:
         return RegressionData(*(getattr(self, field.name)[is_selected] for field in fields(self)))
 
     def project_out_base(self) -> tuple[Array, Array]:
-        """Project out parameters and initial states.
+        """Project out parameters and initial states: what they can explain is no evidence.
 
         Returns:
             The residual (N,) and the effect columns (N, K), without the part that parameters and
@@ -174,10 +174,10 @@ class RegressionEvidence:
         return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
-        """Build the regression r = J delta + D c + noise, equation (1), with one row per sample.
+        """Build the regression of the residual r on its causes, with one row per sample.
 
-        To first order the residual is r = J delta + D c + noise (1), with the derivatives J by
-        parameters and initial states and the directions D of the effects.
+        To first order r = J delta + D c + noise (1), with the derivatives J by parameters and
+        initial states, their changes delta, the directions D of the effects and their sizes c.
         """
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
@@ -195,10 +195,8 @@ class RegressionEvidence:
         """Build the regression of accelerations: the operator L of (2) applied to equation (1).
 
         Accelerations show forces at the moment at which they act, while trajectories integrate
-        them.
-
-        The operator L r = r'' - A r - B r' (2) is applied to both sides of r = J delta + D c +
-        noise (1).
+        them. The operator L r = r'' - A r - B r' (2) is applied to both sides of r = J delta + D c
+        + noise (1); see `_apply_residual_operator`.
 
         Args:
             seconds: window of the local polynomials.
@@ -234,8 +232,6 @@ class RegressionEvidence:
             is_observed: mask of the samples to use, (R, T, C).
         """
         runs = np.broadcast_to(np.arange(len(residual))[:, None, None], is_observed.shape)
-        # An impact makes some entries very large or not finite; rows that are not finite are
-        # excluded.
         is_complete = is_observed & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
         scale = 1.0 / sigma[is_complete]
         states = self._compute_states()
@@ -271,10 +267,10 @@ class RegressionEvidence:
     def _apply_residual_operator(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
         """Apply the operator L of equation (2) to trajectories: L r = r'' - A r - B r'.
 
-        For a channel with a rate, the first derivative replaces the second, and the term with A is
+        A displacement r changes the forces, by the stiffness A and the damping B of the motion.
+        Subtracting this from the acceleration r'' yields the force that caused it. For a channel
+        that is a rate (velocity), the first derivative replaces the second, and the term with A is
         omitted. Channels that are neither coordinates nor rates are not used.
-
-        It is L r = r'' - A r - B r' (2), with the stiffness A and damping B of the motion.
 
         Shapes: R runs, T samples, C channels.
 
@@ -372,13 +368,11 @@ class RegressionEvidence:
         return is_smooth
 
     def _linearise(self, run: int) -> tuple[Array, Array]:
-        """Compute stiffness A and damping B of equation (2), each (T, D), by finite differences.
+        """Compute A and B of L r = r'' - A r - B r' (2), each (T, D), by finite differences.
 
         They are the derivatives of the base model's acceleration by the D coordinates and by their
-        rates, along the fitted motion. They are zero if the system's own force is uniform, and for
-        systems of several coordinates.
-
-        They are A and B of L r = r'' - A r - B r' (2).
+        rates (stiffness and damping, per mass), along the fitted motion. They are zero if the
+        system's own force is uniform, and for systems of several coordinates.
 
         Args:
             run: index of the run.

@@ -100,10 +100,8 @@ class _SparseRegression(Diagnoser):
             rows.select_runs(evidence.fitted),
             rows.select_runs(evidence.held_out),
         )
-        if (
-            min(len(fitting_rows.residual), len(held_out_rows.residual))
-            <= fitting_rows.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
-        ):
+        row_count = min(len(fitting_rows.residual), len(held_out_rows.residual))
+        if row_count <= fitting_rows.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT:
             return None
         residual, effects = fitting_rows.project_out_base()
         strongest_columns = find_strongest_columns(residual, effects, evidence.effect_columns)
@@ -238,6 +236,9 @@ def _select_by_one_standard_error(
 ) -> tuple[Array, float]:
     """Select the simplest model whose held-out error is within one standard error of the best.
 
+    Noise alone can make a more complex model better by less. Errors are means over blocks of the
+    held-out runs; their scatter gives the standard error.
+
     Args:
         models: coefficients of each model, (K,).
         residual: residual of the held-out runs, (N,).
@@ -282,7 +283,8 @@ def _find_equivalent_effects(
 ) -> tuple[str, ...]:
     """List effects that were not selected but are nearly collinear with a selected effect.
 
-    They are the alternatives of the cause, most similar first.
+    The recording does not tell them apart from it, so they are the alternatives of the cause, the
+    most similar first. Effects with several columns are compared by their best pair.
 
     Args:
         name: the selected effect.

@@ -66,10 +66,12 @@ class WhitenessTest(Diagnoser):
 
 
 def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
-    """Compute the smallest Ljung-Box p-value of all runs and channels, Bonferroni-corrected.
+    """Compute the p-value of the hypothesis that all residuals are white noise.
 
-    Series that are constant or not longer than twice the number of autocorrelations are left out;
-    if none remains, the p-value is 1.
+    The Ljung-Box test asks for each run and channel whether samples correlate with earlier ones.
+    The smallest p-value counts, multiplied by the number of tests (Bonferroni's correction). Series
+    that are constant or not longer than twice the number of autocorrelations are left out; if none
+    remains, the p-value is 1.
 
     Args:
         evidence: fitted base model with its residual.

@@ -132,7 +132,10 @@ def get_joint(system: str, place: str) -> int:
 def draw_effect_shape(
     name: str, setting: MachineRecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw the shape of an effect at a place.
+    """Draw the shape of an effect at a place: everything but its strength, such as its sign.
+
+    Forces are scaled by the typical forces and speeds of the joint, effects of the input by its
+    commands, and others have a fixed largest coefficient.
 
     Args:
         name: ``effect@place``, or ``effect`` alone.
@@ -167,22 +170,22 @@ def draw_effect_shape(
 
 
 def _make_force_drawer(
-    bottom: Callable[[dict[str, float]], float],
+    get_factor: Callable[[dict[str, float]], float],
 ) -> Callable[..., CoefficientFunction]:
     """Make the function that draws an effect whose force is proportional to its coefficient.
 
-    At strength 1, the coefficient times `bottom` is twice the typical force of the joint.
+    At strength 1, the coefficient times `get_factor` is twice the typical force of the joint.
 
     Args:
-        bottom: returns, from the typical scales of the joint, the quantity by which the coefficient
-            is multiplied to give the force, such as the speed for a linear drag.
+        get_factor: returns, from the typical scales of the joint, the quantity by which the
+            coefficient is multiplied to give the force, such as the speed for a linear drag.
     """
 
     def draw_coefficients(
         typical: dict[str, float], rng: np.random.Generator
     ) -> CoefficientFunction:
         """Draw the effect from the typical scales of its joint; `rng` is not used."""
-        coefficient_scale = 2.0 * typical["force"] / bottom(typical)
+        coefficient_scale = 2.0 * typical["force"] / get_factor(typical)
         return lambda s: (coefficient_scale * s,)
 
     return draw_coefficients
@@ -201,7 +204,6 @@ def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> 
         Function from the strength to sine amplitude, cosine amplitude, and period.
     """
     angle = rng.uniform(0, 2 * np.pi)
-    # 1.5 to 4 periods within the travel, between 0.08 and 1 rad.
     period = float(np.clip(typical_scales["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
     sine, cosine = (
         2 * typical_scales["force"] * float(function(angle)) for function in (np.sin, np.cos)
@@ -251,7 +253,7 @@ The scales are force, inertia, position, speed and travel.
 def draw_unmodelled_cause(
     name: str, setting: MachineRecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw the shape of an unmodelled cause.
+    """Draw the shape of an unmodelled cause: when a gust acts, or where a patch of friction lies.
 
     Args:
         name: ``cause@joint``, or ``cause`` alone.

@@ -79,21 +79,21 @@ def draw_case(
     name = "-".join([*words, str(seed)])
     conditions, rng = restore_conditions(name, system, requested), make_case_rng(name, "cause")
     case = BenchmarkCase(
-        name,
-        system,
-        kind,
-        {},
-        0.0,
-        conditions.noise.kind,
-        conditions.noise.stated,
-        conditions.rate,
-        conditions.seconds,
-        len(conditions.runs.q),
-        "own equations",
-        True,
-        MACHINES[system].channels,
-        seed,
-        conditions.free_parameters,
+        name=name,
+        system=system,
+        kind=kind,
+        effects={},
+        size=0.0,
+        noise=conditions.noise.kind,
+        stated=conditions.noise.stated,
+        rate=conditions.rate,
+        seconds=conditions.seconds,
+        runs=len(conditions.runs.q),
+        source="own equations",
+        driven=True,
+        channels=MACHINES[system].channels,
+        seed=seed,
+        parameters=conditions.free_parameters,
         asked=requested,
     )
     if kind == "clean":
@@ -113,7 +113,7 @@ def draw_case(
 def restore_conditions(
     name: str, system: str, requested: RequestedConditions = ANY_CONDITIONS
 ) -> MachineRecordingConditions:
-    """Restore the recording conditions of a case.
+    """Draw the recording conditions of a case again; they follow from its name.
 
     Args:
         name: name of the case.
@@ -192,6 +192,8 @@ def _find_sized_coefficients(
     is_modelled: bool = True,
 ) -> tuple[float, ...] | None:
     """Find coefficients at which a cause has the requested size, with a strength of at most 1.
+
+    The shape of the cause is drawn; its strength is then varied until the size is right.
 
     Args:
         name: ``cause@place``, or ``cause`` alone.
@@ -300,8 +302,9 @@ def _compute_unexplained_size(
 ) -> float:
     """Compute the RMS residual that the best of other causes leaves, to first order.
 
-    It is in units of the noise. The change of the readings by the hidden causes is projected on the
-    direction of each other cause.
+    It is in units of the noise. If it is small, the case would be unfair, since a wrong answer
+    explains it. The direction of each other cause is its change of the readings at a small
+    strength; the part of the hidden causes' change along it is subtracted.
 
     Args:
         conditions: recording conditions.
@@ -368,11 +371,14 @@ class _ResidualGauge:
         readings = read_encoders(simulate_machine(plant, start_runs), plant, conditions.runs.times)
         readings = readings.reshape(runs, variants, -1)
         slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
-        shared = np.concatenate(slopes[:, : len(parameters)], axis=1).T
+        # Rows are the samples of all runs one after another.
+        parameter_columns = np.concatenate(slopes[:, : len(parameters)], axis=1).T
         state_columns = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
         for run_index in range(runs):
             state_columns[run_index, :, run_index] = slopes[run_index, len(parameters) :].T
-        columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
+        columns = np.column_stack(
+            [parameter_columns, state_columns.reshape(runs * slopes.shape[2], -1)]
+        )
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
         self._basis = compute_orthonormal_basis(columns)
 
@@ -519,6 +525,9 @@ def build_description(
 ) -> dict[str, object]:
     """Build the description of the recording, as the document of a TOML file.
 
+    It states what a user knows: units, constants or the model file, held-out runs and sometimes the
+    noise, but neither the hidden causes nor the true parameters.
+
     Args:
         case: case of the benchmark: its recording conditions and hidden causes.
         conditions: recording conditions: parameters, commands, initial states and noise.
@@ -532,8 +541,8 @@ def build_description(
         if is_arm
         else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
     )
-    first = case.runs - conditions.held_out
-    runs = {str(number): {"held_out": True} for number in range(first, case.runs)}
+    first_held_out = case.runs - conditions.held_out
+    runs = {str(number): {"held_out": True} for number in range(first_held_out, case.runs)}
     source_entry = {"model": MODEL_FILE_NAME} if is_arm else {"system": case.system}
     constants = {} if is_arm else {"constants": _get_stated_constants(conditions)}
     return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}

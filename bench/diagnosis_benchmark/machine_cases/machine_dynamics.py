@@ -96,7 +96,10 @@ class MachineDynamics(ABC):
         return rubs
 
     def compute_friction_limit(self, q: Array, v: Array) -> Array:
-        """Compute the dry friction limit.
+        """Compute the dry friction limit: the friction of a moving joint, the most at rest.
+
+        It is the sum of Coulomb friction, the Stribeck part that vanishes at speed, and a patch of
+        friction in a region of one joint.
 
         Shapes: L batch elements, N joints.
 

@@ -139,16 +139,11 @@ class MachineRecordingConditions:
         """
         q, v = self.base_motion.q, self.base_motion.v
         a = np.gradient(v, self.base_motion.times, axis=0)
-        lanes, joints = q.shape[1:]
-        inertia = (
-            self.make_machine()
-            .compute_mass_matrix(q.reshape(-1, joints))
-            .reshape(len(q), lanes, joints, joints)
-        )
-        force = np.einsum("klij,klj->kli", inertia, a)
-        force = force - self.make_machine().compute_gravity_force(q.reshape(-1, joints)).reshape(
-            q.shape
-        )
+        runs, joints = q.shape[1:]
+        plant, positions = self.make_machine(), q.reshape(-1, joints)
+        inertia = plant.compute_mass_matrix(positions).reshape(len(q), runs, joints, joints)
+        inertia_force = np.einsum("klij,klj->kli", inertia, a)
+        force = inertia_force - plant.compute_gravity_force(positions).reshape(q.shape)
         return {
             "force": np.sqrt(np.mean(force**2, axis=(0, 1))),
             "speed": np.sqrt(np.mean(v**2, axis=(0, 1))),
@@ -165,7 +160,7 @@ SERVO_PARAMETERS = ("torque_constant", "resistance", "armature")
 def draw_conditions(
     system: str, rng: np.random.Generator, requested: RequestedConditions = ANY_CONDITIONS
 ) -> MachineRecordingConditions:
-    """Draw recording conditions.
+    """Draw recording conditions: sampling, the machine's parameters, its runs and the noise.
 
     Args:
         system: servo or arm2.
@@ -184,14 +179,12 @@ def draw_conditions(
     noise = SensorNoise(
         dict.fromkeys(plant.channels, sigma),
         requested.noise or str(rng.choice(NOISE_KINDS)),
-        # Correlation of neighbouring samples, if the noise is autocorrelated.
-        float(rng.uniform(0.3, 0.9)),
-        # Standard deviation of the dither, in rounding steps.
-        float(rng.uniform(0.3, 0.6)),
-        bool(rng.random() < 0.5),
+        phi=float(rng.uniform(0.3, 0.9)),
+        dither=float(rng.uniform(0.3, 0.6)),
+        stated=bool(rng.random() < 0.5),
     )
     return MachineRecordingConditions(
-        system, numbers, runs, noise, rate, seconds, max(1, count // 3)
+        system, numbers, runs, noise, rate, seconds, held_out=max(1, count // 3)
     )
 
 

@@ -60,19 +60,19 @@ class MachineMotion(NamedTuple):
 def simulate_machine(
     plant: MachineDynamics, runs: MachineRuns, coarse: float = 1.0
 ) -> MachineMotion:
-    """Simulate the motion of a machine.
+    """Simulate the motion of a machine, with equal steps that divide each sampling interval.
 
     Args:
         plant: machine with its parameters and hidden causes.
         runs: initial states and commands.
         coarse: factor of the step size.
     """
-    rate = runs.times[1] - runs.times[0]
+    sampling_interval = runs.times[1] - runs.times[0]
     max_step = coarse * (
         FRICTION_STEP_SECONDS if plant.has_dry_friction.any() else SMOOTH_STEP_SECONDS
     )
     # The small number prevents a further part by rounding.
-    parts = int(np.ceil(rate / max_step - 1e-9))
+    parts = int(np.ceil(sampling_interval / max_step - 1e-9))
     times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
     applied_inputs = compute_applied_inputs(runs, plant, times)
     integrator = _MachineIntegrator(plant, runs.q, runs.v)
@@ -269,7 +269,8 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
 def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag: float) -> Array:
     """Average an input over each step, with a zero-order hold, a delay and a lag.
 
-    Averages are exact: they are differences of the integral of the input.
+    A simulation step with the mean input changes the velocity as the true input does. Averages are
+    exact: they are differences of the integral of the input, divided by the step.
 
     Args:
         stamps: sample times, s, (T,).
@@ -283,19 +284,19 @@ def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag
     """
     # The first level holds before the first sample, the last one after the last sample.
     end_times = np.append(stamps[1:], times[-1] + 1.0)
-    area = np.concatenate([[0.0], np.cumsum(levels * (end_times - stamps))])
+    integral_at_samples = np.concatenate([[0.0], np.cumsum(levels * (end_times - stamps))])
     delayed_times = times - delay
 
-    def integral(t: Array) -> Array:
+    def integrate(t: Array) -> Array:
         """Return the integral of the held input from 0 to t; before 0 it has its first level."""
-        held_integral: Array = np.interp(t, np.append(stamps, end_times[-1]), area)
+        held_integral: Array = np.interp(t, np.append(stamps, end_times[-1]), integral_at_samples)
         return np.where(t < 0, levels[0] * t, held_integral)
 
-    over = integral(delayed_times)
+    input_integral = integrate(delayed_times)
     if lag > 0:
         # x' = (u - x) / lag, so the integral of x is that of u minus lag times the change of x.
-        over = over - lag * _apply_lag(stamps, levels, delayed_times, lag)
-    return np.diff(over) / np.diff(times)
+        input_integral = input_integral - lag * _apply_lag(stamps, levels, delayed_times, lag)
+    return np.diff(input_integral) / np.diff(times)
 
 
 def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> Array:

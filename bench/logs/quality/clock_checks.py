@@ -116,8 +116,8 @@ def _select_timestamps(run: Run) -> Array:
     """Return the sample times of the sensor that was read most often.
 
     The sample times of a run also contain those of commands and of other sensors, which have their
-    own clocks. All sample times are returned if they are at least as regular: the missing samples
-    of the sensor are then empty cells.
+    own clocks. All sample times are returned if they are at least as regular: then the sensors
+    share one clock, and the samples that a sensor lacks are empty cells.
     """
     recorded_masks = [np.isfinite(values) for values in run.channels.values()]
     is_recorded = max(
@@ -165,10 +165,15 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
 
 
 def _count_stale_samples(run: Run) -> tuple[int, float]:
-    """Count samples that repeat the previous one during fast motion.
+    """Count samples that repeat the previous one in every channel although the system moves fast.
+
+    The system moves fast at a sample if some channel changes by many quantisation steps directly
+    before or after it. Such a repetition is rarely a coincidence.
 
     Returns:
-        The count, and its expected value under the null hypothesis.
+        The count, and the count to expect by coincidence, from the noise alone. It is estimated
+        from the samples that change by one step at most: with N channels, each of which changes by
+        -1, 0 or 1 step with equal probability, one in 3^N of them repeats everything.
     """
     signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
     if not signals or run.times.size < 4:
@@ -296,6 +301,10 @@ def _check_gap(run: Run) -> Anomaly | None:
 def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
     """Find a run in which every coordinate moves far more slowly or far faster than expected.
 
+    This finds time stamps in a wrong unit. Each recorded coordinate is compared: its time of motion
+    in the recording with the time that its forces would need. The anomaly is certain (it stops the
+    program) only for motion that is too slow even for a driven system.
+
     All coordinates share the stamps, so a coordinate that moves as expected clears them; another
     one may belong to a link without inertia in the model file.
 
@@ -366,6 +375,8 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
 
     The system is at rest, so drag and friction do not act; D is the number of coordinates.
+    Coordinates that are not recorded are at their default position, inputs that are missing are
+    zero, and parameters are nominal.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -396,10 +407,9 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
 def _estimate_lag(x: Array) -> float:
     """Return the shortest lag in samples after which values differ by their spread (1).
 
-    Returns 0 if the first lag exceeds the spread already, since motion between samples is not
-    recorded.
-
-    It is the smallest T with mean (x(t + T) - x(t))^2 >= var x (1).
+    It is the smallest T with mean (x(t + T) - x(t))^2 >= var x (1). Lags 1, 2, 4, ... are tried,
+    and the last one below T is returned, so that the motion never seems slower than it is. It is 0
+    if values differ as much from one sample to the next.
     """
     variance = float(np.nanvar(x))
     lag, previous_lag = 1, 0
@@ -503,8 +513,9 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
 
     The position is predicted by means of past commands, eq. (1). A drift makes the delay grow with
-    time t, so that the error of the prediction has a part proportional to t times the velocity.
-    Nothing is yielded if the commands explain too little of the motion.
+    time t, so that the error of the prediction has a part proportional to t times the velocity; the
+    drift is its factor, by least squares. Nothing is yielded if the run is short, or the commands
+    explain too little of the motion; otherwise one estimate.
 
     The response to commands is p(t) = c + d t + sum_k h_k <u>_k(t) (1); a delay T that grows by a
     share e of the time gives y(t) = p - (T + e t) p' to first order (2).
@@ -532,9 +543,11 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     predicted = regressors @ coefficients  # Equation (1).
     if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
         return
-    rate = np.gradient(predicted, step)
-    basis, _ = np.linalg.qr(np.column_stack([regressors, rate]))
-    delay_response = -time * rate
+    velocity = np.gradient(predicted, step)
+    # What (1) and a constant delay explain must not count as drift: only the part of the drift's
+    # response that is orthogonal to both determines it.
+    basis, _ = np.linalg.qr(np.column_stack([regressors, velocity]))
+    delay_response = -time * velocity
     delay_response = delay_response - basis @ (basis.T @ delay_response)
     response_power = float(delay_response @ delay_response)
     if not response_power > 0:
@@ -571,10 +584,10 @@ def _average_over_intervals(command: Array) -> Array:
 
 
 def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
-    """Return the weighted mean; scale its error up if estimates scatter more than their errors.
+    """Return the mean, weighted by inverse variances, with an error that admits too much scatter.
 
-    The error is multiplied by the square root of the reduced chi-squared if this is above 1 (Birge
-    ratio).
+    If estimates scatter more than their errors allow, these are too small: the error is multiplied
+    by the ratio of both (the square root of the reduced chi-squared, known as Birge ratio).
 
     Args:
         estimates: Drift and standard error of each run.

@@ -104,7 +104,7 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     # Motion across a gap is no longer close to a polynomial.
     is_gapless = t[:, -1] - t[:, 0] <= _GAP_RATIO * order * np.median(np.diff(times))
     t, y = t[is_gapless], y[is_gapless]
-    # The ones on the diagonal leave out the factor t_i - t_i.
+    # (windows, order + 1, order + 1); ones on the diagonal instead of the factors t_i - t_i = 0.
     time_differences = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
     # Equation (1): a polynomial of lower order becomes zero, white noise keeps its variance.
     weights = 1.0 / time_differences.prod(axis=2)

@@ -53,12 +53,15 @@ def find_contacts(
 def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     """Compute accelerations of a robot at rest in recorded positions under recorded commands.
 
+    They show how fast the robot could move, see `clock_checks`.
+
     Args:
         run: Run with the positions and commands.
         kind: Simulator class of the robot.
 
     Returns:
-        (N, D) accelerations at up to `CHECKED_INSTANTS` times of the run.
+        (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
+        `CHECKED_INSTANTS`.
     """
     joints = [
         joint
@@ -124,8 +127,9 @@ def _select_acting_pairs(
 ) -> list[tuple[int, int]]:
     """Return the pairs of geoms whose contact can act on a recorded joint.
 
-    A force is passed on within a kinematic tree, and from tree to tree at a contact, but not by a
-    body that does not move.
+    A force is passed on within a kinematic tree (bodies connected by joints), and from tree to tree
+    at a contact, but not by a body that does not move. Starting from the recorded trees, further
+    trees are added until none is reached by a contact any more.
 
     Args:
         model: Compiled model (mujoco.MjModel).
@@ -139,10 +143,10 @@ def _select_acting_pairs(
     reached = set(recorded_trees)
     while True:
         acting = [pair for pair, trees in trees_by_pair.items() if trees & reached]
-        larger = reached.union(*(trees_by_pair[pair] for pair in acting))
-        if larger == reached:
+        newly_reached = reached.union(*(trees_by_pair[pair] for pair in acting))
+        if newly_reached == reached:
             return acting
-        reached = larger
+        reached = newly_reached
 
 
 def iterate_poses(
@@ -224,9 +228,11 @@ def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly
 
 
 def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
-    """Find positions far beyond the limits of a joint, which a wrong unit would explain.
+    """Find positions beyond the limits of a joint, which a wrong unit or a wrong limit explains.
 
-    Only the first run with such positions is reported.
+    Far beyond the limits the anomaly is certain (a wrong unit), slightly beyond them it is not (the
+    limit may be wrong), nor for a joint without limits that turns very often. Only the first run
+    with such positions is reported.
 
     Args:
         recording: recording of the robot.
@@ -274,7 +280,7 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     """Find bodies of a robot that overlap in most of the recorded poses.
 
     Contact forces would then act all the time, which is not possible in a real robot: the shapes
-    in the model file are too large.
+    in the model file are too large. A pair counts at most once in a pose, with its deepest contact.
 
     Args:
         recording: Recording to check.
@@ -323,7 +329,8 @@ class _Pair(NamedTuple):
 def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
     """Find servos whose joint moves against the command, or by a factor that a wrong unit explains.
 
-    Exchanged joints are found as well.
+    A joint follows its command if both correlate; then the slope (1) shows the factor. Joints that
+    follow each other's command are found as well, so all commands are compared with all positions.
 
     Args:
         recording: recording of a robot.
@@ -393,10 +400,9 @@ def _has_both(recording: Recording, actuator: Any) -> bool:
 def _compare_position_with_command(recording: Recording, command: str, position: str) -> _Pair:
     """Compute slope and correlation of a position against a command, eq. (1), over all runs.
 
-    The mean of each run is subtracted first.
-
-    With u and q about their means, the slope is b = <u q> / <u^2> and the correlation r = <u q> /
-    sqrt(<u^2> <q^2>) (1).
+    With command u and position q about their means in each run, the slope is b = <u q> / <u^2> and
+    the correlation r = <u q> / sqrt(<u^2> <q^2>) (1). If one of them is constant, the result is
+    that of an inconspicuous servo: slope 1, correlation 0.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -411,7 +417,7 @@ def _compare_position_with_command(recording: Recording, command: str, position:
             squares += _compute_centred_products(u[is_finite], q[is_finite])
     uu, uq, qq = squares
     if min(uu, qq) <= 0 or uq == 0:
-        return _Pair(1.0, 0.0)  # One of the two is constant, so nothing can be concluded.
+        return _Pair(slope=1.0, correlation=0.0)
     return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
 
 
@@ -424,7 +430,8 @@ def _compute_centred_products(u: Array, q: Array) -> Array:
 def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
     """Find floating joints whose initial state is missing in some run.
 
-    Only the first run without the state is reported for each joint.
+    No sensor of a usual log shows where a free body begins, and the fit does not estimate it, so
+    the description must state it. Only the first run without the state is reported for each joint.
 
     Args:
         recording: Recording to check.

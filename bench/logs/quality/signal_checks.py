@@ -84,6 +84,9 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
 def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find channels that are cut off at an end of their range, and commands at their limits.
 
+    A channel is cut off if it jumps to its extreme value and stays there for several samples. A
+    signal that is just at rest there is not.
+
     Args:
         recording: Recording to check.
         kind: Simulator class of its system.
@@ -147,10 +150,10 @@ def _find_saturated_commands(
 
 
 def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
-    """Find coordinates that move in few samples or never.
+    """Find coordinates that move in few samples or never, and so show little of their dynamics.
 
-    A coordinate moves in a window if its range there clearly exceeds the noise and the quantisation
-    step.
+    Each run is divided into windows of `WINDOW_SAMPLES` samples. A coordinate moves in a window if
+    its range there clearly exceeds the noise and the quantisation step.
 
     Args:
         recording: Recording to check.
@@ -215,22 +218,24 @@ def _select_runs(recording: Recording, channel: Channel) -> list[Run]:
 def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> int:
     """Count samples in saturated stretches of at least `MIN_SATURATED_SAMPLES` samples.
 
-    The signal must jump into or out of a stretch: a quantised signal that reverses at its end
-    changes by one step only.
+    In a stretch the signal keeps its extreme value. The signal must jump into or out of it: a
+    quantised signal that reverses at its end changes by one step only, and is not saturated.
 
     Args:
         values: (T,) signal.
         extreme: its smallest or largest value.
         min_jump: smallest change into or out of a saturated stretch, in the unit of the signal.
     """
-    is_at_end = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
-    edges = np.flatnonzero(np.diff(is_at_end))
-    first, last = edges[::2], edges[1::2]
+    is_extreme = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
+    edges = np.flatnonzero(np.diff(is_extreme))
+    # Each stretch is values[begin:end]. With one more value in front, values[begin - 1] is
+    # padded_values[begin], and values[end] is padded_values[end + 1].
+    begin, end = edges[::2], edges[1::2]
     padded_values = np.concatenate([[extreme], values, [extreme]])
     jumps = np.fmax(
-        np.abs(padded_values[first] - extreme), np.abs(padded_values[last + 1] - extreme)
+        np.abs(padded_values[begin] - extreme), np.abs(padded_values[end + 1] - extreme)
     )
-    lengths = last - first
+    lengths = end - begin
     return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > min_jump)].sum())
 
 
@@ -327,12 +332,12 @@ class VelocityDelay(NamedTuple):
 
 
 class VelocityComparison(NamedTuple):
-    """Values of equations (1) and (2) for N intervals of a motion.
+    """Values of equations (1) and (2) for N intervals of a motion, each of several samples.
 
     Attributes:
-        position_changes: (N,) dq.
-        velocity_integrals: (N,) s.
-        velocity_changes: (N,) dv.
+        position_changes: (N,) changes dq of the position.
+        velocity_integrals: (N,) integrals s of the velocity, which should be equal to dq.
+        velocity_changes: (N,) changes dv of the velocity.
         interval: Sampling interval, s.
     """
 
@@ -345,7 +350,8 @@ class VelocityComparison(NamedTuple):
     def measure(runs: Sequence[Run], position: str, rate: str) -> VelocityComparison | None:
         """Compare a velocity with its position, where both have samples.
 
-        The intervals are so long that the position changes well beyond its noise.
+        The runs are divided into intervals so long that the position changes well beyond its noise.
+        Intervals with a gap in time are left out.
 
         Args:
             runs: Runs with both channels.
@@ -362,13 +368,13 @@ class VelocityComparison(NamedTuple):
         if not steps.size or not max(np.abs(part.velocity).max(initial=0.0) for part in series) > 0:
             return None
         interval = float(np.median(steps))
-        moves = np.concatenate([np.diff(part.position) for part in series])
-        usual_move = float(np.sqrt(np.mean(moves**2)))
-        if not usual_move > 0:
+        sample_changes = np.concatenate([np.diff(part.position) for part in series])
+        rms_sample_change = float(np.sqrt(np.mean(sample_changes**2)))
+        if not rms_sample_change > 0:
             return None
         # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
         # vanish.
-        required_length = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual_move)
+        required_length = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / rms_sample_change)
         length = int(np.clip(required_length, MIN_SEGMENT_SAMPLES, 50))
         integrated = [part.integrate(length, MAX_INTERVAL_RATIO * interval) for part in series]
         dq, s, dv = (np.concatenate(rows) for rows in zip(*integrated, strict=True))
@@ -419,7 +425,8 @@ class VelocityComparison(NamedTuple):
         """Return the lag by equation (2), in units of the slope; None if it is not significant.
 
         It is T = -<(s - dq) dv> / <dv^2> (2), with changes dq of position, integrals s of velocity
-        and changes dv of velocity over intervals.
+        and changes dv of velocity over intervals. It is significant if it is several standard
+        errors, and at least a fraction of a sampling interval.
         """
         slope, dv = self.slope, self.velocity_changes
         difference = slope * self.velocity_integrals - self.position_changes
@@ -452,7 +459,10 @@ class _Series(NamedTuple):
         return _Series(run.times[is_recorded], q[is_recorded], v[is_recorded])
 
     def integrate(self, length: int, max_gap: float) -> tuple[Array, Array, Array]:
-        """Return dq, s and dv of intervals of `length` samples; s is NaN across a gap in time.
+        """Return dq, s and dv (see `VelocityComparison`) of intervals of `length` samples.
+
+        The velocity is integrated by the trapezoidal rule; s is NaN across a gap in time. The
+        samples after the last whole interval are not used.
 
         Args:
             length: number of samples of an interval.
@@ -465,6 +475,7 @@ class _Series(NamedTuple):
         if edges.size < 2:
             return np.empty(0), np.empty(0), np.empty(0)
         integrals = np.add.reduceat(areas, edges[:-1])
+        # reduceat sums the last interval to the end of the run, beyond its edge.
         integrals[-1] = areas[edges[-2] : edges[-1]].sum()
         return np.diff(self.position[edges]), integrals, np.diff(self.velocity[edges])
 
