@@ -326,9 +326,16 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     table = pa.Table.from_pandas(suite.runs, preserve_index=False)
     table = table.append_column(_ERRORS_COLUMN, errors)
     with atomic_replacement(folder / CURVES_FILE) as path:
-        # Few errors occur twice, so that a dictionary of them takes more space than it saves.
+        # Few errors occur twice, so that a dictionary of them takes more space than it saves. Each
+        # column is one page, because columns are compressed page by page.
         parquet.write_table(
-            table, path, compression="zstd", compression_level=22, use_dictionary=False
+            table,
+            path,
+            compression="zstd",
+            compression_level=22,
+            use_dictionary=False,
+            use_byte_stream_split=["seconds"],
+            data_page_size=2**26,
         )
     texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
     for name, table_frame in texts.items():
