@@ -208,7 +208,9 @@ def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> 
 
 
 def read_extended(path: Path) -> ExtendedSimulator:
-    """Read and check the file of an extended simulator.
+    """Read and check the file of an extended simulator, a base simulator with fitted effects.
+
+    The base is a registered system, or a robot with its model file.
 
     Raises:
         InputError: The file is missing, malformed, or has another format.

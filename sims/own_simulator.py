@@ -112,7 +112,7 @@ def _ask(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
 
     So a missing quantity is reported before a simulation starts.
     """
-    # Coefficients and states are zero: only the requested quantities matter, not the result.
+    # Coefficients, positions and inputs are zero: only whether they exist matters, not the result.
     ones = np.ones((1, 1))
     d = len(system.coordinates)
     constants = {c.name: c.value * ones for c in system.constants}

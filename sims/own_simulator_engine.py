@@ -333,7 +333,9 @@ class _Forces:
         self._last: tuple[Array, Array, float] | None = None
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
-        """Return the sum (D,) of the effects' forces for the next step.
+        """Return the sum (D,) of the effects' forces for the next step of the user's simulator.
+
+        Friction is added last, since it must know the other forces to hold a resting coordinate.
 
         Shapes: D coordinates.
 
@@ -401,14 +403,17 @@ class _Forces:
 def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[Effect], ...]:
     """Return the effect at each level of a system; empty if it has no levels.
 
+    A level is a state that a user's simulator integrates itself, such as the filling of a tank.
+    With several levels, the effect has one class for each, named after it.
+
     Args:
         effect: Registered effect.
         system: System of a user-defined simulator.
     """
     levels = [channel for channel in system.channels if channel.name in system.levels]
+    has_several_levels = len(levels) > 1
     effects = []
     for channel in levels:
-        has_several_levels = len(levels) > 1
         body = {
             "name": f"{effect.name}@{channel.name}" if has_several_levels else effect.name,
             "of": effect.name,

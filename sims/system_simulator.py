@@ -74,6 +74,9 @@ class SystemSimulator(Simulator):
     ) -> None:
         """Create engine and effects, and append the effects' coefficients to the parameters.
 
+        Effects that are fitted (`effects`) have coefficients that vary between batch elements;
+        those of known effects (`fixed`) are the same in all.
+
         Args:
             constants: Values of `constants` that differ from their defaults.
             observe: Channels to return, in order (default: all).
@@ -131,7 +134,7 @@ class SystemSimulator(Simulator):
         return make_engine(name or self.default_engine, self.system, settings)
 
     def _effect(self, named: str | type[Effect]) -> Effect:
-        """Return an effect by name or class, if the system and the engine support it.
+        """Make an effect from its name or class, if the system and the engine support it.
 
         Raises:
             InputError: the effect is unknown or not supported; the message states the reason.

@@ -117,12 +117,7 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
 
 
 def format_target_count(statistics: ComparisonStatistics, kind: str) -> str:
-    """Format the number of targets of a range: ``10 targets``, or how many of them decide.
-
-    Args:
-        statistics: Statistics of the comparison.
-        kind: Range of the targets.
-    """
+    """Format the number of targets of a range: ``10 targets``, or how many of them decide."""
     count, deciding_counts = (
         statistics.target_counts[kind],
         _select_range(statistics, kind)["targets"],

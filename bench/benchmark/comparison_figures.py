@@ -251,9 +251,6 @@ _LAYOUTS = {
 def list_figure_names(stored: StoredComparison) -> list[str]:
     """List the names of the figures that a comparison's data allow; empty without a run.
 
-    Args:
-        stored: Comparison read from its result folder.
-
     Returns:
         Keys of `FIGURE_FILES`, in its order.
     """

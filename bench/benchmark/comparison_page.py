@@ -253,9 +253,6 @@ def list_failures(view: ComparisonView) -> list[Failure]:
     """List every kind of failure with its first reason, the most frequent one first.
 
     Runs that failed or were skipped are grouped by tuner, status and reason.
-
-    Args:
-        view: Comparison with the status of every run.
     """
     statuses = view.stored.statuses
     failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]

@@ -67,11 +67,6 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     The summary has the best tuners, their median errors, limitations of the comparison, failures
     and running times.
 
-    Args:
-        folder: result folder of the comparison.
-        problem: tuning problem of the comparison.
-        print_line: callback that prints one line.
-
     Returns:
         Number of failed runs.
 
@@ -124,13 +119,7 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
 def _render_figures(
     stored: StoredComparison, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> dict[str, FigureFiles]:
-    """Render all figures that exist for the comparison, by name.
-
-    Args:
-        stored: content of the result folder.
-        labels: axis labels.
-        statistics: statistics of the comparison.
-    """
+    """Render all figures that exist for the comparison, by name."""
     return {
         name: render_all_formats(comparison_figures.draw_figure(stored, labels, name, statistics))
         for name in comparison_figures.list_figure_names(stored)

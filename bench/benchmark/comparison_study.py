@@ -307,9 +307,6 @@ class Comparison(Study):
     def report(self, print_line: PrintLine) -> int:
         """Write tables and figures of the stored runs, and print the results.
 
-        Args:
-            print_line: callback that prints one line.
-
         Returns:
             Number of failed runs.
 

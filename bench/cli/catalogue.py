@@ -152,12 +152,7 @@ def _describe_channels(channels: Iterable[Any]) -> list[JsonDocument]:
 
 
 def _pick(part: Any, *names: str) -> JsonDocument:
-    """Return some attributes of an object by name.
-
-    Args:
-        part: the object.
-        *names: names of its attributes.
-    """
+    """Return some attributes of an object by name."""
     return {name: getattr(part, name) for name in names}
 
 
@@ -307,12 +302,7 @@ def format_catalogue(section: str) -> list[str]:
 
 
 def format_documents(section: str, documents: list[JsonDocument]) -> list[str]:
-    """Format given documents of a section of the catalogue.
-
-    Args:
-        section: Name of the section.
-        documents: Documents of its entries.
-    """
+    """Format given documents of a section of the catalogue."""
     format_entry = _LAID_OUT.get(section, _format_plain_entry)
     return [line for document in documents for line in format_entry(document)]
 
@@ -507,9 +497,6 @@ def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
 
 def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]]:
     """Return the names of effects that can act on a robot, by the kind of their places.
-
-    Args:
-        system: System of a robot.
 
     Returns:
         Effect names by kind of place, such as joint or body.

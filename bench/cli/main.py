@@ -201,13 +201,7 @@ class _Parser(argparse.ArgumentParser):
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
     def refuse_unknown(self, kind: str, name: str, known_names: Iterable[str]) -> NoReturn:
-        """Report an unknown command or option with the most similar known ones.
-
-        Args:
-            kind: What it is, for the message.
-            name: Unknown name.
-            known_names: Known names.
-        """
+        """Report an unknown command or option with the most similar known ones."""
         from difflib import get_close_matches
 
         from sims.core.plain_values import truncate_text

@@ -184,11 +184,7 @@ _FIGURES_FOLDER = "figures"
 
 
 def summarise_study(study: Study) -> JsonDocument:
-    """Summarise a study: name, folder, files, isolation, kind of salt, and results.
-
-    Args:
-        study: Study in its result folder.
-    """
+    """Summarise a study: name, folder, files, isolation, kind of salt, and results."""
     experiment = study.configuration.experiment
     return {
         "name": experiment.name,

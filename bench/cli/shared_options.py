@@ -201,11 +201,7 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_path(text: str) -> Path:
-    """Parse the path of a file or folder, which need not exist.
-
-    Args:
-        text: Word of the command line.
-    """
+    """Parse the path of a file or folder, which need not exist."""
     from sims.core.plain_values import truncate_text
 
     try:

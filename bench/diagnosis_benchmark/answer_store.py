@@ -128,10 +128,6 @@ def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, 
 
     A case is left out if it was not drawn (its stored document has no hidden effects) or if this
     diagnoser has not answered it.
-
-    Args:
-        diagnoser: name of the diagnoser.
-        answers: stored answers by name of the case.
     """
     for question, answer in sorted(answers.items()):
         # The case could not be drawn, or its worker was lost before it was drawn.

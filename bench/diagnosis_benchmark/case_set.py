@@ -216,9 +216,6 @@ def read_config(experiment: Experiment) -> BenchmarkConfig:
     It states the diagnosers, the tables of cases (``questions``), the random seed and the size of a
     sample.
 
-    Args:
-        experiment: Experiment with the table.
-
     Raises:
         InputError: a key or value is not allowed; the message names it and what is allowed.
     """
@@ -373,9 +370,6 @@ def _iterate_combinations(
 
     A list that is empty gives None, which means that the value is drawn at random; effects are then
     all that can be hidden.
-
-    Args:
-        request: the table.
 
     Yields:
         Kind, system, effect, size, and recording conditions.

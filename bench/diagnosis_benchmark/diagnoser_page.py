@@ -220,11 +220,7 @@ def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
 
 
 def _make_board(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against false alarms.
-
-    Args:
-        data: Results of all diagnosers.
-    """
+    """Make the chart of diagnosed single causes against false alarms."""
     x_axis = Axis(
         "false alarms if nothing is hidden [%]",
         "symlog",
@@ -308,11 +304,7 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_cost(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against the cost of an answer.
-
-    Args:
-        data: Results of all diagnosers.
-    """
+    """Make the chart of diagnosed single causes against the cost of an answer."""
     y_axis = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
     labels = {
         "simulations_median": "simulations for an answer, median",

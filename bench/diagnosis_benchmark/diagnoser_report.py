@@ -173,11 +173,6 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
 
     Rows are the families of the hidden causes, columns those of the answers, in per cent of a row.
     Cases with two hidden causes are left out.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-        title: title of the figure.
     """
     graded_rows = select_graded_answers(rows[rows["kind"] != "double"])
     graded_rows = graded_rows.assign(
@@ -341,10 +336,6 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
     """Write tables, figures and HTML report from the answers that exist.
 
     Only cases that every diagnoser has answered are reported.
-
-    Args:
-        study: the study to report.
-        print_line: prints one line.
 
     Returns:
         Number of failed answers.

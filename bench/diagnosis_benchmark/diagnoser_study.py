@@ -234,9 +234,6 @@ class DiagnosisStudy(Study):
     def report(self, print_line: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.
 
-        Args:
-            print_line: prints one line.
-
         Returns:
             Number of failed answers.
         """
@@ -503,10 +500,6 @@ def _register_stub(name: str, trusted: bool) -> None:
 
 def _compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
     """Compute hashes of everything that must not change while the study is incomplete.
-
-    Args:
-        experiment: configuration of the study.
-        plugins: paths of the plugin files.
 
     Returns:
         Hashes by a description for the user.

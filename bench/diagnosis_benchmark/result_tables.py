@@ -181,9 +181,6 @@ def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 def _list_groups(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of groups.csv for one diagnoser: metrics by system, noise, rate and so on.
 
-    Args:
-        diagnoser_rows: rows of the diagnoser.
-
     Yields:
         Metric, column that defines the groups (``by``), its value in this group, and the fraction.
     """
@@ -198,9 +195,6 @@ def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of power.csv: fractions of single effects named and detected, by their size.
 
     All sizes are counted, also those that are too small to be graded.
-
-    Args:
-        diagnoser_rows: rows of one diagnoser.
     """
     for size, part in diagnoser_rows[diagnoser_rows["kind"] == "single"].groupby("size"):
         for metric, successes in (("named", _is_named(part)), ("seen", _is_alarm(part))):
@@ -222,9 +216,6 @@ def _list_set_sizes(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 
     The fraction is that of the answers whose sets contain the true cause. Large sets contain it
     more easily but tell less.
-
-    Args:
-        diagnoser_rows: rows of one diagnoser.
     """
     single_rows = select_single_effects(diagnoser_rows)
     for label, (low, high) in SET_SIZE_BINS.items():

@@ -261,12 +261,7 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
 
 
 def _draw_scene(axis: Axes, track: BallTrack) -> None:
-    """Draw the track on the background with some outlines, on white for dark scenes.
-
-    Args:
-        axis: axes to draw on.
-        track: the tracked ball, with the background.
-    """
+    """Draw the track on the background with some outlines, on white for dark scenes."""
     from matplotlib.patches import Circle
 
     axis.imshow(_overlay_balls(track), interpolation="nearest")

@@ -374,12 +374,7 @@ def apply_settings(settings: Mapping[Any, Any]) -> Iterator[None]:
 
 
 def set_title(axis: Axes, title: str) -> None:
-    """Set a title above a panel that has no ticks there.
-
-    Args:
-        axis: axes of the panel.
-        title: the title.
-    """
+    """Set a title above a panel that has no ticks there."""
     # Without a fixed position, every drawing measures all ticks for the title.
     axis.set_title(title, fontsize=10, y=1.0)
 

@@ -494,12 +494,6 @@ def _refuse_other(
     Both must be of one system (robots: one model file) and have the same channels and inputs, since
     the joined recording is fitted with one simulator.
 
-    Args:
-        first: the first recording.
-        kind: its simulator class.
-        other: the other recording.
-        other_kind: its simulator class.
-
     Raises:
         InputError: System, model file, channels or inputs of the recordings differ.
     """

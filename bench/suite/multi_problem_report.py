@@ -99,11 +99,6 @@ def compare_across_problems(
 ) -> MultiProblemResult:
     """Compute joint statistics of several comparisons, and write tables, figures and a page.
 
-    Args:
-        folders: result folders of the comparisons.
-        out: folder to write to.
-        print_line: callback that prints one line.
-
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
     """

@@ -49,11 +49,7 @@ MAX_PRINTED_RATIO = 1e4
 
 
 def build_headline(tables: SuiteTables) -> str:
-    """Build one sentence that a practitioner can act on.
-
-    Args:
-        tables: tables of the suite.
-    """
+    """Build one sentence that a practitioner can act on."""
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     mean_ranks = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
     untrained = mean_ranks[~mean_ranks.index.isin(tables.get_trained_tuners())]
@@ -105,9 +101,6 @@ def join_segments(segments: Sequence[tuple[str, int]]) -> str:
 
 def build_guide(tables: SuiteTables) -> pd.DataFrame:
     """Build the decision guide: the best method for each kind of problem and budget.
-
-    Args:
-        tables: tables of the suite.
 
     Returns:
         Columns `GUIDE_COLUMNS`: best of all methods, and best of those that need no training.
@@ -239,9 +232,6 @@ def render_suite_page(tables: SuiteTables) -> str:
 
     The page has the ranking of the tuners, significance tests, the guide by property of the
     problem, losses of this project's tuners, and all tables.
-
-    Args:
-        tables: tables of the suite.
     """
     suite = tables.suite
     page = HtmlPage(_STYLESHEET)

@@ -353,12 +353,7 @@ class InputFeatures:
 
     @classmethod
     def fit(cls, data: TrainingData, reading: FeatureConfig) -> InputFeatures:
-        """Choose the inputs from training data.
-
-        Args:
-            data: training data.
-            reading: configuration of the inputs.
-        """
+        """Choose the inputs from training data."""
         data = data._replace(observations=reading.select_channels(data.observations))
         if reading.raw:
             return cls(
@@ -416,9 +411,6 @@ class InputFeatures:
     def compute_rows(self, data: TrainingData) -> Array:
         """Compute the input rows (scenarios, each, D) of training simulations.
 
-        Args:
-            data: Training simulations of all scenarios.
-
         Returns:
             (scenarios, simulations per scenario, D) inputs of the network.
         """
@@ -454,10 +446,6 @@ class InputFeatures:
 
         Arrays named `inputs.*` describe the features of observations, arrays named `told.*` those
         of scenarios.
-
-        Args:
-            state: arrays by name.
-            reading: configuration of the inputs.
 
         Returns:
             The map, and the arrays of other names.

@@ -213,10 +213,6 @@ def check_shapes(
 ) -> dict[str, Array]:
     """Return the arrays in the order of the expected names, after a check of their shapes.
 
-    Args:
-        arrays: arrays by name.
-        expected: shapes by name.
-
     Raises:
         ValueError: arrays have other names or shapes, or numbers that are not finite.
     """

@@ -152,6 +152,8 @@ def _bind_arguments(
 ) -> inspect.BoundArguments:
     """Return the arguments of a call by name, with errors that a user understands.
 
+    Python's own TypeError names neither the expected type nor a similar name.
+
     Args:
         function_name: name of the function in messages.
         signature: its signature.
@@ -258,7 +260,10 @@ def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
 
 
 def _convert_to_type(value: Any, hint: Any, arguments: tuple[Any, ...]) -> Any:
-    """Convert a value to a single type; `_NO_MATCH` if it does not match.
+    """Convert a value to a single type; return `_NO_MATCH` if it does not match.
+
+    Only conversions without loss are made: 1 or NumPy's True is a bool, 2.0 an int, a whole number
+    a float, but no text is a number.
 
     Args:
         value: value of the argument.

@@ -169,6 +169,9 @@ def atomic_replacement(path: Path, *, keep_ending: bool = False) -> Iterator[Pat
 def write_new_files(contents: Mapping[Path, Content]) -> None:
     """Write several new files, all or none; existing files are never overwritten.
 
+    All contents are written to temporary files first, which then get their names. If one name is
+    taken, the files that have theirs already are deleted again.
+
     Raises:
         OSError: A file cannot be written, or exists (`FileExistsError`); its filename says which.
     """

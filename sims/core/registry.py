@@ -82,7 +82,8 @@ class Registry(Generic[T]):
     def get(self, name: str) -> type[T]:
         """Return the class registered as `name`.
 
-        Installed parts are imported here, at their first use.
+        It was registered in this process, by a stub for a plugin that is not imported here, or by
+        an installed package, which is imported now, at its first use.
 
         Raises:
             InputError: The name is unknown.

@@ -235,7 +235,7 @@ class Scenario:
     off: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check times, inputs and switches, and store read-only copies.
+        """Check times, inputs, histories of inputs and switches, and store read-only copies.
 
         Raises:
             InputError: times do not increase, or a signal does not have one value for each of them.

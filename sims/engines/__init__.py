@@ -49,6 +49,9 @@ def missing_packages(name: str) -> list[str]:
 def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
     """Make a new engine for one simulator.
 
+    The module of the engine is imported here, so that a program needs only the packages of the
+    engines that it uses.
+
     Args:
         name: name of the engine in `ENGINE_MODULES`.
         system: system that the engine will integrate.

@@ -220,6 +220,9 @@ def make_augmented_system(
 ) -> type[AugmentedSystem]:
     """Return the system with a hidden coordinate for each of these effects.
 
+    An effect with a memory, such as a load on a spring, has a state that no sensor shows. The
+    integrators treat it as one more coordinate, so they need not know such effects.
+
     Args:
         system: system to extend.
         effects: effect classes with a hidden state.

@@ -124,6 +124,9 @@ def _build_lead_in_steps(
 ) -> tuple[Array, Array, Array]:
     """Build the steps before the runs in which the history of an input is known.
 
+    Effects with a memory, such as delay and lag, begin a run in the state that earlier commands
+    caused, so they are evaluated in these steps, too. Nothing is simulated in them.
+
     Args:
         runs: Scenarios of the batch elements.
         name: Name of the input.
@@ -154,7 +157,11 @@ def _apply_input_effects(
     means: Array,
     start: Array,
 ) -> Array:
-    """Pass the means of the command through the effects on the input.
+    """Pass the means of the command through the effects on the input, one after the other.
+
+    Steps of length zero only fill up rows of batch elements with fewer steps; they repeat the value
+    of the step before them. The first value passes through the effects, too, since it is what the
+    next effect has received before the first step.
 
     Shapes: L batch elements, S steps.
 
@@ -220,6 +227,8 @@ def _average_command(
 ) -> Array:
     """Return the mean of each batch element's signal over each step.
 
+    Between the times of commands, a signal is held or linear; see `Scenario.linear`.
+
     Shapes: L batch elements, S steps.
 
     Args:
@@ -239,9 +248,9 @@ def _average_command(
     count = len(commands) if has_uniform_steps else len(starts)
     averages = np.empty((count, starts.shape[1]))
     # Process all batch elements with the same scenario in one call.
-    order = np.argsort(runs.scenario_index, kind="stable")
-    borders = np.flatnonzero(np.diff(runs.scenario_index[order])) + 1
-    for elements in np.split(order, borders):
+    sorted_elements = np.argsort(runs.scenario_index, kind="stable")
+    borders = np.flatnonzero(np.diff(runs.scenario_index[sorted_elements])) + 1
+    for elements in np.split(sorted_elements, borders):
         run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
         average_signal = (

@@ -95,9 +95,9 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
     """
     # Compare objects first, because comparing the contents of each scenario is slow.
     objects, object_index = group_by_identity(scenarios)
-    by_content: dict[object, int] = {}
+    group_by_content: dict[object, int] = {}
     distinct: list[Scenario] = []
-    groups = []
+    group_by_object = []
     for scenario in objects:
         signals = sorted(scenario.inputs.items())
         input_histories = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
@@ -112,12 +112,12 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
             off_masks,
             *signals_content,
         )
-        group = by_content.setdefault(content, len(distinct))
+        group = group_by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)
-        groups.append(group)
-    index = np.array(groups, dtype=np.intp)[object_index]
-    return ScenarioGroups(tuple(distinct), index, tuple(by_content))
+        group_by_object.append(group)
+    index = np.array(group_by_object, dtype=np.intp)[object_index]
+    return ScenarioGroups(tuple(distinct), index, tuple(group_by_content))
 
 
 def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
@@ -287,12 +287,7 @@ def get_command_times(scenario: Scenario) -> Array:
 
 
 def get_history_times(scenario: Scenario, name: str) -> Array:
-    """Return the times (K,) of an input's known history before the run, s.
-
-    Args:
-        scenario: scenario of the run.
-        name: name of the input.
-    """
+    """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
     history_times: Array = scenario.before[name][0] + scenario.offset

@@ -200,9 +200,7 @@ class RecordingTable:
     ) -> tuple[list[str], dict[str, Array]]:
         """Convert the rows below the header to run names and numeric columns (T,).
 
-        Args:
-            header: names of the columns.
-            records: cells of each row.
+        Rows are converted in blocks, so that the texts of a long table are never all in memory.
         """
         names: list[str] = []
         converted_blocks: list[list[Array]] = []

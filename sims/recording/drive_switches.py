@@ -77,10 +77,6 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
     While a drive is off, for example after an emergency stop, its actuator exerts no force. The
     keys ``enable`` and ``disable`` of an actuator name the column that says when.
 
-    Args:
-        path: Path of the description, for messages.
-        meta: Content of the description.
-
     Raises:
         InputError: A column name is not a text, or a drive has both keys.
     """
@@ -157,6 +153,9 @@ def apply_drive_switches(
     path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]
 ) -> Switched:
     """Add to each run at which samples its drives are off, with notes for the user.
+
+    A drive that is off makes no force, whatever its command is. Drives that are off in the same
+    samples share a note.
 
     Args:
         path: Path of the table, for messages.

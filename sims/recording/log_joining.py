@@ -278,7 +278,8 @@ class _FolderLogs:
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
 
-        Without stamps, they follow from the sampling rate.
+        Without stamps, they follow from the sampling rate, in seconds. Few repeated stamps are
+        tolerated (only the first row of each counts), many mean that the column is no clock.
 
         Args:
             log: log: its columns of numbers by name.

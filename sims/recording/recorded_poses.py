@@ -40,9 +40,6 @@ def find_recorded_bases(channels: Iterable[str]) -> list[str]:
 
     A pose is a position, ``q.BASE.x``, y and z, unless BASE is a ball joint, and a quaternion,
     ``q.BASE.qw``, qx, qy and qz, or the three angles.
-
-    Args:
-        channels: names of the channels.
     """
     names = set(channels)
     found = []

@@ -206,7 +206,9 @@ def read_recording(
 ) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system.
 
-    Channels, inputs, constants and states must be those of the system.
+    Channels, inputs, constants and states must be those of the system. The description decides how
+    the data are stored: a table with the names of the system, a table with other names, or logs of
+    several files that are joined by time.
 
     Args:
         path: Path of the table.
@@ -475,6 +477,8 @@ def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]
 
 def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
     """Split a run into its first two thirds and its last third, which is held out.
+
+    A recording needs data that no fit has seen, to validate the result.
 
     Args:
         path: path of the recording, for messages.

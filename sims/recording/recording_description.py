@@ -190,12 +190,7 @@ def model_in(
 
 
 def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the robot parameters that the description leaves free.
-
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-    """
+    """Return the names of the robot parameters that the description leaves free."""
     free_names = meta.get("free", [])
     if not isinstance(free_names, list) or not all(isinstance(name, str) for name in free_names):
         raise make_error(path, "free", 'names, as ["damping@*"]', free_names)
@@ -406,11 +401,6 @@ def _read_drive_switches(
 def check_run_names(path: Path, marked: Iterable[str], table_names: Iterable[str]) -> None:
     """Check that all runs in the description exist in the table.
 
-    Args:
-        path: Path of the description, for messages.
-        marked: Names of the runs in the description.
-        table_names: Names of the runs in the table.
-
     Raises:
         InputError: The description mentions another run.
     """
@@ -426,12 +416,7 @@ def _check_known_names(
 
 
 def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
-    """Return the name of the system that a description states.
-
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-    """
+    """Return the name of the system that a description states."""
     system = meta.get("system")
     if not isinstance(system, str):
         raise make_error(path, "", 'system = "NAME"', system)
@@ -466,6 +451,10 @@ def _find_orientations(
     path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
 ) -> dict[str, Array]:
     """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
+
+    A motion capture system, for example, records quaternions where the robot has joints; they are
+    converted relative to the orientation in the model file. Bodies without such channels are left
+    out.
 
     Args:
         path: file of the description, for error messages.

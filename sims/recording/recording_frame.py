@@ -50,10 +50,6 @@ class Frame(Protocol):
 def move_index_to_columns(path: Path, frame: Frame) -> Any:
     """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
 
-    Args:
-        path: Name of the frame, for messages.
-        frame: Data frame.
-
     Raises:
         InputError: The name of a column is not a text, or is not unique.
     """
@@ -228,12 +224,7 @@ class _FrameTable(RecordingTable):
         return f"{self.path}.iloc[{record}]"
 
     def read_frame(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
-        """Return the runs of a frame, with columns by the names of the signals.
-
-        Args:
-            frame: Data frame.
-            description: Checked description of the frame.
-        """
+        """Return the runs of a frame, with columns by the names of the signals."""
         sources = description.sources
         places = {
             "t": SignalSource("", (sources.time,)),

@@ -92,6 +92,9 @@ def find_geom(robot: RobotModel, name: str) -> int:
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
     """Return the parameters that MuJoCo gives to a contact of two geoms.
 
+    The geom with the higher priority determines them; with equal priorities, spring, damper and
+    impedance are averaged with the weights `solmix` of the geoms, and the larger friction counts.
+
     Args:
         model: compiled model.
         geoms: numbers of the two geoms.
@@ -105,7 +108,8 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
         mixes = np.ones(len(geom_rows))
     weights = mixes / mixes.sum()
     solref = model.geom_solref[geom_rows]
-    # Stiffness and damping, as negative numbers, are not averaged.
+    # Negative numbers are a stiffness and a damping in place of a time constant and a damping
+    # ratio. MuJoCo does not average them.
     has_direct_form = (solref[:, 0] <= 0).any()
     sliding, torsional, rolling = model.geom_friction[geom_rows].max(axis=0)
     return ContactParameters(
@@ -164,6 +168,9 @@ def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]
 
 def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
     """Add elements `<pair>` to a robot, with the parameters that the contacts have already.
+
+    A pair has its own parameters, so that an effect can change one contact without the others.
+    Pairs refer to geoms by name, so geoms without one get a name.
 
     Args:
         robot: robot, whose elements keep their names and numbers.

@@ -30,6 +30,8 @@ One model has a tendon for each drive that can be coupled; c is zero where none 
 def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
     """Find the preceding joint, in the joint's own body or in the nearest ancestor with joints.
 
+    Joints that effects have added in series with others (`RobotModel.series`) do not count.
+
     Args:
         robot: robot whose joints are meant.
         name: joint.

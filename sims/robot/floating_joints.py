@@ -76,9 +76,6 @@ class FloatingJoints:
 
         These are free joints (three translations and a quaternion) and ball joints (a quaternion).
 
-        Args:
-            robot: Robot with its joints.
-
         Returns:
             The joints with their columns in `qpos` and `qvel`.
         """

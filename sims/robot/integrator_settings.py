@@ -103,12 +103,7 @@ def format_option(name: str, number: float) -> float | str:
 
 
 def parse_option(name: str, value: float | str) -> float:
-    """Return the number of an option in a compiled model; the reverse of `format_option`.
-
-    Args:
-        name: name of the option.
-        value: its number, or its word in a model file.
-    """
+    """Return the number of an option in a compiled model; the reverse of `format_option`."""
     return OPTION_WORDS[name][value] if isinstance(value, str) else value
 
 
@@ -126,10 +121,6 @@ def list_changed_options(
     robot: RobotModel, settings: IntegratorSettings
 ) -> dict[str, tuple[float, float]]:
     """Return the options in which settings differ from the robot's model file.
-
-    Args:
-        robot: robot with the model file.
-        settings: settings in use.
 
     Returns:
         Number in the file and number in use, by the effect that names the option.

@@ -125,7 +125,7 @@ def _make_relative_path(folder: Path, path: Path) -> str:
 
 
 def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotReference:
-    """Read a robot reference from the document of a file.
+    """Read a robot reference (model file, settings and fitted numbers) from a file's document.
 
     Args:
         source: the file; the path of the model file is relative to its folder.
@@ -151,10 +151,6 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
 def _check_friction_form(source: Source, value: Any) -> FrictionForm:
     """Check the value of ``friction_form``.
 
-    Args:
-        source: beginning of error messages.
-        value: the value.
-
     Raises:
         InputError: it is not one of `FRICTION_FORMS`.
     """
@@ -165,12 +161,7 @@ def _check_friction_form(source: Source, value: Any) -> FrictionForm:
 
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
-    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver.
-
-    Args:
-        source: beginning of error messages.
-        value: the table.
-    """
+    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver."""
     from sims.robot.integrator_settings import OPTION_EFFECTS, OPTION_WORDS
 
     settings = check_table(source, "numerics", value)

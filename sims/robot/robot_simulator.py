@@ -674,6 +674,9 @@ class RobotSimulator(SystemSimulator):
     ) -> Array:
         """Compute the recorded observations (n, T, C) of one run, including sensor effects.
 
+        Each channel is interpolated from the steps to its sample times, with the slopes at the
+        steps, after the time shifts of its sensor effects.
+
         Shapes: T samples, C channels.
 
         Args:

@@ -199,6 +199,9 @@ class RobotSystem(System):
     def find_freeable_effects(cls, word: str) -> list[type[Effect]]:
         """Return the effects whose coefficients an entry of ``--free`` refers to.
 
+        Such an entry names a number of the model file that is to be tuned. For all places, it is
+        one number at each place, except for effects that all places share.
+
         Args:
             word: name in MuJoCo's words such as ``damping@elbow``, or effect such as
                 ``drag.linear@elbow``; ``@*`` is every place.

@@ -71,6 +71,8 @@ def build(client: int, constants: Mapping[str, float]) -> int:
 def build_native(client: int, constants: Mapping[str, float], settings: Mapping[str, float]) -> int:
     """Build the published scene of ground plane and ball; return the ball's id.
 
+    Contacts are Bullet's own, with the settings of friction, restitution and damping.
+
     Args:
         client: Bullet client of an empty world.
         constants: constants of the system by name.

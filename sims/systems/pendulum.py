@@ -82,10 +82,6 @@ class PendulumSystem(System):
         axis.
 
         Shapes: L batch elements.
-
-        Args:
-            moment: state snapshot.
-            axis: horizontal axis of the acceleration.
         """
         if axis == "y":
             return np.zeros_like(moment.x)

@@ -23,7 +23,11 @@ _BODY_INERTIA = 1e-14
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """Return the MuJoCo model (MJCF) of the pendulum."""
+    """Return the MuJoCo model (MJCF) of the pendulum, with the gravity torque of its constants.
+
+    Mass times arm is that of the pendulum. The arm is far shorter, so that the body adds hardly any
+    inertia to the armature of the joint, which `load` sets.
+    """
     mass = constants["mass"] * LENGTH_REDUCTION_FACTOR
     arm = constants["length"] / LENGTH_REDUCTION_FACTOR
     inertia = f"{_BODY_INERTIA} {_BODY_INERTIA} {_BODY_INERTIA}"

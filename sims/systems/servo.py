@@ -50,23 +50,23 @@ POINT_MASS_INERTIA = 1e-9
 
 
 def render_model_file(numbers: Mapping[str, float]) -> RenderedModelFile:
-    """Return the model file of the servo with these parameters and constants."""
-    numbers_by_name = numbers
-    stall = (
-        numbers_by_name["torque_constant"]
-        * numbers_by_name["voltage"]
-        / numbers_by_name["resistance"]
-    )
+    """Return the model file of the servo with these parameters and constants.
+
+    MuJoCo has no motor with a voltage. A position actuator with a force range is equivalent: its
+    largest force is the stall torque (the torque at full voltage and standstill), and damping takes
+    the place of the voltage that the motor itself generates.
+    """
+    stall_torque = numbers["torque_constant"] * numbers["voltage"] / numbers["resistance"]
     text = SERVO_MJCF_TEMPLATE.format(
-        down=repr(-numbers_by_name["gravity"]),
-        armature=repr(numbers_by_name["armature"]),
-        damping=repr(numbers_by_name["torque_constant"] ** 2 / numbers_by_name["resistance"]),
-        below=repr(-numbers_by_name["length"]),
-        mass=repr(numbers_by_name["mass"]),
+        down=repr(-numbers["gravity"]),
+        armature=repr(numbers["armature"]),
+        damping=repr(numbers["torque_constant"] ** 2 / numbers["resistance"]),
+        below=repr(-numbers["length"]),
+        mass=repr(numbers["mass"]),
         point=repr(POINT_MASS_INERTIA),
-        kp=repr(stall * numbers_by_name["kp"] * numbers_by_name["error_gain"]),
-        least=repr(-stall),
-        most=repr(stall),
+        kp=repr(stall_torque * numbers["kp"] * numbers["error_gain"]),
+        least=repr(-stall_torque),
+        most=repr(stall_torque),
     )
     assumptions = (
         "damping is the motor's own voltage, kt^2/R, of a driven motor: with torque_enable 0 there "

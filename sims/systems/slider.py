@@ -75,10 +75,6 @@ class SliderSystem(System):
         The guide runs along x and supports forces across it.
 
         Shapes: L batch elements.
-
-        Args:
-            moment: state snapshot.
-            axis: horizontal axis of the acceleration.
         """
         return moment.theta[:, :1] if axis == "x" else np.zeros_like(moment.x)
 

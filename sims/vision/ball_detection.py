@@ -178,9 +178,13 @@ class BallDetector:
     def detect(self, picture: RgbImage, ghosts: bool = False) -> list[BallDetection]:
         """Detect round objects in a picture, the largest first.
 
+        Pixels that differ clearly from the background image are joined to regions, without shadows
+        if `shadows` is set; each region is then measured in detail.
+
         Args:
             picture: Picture (height, width, 3).
-            ghosts: Whether to include objects that only the background image has.
+            ghosts: Whether to include objects that only the background image has, such as a ball
+                that lay there when the background was taken.
         """
         cv2 = import_package("cv2")
         difference = self._compute_largest_difference(picture)
@@ -541,6 +545,8 @@ def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array
 
 def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> Array:
     """Return the median colour (3,) on a circle around a detection, in grey levels.
+
+    It is the colour of the background, against which the contrast of the ball is measured.
 
     Args:
         picture: picture (height, width, 3).

@@ -358,6 +358,9 @@ class BallScene:
     def _draw_ball(self, picture: ColourArray, position: Array) -> None:
         """Blend the ball into the picture, weighted by its coverage of each pixel.
 
+        Only the window of pixels around the ball is rendered, with several rays for each pixel. A
+        ball behind the camera or outside the picture changes nothing.
+
         Args:
             picture: (height, width, 3) linear colours, changed in place.
             position: (3,) centre of the ball in the world, m.

@@ -202,6 +202,9 @@ def _extend_paths(
 ) -> set[int]:
     """Append each detection in a frame to the path that it fits best, nearest pairs first.
 
+    Each path predicts where its object would be; the distance is infinite if a detection cannot be
+    that object.
+
     Args:
         active_paths: Paths that may continue.
         frame: Number of the frame.
@@ -216,13 +219,13 @@ def _extend_paths(
             distance = path.compute_distance(frame, detection)
             if np.isfinite(distance):
                 pairs.append((distance, path_index, detection_index))
-    paths: set[int] = set()
+    extended_paths: set[int] = set()
     used_detections: set[int] = set()
     # Nearest pairs first: a path gets one detection, and a detection one path.
     for _, path_index, detection_index in sorted(pairs):
-        if path_index in paths or detection_index in used_detections:
+        if path_index in extended_paths or detection_index in used_detections:
             continue
-        paths.add(path_index)
+        extended_paths.add(path_index)
         used_detections.add(detection_index)
         active_paths[path_index].append(frame, detections[detection_index])
     return used_detections
@@ -230,6 +233,9 @@ def _extend_paths(
 
 def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list[TrackedPath]]:
     """Merge the first path with those that continue it after it was lost from view.
+
+    A path continues it if it shows a ball of similar size and colour near the same line, in other
+    frames.
 
     Args:
         paths: Paths, the best first.
@@ -634,9 +640,6 @@ def _refine_with_smooth_radius(
     detections: list[BallDetection],
 ) -> tuple[list[BallDetection], list[bool]]:
     """Refit the centres with radii that change linearly along the path, as perspective implies.
-
-    Args:
-        detections: Detections of the ball.
 
     Returns:
         The refitted detections, and whether the radius of each deviates too much from the linear

@@ -221,7 +221,11 @@ class VideoFile:
         return file
 
     def _decode_frames(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
-        """Iterate over time and picture of each frame; the picture is None after an error."""
+        """Iterate over time in seconds and picture of each frame.
+
+        A frame without a stamp gets its time from the frame rate. After a decoding error the last
+        item has the picture None, so that the frames before it are not lost.
+        """
         av = import_package("av")
         stream = file.streams.video[0]
         stream.thread_count = 1

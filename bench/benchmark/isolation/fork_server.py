@@ -66,9 +66,6 @@ def serve_fork_requests(descriptor: int) -> None:
 
     Each request names modules to import, and may ask for a new process, which this process forks.
     The fork becomes a supervisor; this process continues with the next request.
-
-    Args:
-        descriptor: file descriptor of the socket.
     """
     link = socket.socket(fileno=descriptor)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -110,10 +110,6 @@ class MessageChannel:
         """Store the descriptors, and prepare polling.
 
         Polling is needed so that every read and write can have a deadline.
-
-        Args:
-            reading: file descriptor to read from.
-            writing: file descriptor to write to.
         """
         self._reading, self._writing = reading, writing
         self._buffer = bytearray(_MAX_READ_BYTES)

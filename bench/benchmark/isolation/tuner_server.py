@@ -51,11 +51,6 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
 
     First the active isolation layers are reported. An error in the tuner's code is reported and
     ends its run, but not this process.
-
-    Args:
-        channel: message channel to the harness.
-        policy: access policy of this process.
-        active_layers: names of the active isolation layers.
     """
     channel.send_document(b"R", active_layers)
     # NumPy was preloaded, so code that uses its global generator would get the same numbers in each

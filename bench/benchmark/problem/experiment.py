@@ -431,12 +431,7 @@ def check_name(text: str) -> str:
 
 
 def resolve_model_path(model: str, experiment: Path) -> str:
-    """Return the path of a model file, made absolute if the file is next to the experiment file.
-
-    Args:
-        model: path of the model file in the experiment.
-        experiment: path of the experiment file.
-    """
+    """Return the path of a model file, made absolute if the file is next to the experiment file."""
     file = experiment.parent / model
     return str(file.resolve()) if is_existing_file(file) else model
 
@@ -479,11 +474,6 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     """Check the tables of an experiment file and convert them to an experiment.
 
     Relative paths are made absolute, and names of tuners and swept values are checked.
-
-    Args:
-        name: name of the experiment.
-        document: tables of the file.
-        path: experiment file, for messages and for relative paths.
 
     Raises:
         InputError: there is an unknown key or a value of a wrong type; names file and key.

@@ -270,12 +270,6 @@ def check_problem_hash(
 ) -> None:
     """Raise an error if a problem is not the one that belongs to a suite's version.
 
-    Args:
-        suite: name and version of the suite.
-        expected: hashes by name of the suite's problems.
-        name: name of the problem.
-        computed_hash: its hash.
-
     Raises:
         InputError: the hash is another one, or the suite states none.
     """

@@ -109,10 +109,6 @@ def resolve_recording_path(path: str, experiment: Path) -> str:
     """Return a recording's path, made absolute if the file is next to the experiment file.
 
     Workers and result folders do not know the location of the experiment file.
-
-    Args:
-        path: path of the recording in the experiment.
-        experiment: path of the experiment file.
     """
     file = experiment.parent / path
     # The folders of recordings have priority everywhere.

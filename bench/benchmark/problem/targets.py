@@ -133,10 +133,6 @@ def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
 def count_redraws(experiment: Experiment, drawn_targets: Sequence[Target]) -> Redraws:
     """Count the draws of all targets.
 
-    Args:
-        experiment: configuration of the experiment.
-        drawn_targets: all targets.
-
     Raises:
         InputError: more than `MAX_FAILED_SHARE` of the draws diverged.
     """

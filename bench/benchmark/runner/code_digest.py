@@ -110,12 +110,7 @@ def hash_source_folders(which: tuple[str, ...] = ()) -> str:
 
 
 def _read_source_files(folder: Path, root: Path) -> list[tuple[str, bytes]]:
-    """Return relative path and content of each file in a folder, without compiled Python files.
-
-    Args:
-        folder: folder to read.
-        root: folder to which the paths are relative.
-    """
+    """Return relative path and content of each file in a folder, without compiled Python files."""
     files = [
         file
         for file in sorted(folder.rglob("*"))
@@ -265,9 +260,6 @@ def _represent_class(kind: type) -> Any:
     source folders is represented by "", because `hash_source_folders` covers it. For any other
     class, it is the source of the notebook cell, plugin file or package that defines it.
 
-    Args:
-        kind: Class to represent.
-
     Raises:
         InputError: the source of the class cannot be found.
     """
@@ -308,12 +300,7 @@ def _read_class_source(kind: type) -> str:
 
 
 def _read_package_contents(kind: type, path: Path) -> Any:
-    """Return the contents of an installed plugin's package, or of the file with the class.
-
-    Args:
-        kind: class of the plugin.
-        path: file with this class.
-    """
+    """Return the contents of an installed plugin's package, or of the file with the class."""
     top = sys.modules.get(_get_top_level_package(kind))
     if _get_top_level_package(kind) in _list_plugin_packages() and (
         folders := getattr(top, "__path__", None)

@@ -299,12 +299,7 @@ class ClusterPool:
 
 
 def _write_if_absent(path: Path, content: bytes) -> None:
-    """Write a file atomically if it does not exist.
-
-    Args:
-        path: path of the file.
-        content: its bytes.
-    """
+    """Write a file atomically if it does not exist."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)
@@ -388,9 +383,6 @@ def _write_hashed_folder(files: FileContents) -> Path:
     """Write files into a folder of this machine that is named by their hash; return the folder.
 
     Equal files give the same folder, so that each worker writes them only once.
-
-    Args:
-        files: Names and contents of the files.
     """
     hashed = hashlib.sha256()
     for name, content in files:

@@ -175,10 +175,6 @@ def count_seeds(experiment: Experiment, entry: TunerEntry) -> int:
     """Return the number of seeds of an entry.
 
     It is the entry's or the experiment's number, or one if the tuner is deterministic.
-
-    Args:
-        experiment: configuration of the experiment.
-        entry: entry of the tuner.
     """
     kind = tuners.get(entry.tuner)
     if not (kind.stochastic or kind.learned):
@@ -245,11 +241,10 @@ def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     is_main = part.__module__ == "__main__"
-    source = "this session"
-    if file:
-        source = f"the script {Path(file).resolve()}" if is_main else str(Path(file).resolve())
+    place = str(Path(file).resolve()) if file else "this session"
+    source = f"the script {place}" if file and is_main else place
     must_move = is_main or not file
-    plugin = f"{name}.py" if must_move else str(Path(file).resolve())
+    plugin = f"{name}.py" if must_move else place
     move = f"put it into a file of its own, say {plugin}, and " if must_move else ""
     name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
     return InputError(
@@ -294,13 +289,7 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
 def _iterate_planned_runs(
     experiment: Experiment, entries: list[TunerEntry], targets: list[Target]
 ) -> Iterator[PlannedRun]:
-    """Iterate over all runs, target by target, so that the remaining time can be estimated.
-
-    Args:
-        experiment: configuration of the experiment.
-        entries: tuners that can be used.
-        targets: all targets.
-    """
+    """Iterate over all runs, target by target, so that the remaining time can be estimated."""
     name = RunIds(experiment).make_run_id
     for target in targets:
         for entry in entries:

@@ -157,10 +157,6 @@ def _list_extended_names(paths: Iterable[str]) -> set[str]:
 def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> None:
     """Raise an error if a file with a simulator or effect in use also has a tuner in use.
 
-    Args:
-        plugins: plugins in use.
-        experiment: the experiment, with its tuners.
-
     Raises:
         InputError: there is such a file.
     """
@@ -175,10 +171,6 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
     """Make the error for a tuner whose code has been loaded into this process.
 
     Such a tuner could read the true parameters, so its results would prove nothing.
-
-    Args:
-        label: label of the tuner.
-        file: file with its code.
     """
     return InputError(
         f"tuner {label}: the code of {file} runs in this process, which has the true "
@@ -193,10 +185,6 @@ def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugi
 
     If tuners are not trusted, these are the results of their inspection, so that workers do not
     load code of tuners either. A file that was not inspected yet is inspected now.
-
-    Args:
-        paths: plugin files.
-        experiment: configuration of the experiment.
 
     Raises:
         InputError: a file cannot be used.
@@ -219,9 +207,6 @@ def _announce_installed(names: Iterable[str]) -> None:
     """Inspect tuners of other packages before they are imported in this process.
 
     Their code must not run here, so a stub with the properties found is registered in their place.
-
-    Args:
-        names: Registered names of tuners.
     """
     for name in names:
         if is_external_part(name):
@@ -266,10 +251,6 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
 
     A file is loaded if it defines a simulator or effect that is needed. Its names must not be in
     use, which is checked before its code runs.
-
-    Args:
-        paths: plugin files.
-        needed: names of the simulators and effects in use.
 
     Raises:
         InputError: a file cannot be used.
@@ -344,12 +325,7 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
 
 
 def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
-    """Return whether a registered part belongs to another package and is not loaded here.
-
-    Args:
-        name: registered name.
-        registry: registry of the part.
-    """
+    """Return whether a registered part belongs to another package and is not loaded here."""
     entry_point = registry.entry(name)
     is_registered = registry.place(name) is not None or entry_point is None
     return not is_registered and not str(entry_point).startswith(_PROJECT_PACKAGES)

@@ -54,10 +54,6 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
     The hashes are stored with the study. When it is resumed, they are computed again, and a
     difference is reported by its name.
 
-    Args:
-        experiment: configuration of the experiment.
-        plugins: plugin files.
-
     Returns:
         Hashes by readable name.
     """

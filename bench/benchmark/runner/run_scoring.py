@@ -23,12 +23,6 @@ def make_unfinished_outcome(
     """Make the outcome of a run that ended without a trace.
 
     It has no simulations, and its only recommendation is the start.
-
-    Args:
-        problem: tuning problem.
-        target: target of the run.
-        status: status of the run.
-        reason: reason of the status.
     """
     no_values, start = np.empty(0), target.blinded.start[None]
     trace = RunTrace(
@@ -45,13 +39,7 @@ def make_unfinished_outcome(
 
 
 def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) -> RunStatus:
-    """Make the status row of a run.
-
-    Args:
-        problem: tuning problem.
-        order: request of the run.
-        outcome: outcome of the run.
-    """
+    """Make the status row of a run."""
     trace = outcome.trace
     return RunStatus(
         run=order.run,

@@ -50,12 +50,7 @@ class RunnableTuner(Protocol):
     """Tuner that can be run: a `methods.tuner.Tuner`, or one in another process."""
 
     def tune(self, task: Task, rng: np.random.Generator, /) -> TunerRun:
-        """Start a run on a target.
-
-        Args:
-            task: task of the target.
-            rng: random generator of the run.
-        """
+        """Start a run on a target."""
         ...
 
 
@@ -187,12 +182,7 @@ class _RunRecord:
             self._tuner_seconds[-1] = points, seconds + tuner
 
     def trace(self, status: str, reason: str) -> RunTrace:
-        """Return the trace of the ended run.
-
-        Args:
-            status: status of the run.
-            reason: reason of the status.
-        """
+        """Return the trace of the ended run."""
         return RunTrace(
             status,
             reason,

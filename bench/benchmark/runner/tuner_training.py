@@ -283,11 +283,6 @@ def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -
 
     It is the name of the file of the weights, so that weights are reused only by an equal training.
 
-    Args:
-        experiment: configuration of the training.
-        entry: entry of the tuner.
-        seed: seed of the training.
-
     Raises:
         InputError: the source of the tuner or the simulator cannot be found.
     """
@@ -519,10 +514,6 @@ def _train_isolated(
 def _check_weights(request: TrainingRequest, path: Path) -> None:
     """Raise an error if the tuner does not accept the weights.
 
-    Args:
-        request: tuner of the training.
-        path: file of the weights.
-
     Raises:
         WeightsError: the tuner does not accept the weights.
     """
@@ -558,10 +549,6 @@ def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]
 def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
     """Build the tuner of an entry, and load its weights.
 
-    Args:
-        entry: entry of the tuner.
-        path: file of the weights.
-
     Raises:
         WeightsError: the file is missing, damaged, or of another training.
     """
@@ -589,10 +576,6 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
 
     The file has the weights, the cost of the training (two numbers) and its key, which must be
     `name`. Nothing is unpickled.
-
-    Args:
-        path: file of the weights.
-        name: key of the training.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another training than `name`.

@@ -254,9 +254,6 @@ class ComparisonStatistics:
         """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
 
         Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
-
-        Args:
-            level: Error to be reached.
         """
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")
@@ -357,10 +354,6 @@ def _build_break_even_rows(experiment: str, statistics: ComparisonStatistics) ->
     """Build the table of break-even targets for all priced thresholds and ranges.
 
     It says from how many targets on the training of a learned tuner costs less than a search.
-
-    Args:
-        experiment: name of the experiment.
-        statistics: statistics of the comparison, with the costs of the tuners.
     """
     parts = [
         build_break_even_table(experiment, kind, level, by_tuner)

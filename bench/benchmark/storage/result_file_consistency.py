@@ -245,11 +245,6 @@ def _read_identifiability_table(
 
     The file has the directions of the parameter space of each target, in order of number. Targets
     must be those of the experiment, and the directions of a target must be numbered 1, 2, ....
-
-    Args:
-        folder: result folder.
-        experiment: configuration of the experiment.
-        remedy: advice at the end of error messages.
     """
     path = folder / "identifiability.csv"
     if not path.exists():

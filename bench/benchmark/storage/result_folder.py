@@ -141,24 +141,14 @@ def create_folder(
 
 
 def _write_private_file(path: Path, secret: str) -> None:
-    """Write a file that only its owner can read.
-
-    Args:
-        path: path of the file.
-        secret: its content.
-    """
+    """Write a file that only its owner can read."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
         file.write(secret)
 
 
 def write_configuration(folder: Path, experiment: Experiment) -> None:
-    """Write experiment.toml completely or not at all.
-
-    Args:
-        folder: result folder.
-        experiment: configuration to write.
-    """
+    """Write experiment.toml completely or not at all."""
     import tomli_w
 
     write_atomically(
@@ -382,10 +372,6 @@ def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Exper
 
 def read_salt(folder: Path, experiment: Experiment) -> str | None:
     """Read the secret salt of a study to be resumed; None if it is public or revealed.
-
-    Args:
-        folder: Folder of the study.
-        experiment: Its experiment.
 
     Raises:
         InputError: It is missing, or differs from the committed one.

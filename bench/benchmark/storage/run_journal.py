@@ -153,11 +153,6 @@ def check_no_duplicate_runs(
 ) -> None:
     """Reject runs that another file contains already.
 
-    Args:
-        path: Path of the file.
-        plan_indices: Indices of its runs.
-        known_indices: Indices of the runs in other files.
-
     Raises:
         InputError: A run is in both.
     """
@@ -204,9 +199,6 @@ def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunSta
 
     Files are journals of single runs, and parts, into which full journals are converted. Another
     process may do this at the same time, so a journal may disappear, or its runs come twice.
-
-    Args:
-        folder: Result folder of the study.
     """
     # Journals first: a journal that becomes a part in the meantime is then found among the parts.
     for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):
@@ -221,12 +213,7 @@ def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunSta
 
 
 def write_plan(folder: Path, ids: Sequence[str]) -> None:
-    """Write the id of every run, in the order of the plan.
-
-    Args:
-        folder: result folder.
-        ids: ids of all runs.
-    """
+    """Write the id of every run, in the order of the plan."""
     write_atomically(folder / SEGMENTS_FOLDER / PLAN_FILE, "".join(f"{name}\n" for name in ids))
 
 

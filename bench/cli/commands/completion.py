@@ -27,12 +27,7 @@ def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_completion(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Execute `simgap completion`: print the completion script of the named shell.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Execute `simgap completion`: print the completion script of the named shell."""
     from bench.cli.main import build_parser
 
     script = build_completion_script(build_parser(), options.shell)

@@ -39,12 +39,7 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Make a data sheet; explain the logs first unless an explanation is given.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Make a data sheet; explain the logs first unless an explanation is given."""
     from bench.api.datasheet import DatasheetOptions, check_joint_exists, datasheet
     from bench.api.explain import explain
     from bench.cli.progress_display import ProgressDisplay

@@ -79,12 +79,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Explain a recording, write the results, print the text summary.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Explain a recording, write the results, print the text summary."""
     from bench.api.explain import explain
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
     from bench.cli.progress_display import ProgressDisplay
@@ -151,12 +146,7 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
 
 
 def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Explain every recording separately, print each result, then print the overall summary.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Explain every recording separately, print each result, then print the overall summary."""
     from bench.benchmark.runner.plugin_discovery import Plugin
     from bench.benchmark.runner.worker_pools import make_pool
     from bench.benchmark.storage.provenance import (

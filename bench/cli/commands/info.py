@@ -166,12 +166,7 @@ def _read_package_version(package: str) -> str | None:
 
 
 def _find_import_problem(package: str, load: Callable[[], Any]) -> str | None:
-    """Return why a package cannot be used; None if it can.
-
-    Args:
-        package: name of the package, for the advice.
-        load: imports it.
-    """
+    """Return why a package cannot be used; None if it can."""
     try:
         load()
     except ModuleNotFoundError:

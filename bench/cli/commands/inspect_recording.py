@@ -69,10 +69,6 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     ``--fix`` it writes a corrected description, with ``--check`` it says which parameters the data
     determine.
 
-    Args:
-        options: parsed arguments of the command.
-        print_line: prints one line of text.
-
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if the data do not
         determine a parameter that should be fitted.
@@ -216,10 +212,6 @@ def _print_identifiability(
 
     The numbers are those that the user named with ``--free``, then the coefficients of the possible
     causes. The same is returned as JSON documents.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
     """
     from bench.diagnosis.identifiability import format_identifiability
     from bench.diagnosis.recording_check import check_identifiability

@@ -72,12 +72,7 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 
 
 def _run_schema(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Execute `simgap schema`: print the JSON schema of a document that simgap writes.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Execute `simgap schema`: print the JSON schema of a document that simgap writes."""
     from bench.schemas import load_schema
 
     schema = load_schema(options.name)

@@ -31,12 +31,7 @@ def add_score_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Print a model's error on a recording.
-
-    Args:
-        options: parsed command line.
-        print_line: prints one line of text.
-    """
+    """Print a model's error on a recording."""
     from bench.api.explain import score
     from bench.core.plugin_registries import load_plugins
 

@@ -24,10 +24,6 @@ from sims.core.simulator import InputError
 def parse_key_values(option: str, texts: Sequence[str]) -> dict[str, str]:
     """Parse NAME=VALUE texts.
 
-    Args:
-        option: Name of the option, for error messages.
-        texts: Arguments of the option.
-
     Returns:
         Values by name.
 
@@ -48,11 +44,6 @@ def parse_key_values(option: str, texts: Sequence[str]) -> dict[str, str]:
 def parse_number(option: str, name: str, text: str) -> float:
     """Parse a finite number.
 
-    Args:
-        option: Name of the option, for error messages.
-        name: Name of the value, for error messages.
-        text: Text of the number.
-
     Raises:
         InputError: The text is not a finite number.
     """
@@ -66,12 +57,7 @@ def parse_number(option: str, name: str, text: str) -> float:
 
 
 def parse_key_numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
-    """Parse NAME=NUMBER texts.
-
-    Args:
-        option: Name of the option, for error messages.
-        texts: Arguments of the option.
-    """
+    """Parse NAME=NUMBER texts."""
     return {
         name: parse_number(option, name, text)
         for name, text in parse_key_values(option, texts).items()
@@ -263,10 +249,6 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
     """Execute `simgap simulate`: simulate a recording, and write it with its true parameters.
 
     The true parameters are in a separate file, so that the recording can be explained without them.
-
-    Args:
-        options: parsed arguments of the command.
-        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).

@@ -40,11 +40,7 @@ class BaseMotion:
     """Scales of the motion without hidden causes, from which shapes are drawn."""
 
     def __init__(self, setting: RecordingConditions) -> None:
-        """Keep the conditions; the motion is simulated when a scale of it is needed.
-
-        Args:
-            setting: recording conditions.
-        """
+        """Keep the conditions; the motion is simulated when a scale of it is needed."""
         self.setting, self.system = setting, setting.system
         self.rate, self.seconds, self.scenarios = setting.rate, setting.seconds, setting.scenarios
 
@@ -525,11 +521,6 @@ def draw_unmodelled_cause(
     name: str, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw the shape of an unmodelled cause; see `case_generation.reference_simulation`.
-
-    Args:
-        name: name of the cause.
-        setting: recording conditions.
-        rng: random generator.
 
     Returns:
         Numbers of the cause as a function of the strength.

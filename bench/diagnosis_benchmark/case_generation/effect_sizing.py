@@ -220,10 +220,6 @@ def simulate_observations(setting: RecordingConditions, effects: EffectCoefficie
     """Simulate noise-free observations (R, T, C) with given effects.
 
     Shapes: R runs, T samples, C channels.
-
-    Args:
-        setting: recording conditions.
-        effects: coefficients by name of the effect.
     """
     kind = SIMULATORS[setting.system]
     fixed_effects = {name: list(c) for name, c in effects.items()}

@@ -122,9 +122,6 @@ def guess_role(column: LogColumn) -> Role | None:
     Words for a command come first: ``position_command`` is a command. Then the quantity of the
     column's unit decides, such as "torque" for N*m, and then other words of the names.
 
-    Args:
-        column: Column of a log, with name, unit and file.
-
     Returns:
         Command, position, velocity, force or other; None if nothing indicates a role.
     """

@@ -287,10 +287,6 @@ def describe_logs(
 def write_checked_description(path: Path, text: str) -> None:
     """Write a description and read the recording; delete the description if that fails.
 
-    Args:
-        path: Path of the description.
-        text: Its content.
-
     Raises:
         InputError: It cannot be written, or read.
     """

@@ -122,12 +122,7 @@ def find_position_conversion(
 
 
 def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
-    """Return whether a log is from LeRobot: an episode, or a table with its column names.
-
-    Args:
-        log: Path of the log.
-        columns: Names of its columns.
-    """
+    """Return whether a log is from LeRobot: an episode, or a table with its column names."""
     names = ("observation.state", "observation/state")
     return split_episode_path(log) is not None or any(
         column.startswith(names) for column in columns
@@ -171,12 +166,7 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
 
 
 def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool:
-    """Return whether a description's runs are episodes of a dataset.
-
-    Args:
-        description: path of the description.
-        meta: its content.
-    """
+    """Return whether a description's runs are episodes of a dataset."""
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
     folders = [table.get("folder") for table in tables if isinstance(table, dict)]

@@ -144,9 +144,6 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
     """Find samples that repeat the previous one in every channel although the system moves.
 
     Such samples were not measured anew, and look like a delay.
-
-    Args:
-        recording: Recording of a moving system.
     """
     repeated_count, sample_count, runs = 0, 0, []
     for run in recording.runs:

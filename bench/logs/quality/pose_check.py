@@ -55,10 +55,6 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
 
     They show how fast the robot could move, see `clock_checks`.
 
-    Args:
-        run: Run with the positions and commands.
-        kind: Simulator class of the robot.
-
     Returns:
         (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
         `CHECKED_INSTANTS`.
@@ -81,10 +77,6 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
 
     Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
     joint, such as those of an object that rests on a table next to the robot, are left out.
-
-    Args:
-        recording: Recording of the robot.
-        kind: Simulator class of the robot.
 
     Returns:
         Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
@@ -210,10 +202,6 @@ _SMALLER_UNITS = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
 
 def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
     """Find implausible positions of a robot; none for other systems.
-
-    Args:
-        recording: Recording to check.
-        kind: Simulator class of its system.
 
     Returns:
         Anomalies of joint ranges and of servos.

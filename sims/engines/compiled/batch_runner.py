@@ -130,9 +130,6 @@ def _integrate_group(
         """Integrate one thread's part of the elements, with buffers of its own.
 
         The number of slots is at most the number of elements, rounded up to whole SIMD vectors.
-
-        Args:
-            part: Elements of one thread.
         """
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
         # Elements in closed form are integrated one after the other.

@@ -84,7 +84,9 @@ class PreparedProgram(NamedTuple):
     def make_runners(self) -> tuple[Callable[[], None], ...]:
         """Return functions that run the parts of the program on all slots.
 
-        The parts are the values of each element, the forces, and the contact parameters.
+        The parts are the values of each element, the forces, and the contact parameters. If NumPy
+        evaluates some forces, compiled code cannot raise their exceptions; they are raised after
+        each part.
         """
         part_ends, r = self.arrays.ends.tolist(), self.block.r
         runners = [
@@ -281,12 +283,7 @@ class SystemTracer:
         )
 
     def _broadcast_result(self, values: Any, shape: tuple[int, int]) -> TracedArray:
-        """Return the result of an array function, broadcast to its expected shape.
-
-        Args:
-            values: traced array, or numbers.
-            shape: expected shape.
-        """
+        """Return the result of an array function, broadcast to its expected shape."""
         if not isinstance(values, TracedArray):
             values = TracedArray(self.graph, make_constant_nodes(self.graph, values))
         return TracedArray(self.graph, np.broadcast_to(values.nodes, shape))
@@ -573,6 +570,8 @@ def _evaluate_program(
     program: ForceProgram | NumpyForceProgram, parameters: Array, states: Sequence[Array]
 ) -> list[Array]:
     """Evaluate a program at some states and two impact speeds, to compare it with NumPy.
+
+    The states are written into the registers of the program, and the results read from there.
 
     Args:
         program: traced program, or the program that evaluates with NumPy.

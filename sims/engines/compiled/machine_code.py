@@ -187,12 +187,7 @@ def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[],
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file atomically, with the hash of its content.
-
-    Args:
-        path: path of the file.
-        content: its bytes.
-    """
+    """Write a file atomically, with the hash of its content."""
     # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
     partial = path.with_suffix(".part")
     try:

@@ -105,12 +105,7 @@ class ExpressionGraph:
 
 
 def _compute_constant(operation: str, values: list[float]) -> float:
-    """Apply an operation to constants, with NumPy's result for overflow and division by zero.
-
-    Args:
-        operation: name of the operation.
-        values: its arguments.
-    """
+    """Apply an operation to constants, with NumPy's result for overflow and division by zero."""
     with np.errstate(all="ignore"):
         if operation == "where":
             return values[1] if values[0] else values[2]

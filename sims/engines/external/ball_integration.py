@@ -150,9 +150,8 @@ class BallWithImpacts(BallBody, Protocol):
 def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     """Integrate one batch element, a ball, with impacts at their exact times.
 
-    Args:
-        ball: ball in an engine.
-        element: batch element to integrate.
+    The run is divided into legs, in which step size and inputs are constant, so that the engine
+    makes many steps in one call. A ball that diverges ends the integration early.
 
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
@@ -279,8 +278,8 @@ class BallRollout:
     def advance_with_impacts(self, remaining: float) -> None:
         """Advance by a step that contains impacts.
 
-        The engine flies to each impact in a step of its own, the impact is computed, and
-        the rest of the step follows.
+        The engine flies to each impact in a step of its own, the impact is computed, and the rest
+        of the step follows, which may contain further impacts. A resting ball has none.
 
         Args:
             remaining: length of the step in seconds.
@@ -302,9 +301,6 @@ class BallRollout:
         """Set the engine's step, and its state if necessary; return the engine's velocity.
 
         The engine's velocity belongs to half a step before the position, so it depends on the step.
-
-        Args:
-            step: Step in s.
         """
         # The velocity half a step earlier depends on the step size.
         if step != self.step:
@@ -476,10 +472,6 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
 
     The smooth acceleration is g + f - k v (1 + |v|), with the effects' force f per unit mass and
     the engine's air damping k (6).
-
-    Args:
-        ball: ball in an engine.
-        element: batch element to integrate.
 
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.

@@ -295,6 +295,8 @@ def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
 def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, list[int]]]:
     """Split the steps into legs in which neither the step size nor any signal changes.
 
+    Within a leg, an engine can make all steps to the next recorded state in one call.
+
     Shapes: S steps.
 
     Args:
@@ -313,15 +315,15 @@ def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, li
     # The engine is stopped at the beginning of each leg and where a state is recorded.
     stops = is_new_leg.copy()
     stops[element.recorded_steps[element.recorded_steps < size]] = True
-    leg_starts = np.flatnonzero(stops)
-    counts = np.diff(leg_starts, append=size).tolist()
-    firsts = is_new_leg[leg_starts].tolist()
-    result: list[tuple[int, list[int]]] = []
-    for leg_start, count, first in zip(leg_starts.tolist(), counts, firsts, strict=True):
-        if first:
-            result.append((leg_start, []))
-        result[-1][1].append(count)
-    return result
+    stop_steps = np.flatnonzero(stops)
+    counts = np.diff(stop_steps, append=size).tolist()
+    begins_leg = is_new_leg[stop_steps].tolist()
+    legs: list[tuple[int, list[int]]] = []
+    for first_step, count, is_first in zip(stop_steps.tolist(), counts, begins_leg, strict=True):
+        if is_first:
+            legs.append((first_step, []))
+        legs[-1][1].append(count)
+    return legs
 
 
 def resolve_time_step(time_step: float | None, system: type[System]) -> float:

@@ -118,10 +118,6 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
     If the drive depends on the inputs alone and the other forces equal a linear damping, the
     engine runs on its own while the inputs are constant; otherwise forces are set in each step.
 
-    Args:
-        joint: body in an engine.
-        element: batch element to integrate.
-
     Returns:
         The trajectory; NaN if the engine cannot represent the element.
     """

@@ -54,6 +54,9 @@ def make_engine(
 ) -> Engine:
     """Make the MuJoCo engine for one simulator.
 
+    By default impacts are computed exactly, not by MuJoCo; settings that apply to its own contact
+    only are refused without it.
+
     Args:
         system: system that the engine will integrate.
         time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is

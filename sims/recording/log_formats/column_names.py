@@ -32,7 +32,9 @@ def name_numbered_columns(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the numbered columns of a table by the columns that hold their names.
 
-    Names are looked up in each row, because some loggers change their order.
+    ROS logs, for example, have columns ``name[0]``, ``name[1]``, ... with names of joints and
+    ``position[0]``, ``position[1]``, ... with numbers. Names are looked up in each row, because
+    some loggers change their order.
 
     Args:
         columns: Numbers (T,) by column name.
@@ -151,13 +153,16 @@ def _group_numbered_columns(
 def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
     """Sort numbers into columns by name, looking up the names in each row.
 
+    Texts that differ in most rows are not names; then nothing is sorted.
+
     Args:
         values: Numbers (T, k).
         names: Names (k, T), one for each number in each row.
         prefix: Beginning of the names of the new columns.
 
     Returns:
-        Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice.
+        Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice, or if
+        there are far more names than columns.
     """
     distinct_names = list(dict.fromkeys(name for column in names for name in column if name))
     if not distinct_names or len(distinct_names) > 4 * len(names):
@@ -272,9 +277,6 @@ def split_unit(name: str) -> NamedUnit:
 
     A unit may be in brackets (`q [rad]`), after a joiner (`q_rad_s`) or in camel case
     (`speedRadS`).
-
-    Args:
-        name: Name of a column.
 
     Returns:
         The name without its unit; the whole name without a unit if none is found.

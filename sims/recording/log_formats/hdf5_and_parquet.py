@@ -40,22 +40,13 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
 
 
 def make_unreadable_error(path: Path, error: Exception) -> InputError:
-    """Make the error for a file that pyarrow cannot read.
-
-    Args:
-        path: path of the file.
-        error: error of pyarrow.
-    """
+    """Make the error for a file that pyarrow cannot read."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return InputError(f"{path}: not a Parquet file: {reason[:300]}")
 
 
 def is_numeric_type(kind: Any) -> bool:
-    """Return whether columns of a pyarrow type hold numbers, times or lists of them.
-
-    Args:
-        kind: Data type of pyarrow.
-    """
+    """Return whether columns of a pyarrow type hold numbers, times or lists of them."""
     import pyarrow
 
     if _is_list(kind):

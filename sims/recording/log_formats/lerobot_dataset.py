@@ -88,7 +88,9 @@ def list_episode_files(dataset: Path, episode: int) -> list[Path]:
 
 
 def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[str]]:
-    """Read an episode of a dataset.
+    """Read an episode of a dataset: its rows in all files that have some, without images.
+
+    Columns of lists whose entries the dataset names become a column for each entry.
 
     Args:
         dataset: Folder of the dataset.
@@ -261,10 +263,6 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
 
 def motor_of(column: str, motors: Iterable[str]) -> str | None:
     """Return the motor whose name is part of a column's name; the longest one if several match.
-
-    Args:
-        column: Name of the column.
-        motors: Names of the motors.
 
     Returns:
         The name of the motor; None if none matches.

@@ -79,9 +79,6 @@ def find_layout(path: Path) -> Layout:
     The separator is detected first, then the first row of numbers. The header is the last row above
     it that can be names; a row of units may lie in between. Without a header, columns are numbered.
 
-    Args:
-        path: Text file of a table.
-
     Raises:
         InputError: The table has no rows, or its header has another number of cells than its rows.
     """
@@ -493,6 +490,9 @@ def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputErro
 def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
     """Make the error for the first row with a wrong number of cells; None if all rows are even.
 
+    Empty cells at the end of a row do not count. The message distinguishes an open quotation mark,
+    a log that ends within a row, and any other row.
+
     Args:
         path: path of the file.
         layout: layout of the table.
@@ -727,7 +727,7 @@ class _CellKind:
         return np.where(stamps.isna().to_numpy(), np.nan, nanoseconds * 1e-9)
 
     def _convert_lists(self, path: Path, layout: Layout, name: str) -> Array:
-        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k).
+        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k): T cells with k numbers each.
 
         Args:
             path: path of the file, for messages.

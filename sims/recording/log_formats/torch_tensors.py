@@ -79,12 +79,7 @@ class _TensorUnpickler(pickle._Unpickler):
     """
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the substitute for a class or function that the pickle program names.
-
-        Args:
-            module: module of the class.
-            name: name of the class.
-        """
+        """Return the substitute for a class or function that the pickle program names."""
         if module == "torch" and name.endswith("Storage"):
             return name
         return _KNOWN_NAMES.get(f"{module}.{name}", _UnknownObject)
@@ -167,6 +162,9 @@ def _read_tensors(
 
 def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
     """Flatten nested containers to named entries; lists of numbers and texts stay whole.
+
+    The name of an entry is its path, such as ``episode/0/action``. Containers nested deeper than
+    `MAX_DEPTH` stay whole, too.
 
     Args:
         name: name of the container, the beginning of the names of its entries.

@@ -140,10 +140,6 @@ def _extend_to_steps(values: NDArray[Number], steps: int) -> NDArray[Number]:
 def group_by_run(runs: ScenarioGroups, batch_indices: IndexArray) -> list[tuple[int, IndexArray]]:
     """Group consecutive batch elements by their runs.
 
-    Args:
-        runs: runs of all batch elements.
-        batch_indices: indices of the batch elements.
-
     Returns:
         For each group, the number of the run and the indices of its batch elements.
     """

@@ -91,10 +91,6 @@ class _Tracing:
         as an expression graph. The two states are at the beginning of a step, and at its middle,
         which is predicted (midpoint rule). Time, states and inputs change in each step; the servo
         stiffness is constant for a batch element.
-
-        Args:
-            system: system of the robot.
-            inputs: names of the inputs.
         """
         graph = ExpressionGraph()
         joints = len(system.coordinates)
@@ -317,11 +313,7 @@ class CompiledForces:
         }
 
     def begin(self, joint_states: JointStates) -> None:
-        """Set the hidden states at the beginning of a motion.
-
-        Args:
-            joint_states: joint states at the beginning.
-        """
+        """Set the hidden states at the beginning of a motion."""
         hidden = self._source.hidden
         if not hidden:
             return

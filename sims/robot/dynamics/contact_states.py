@@ -88,6 +88,9 @@ class _ContactModel:
     ) -> None:
         """Prepare MuJoCo's model and data with the effects and the inputs of the run's beginning.
 
+        The contacts that MuJoCo then finds in the initial pose are those of the run. A large gap
+        (`SEARCH_GAP`) makes it report geoms that only nearly touch, too.
+
         Args:
             simulator: simulator of the robot.
             theta: (P,) parameters, of which effects have their coefficients.

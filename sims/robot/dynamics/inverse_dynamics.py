@@ -32,7 +32,9 @@ def motion_forces(
     controls: Array,
     activations: Array | None = None,
 ) -> MotionForces:
-    """Compute the joint forces of a motion by inverse dynamics.
+    """Compute the joint forces of a motion by inverse dynamics, and those of the actuators.
+
+    The difference of both is what the model lacks. The motion is given, so nothing is integrated.
 
     Joints that are not in `joints` rest in the reference pose of the model.
 
@@ -167,9 +169,6 @@ def coefficient_scales(robot: RobotModel) -> JointScales:
 
 def compute_floating_forces(robot: RobotModel) -> Array:
     """Compute the typical force of each degree of freedom of floating bodies, in N or N m.
-
-    Args:
-        robot: robot with floating bodies.
 
     Returns:
         (F,) forces for the acceleration `TYPICAL_ACCELERATION`.

@@ -290,9 +290,6 @@ class MeasuredLinear(RunLinearisation):
 
         Shapes: T samples, C channels.
 
-        Args:
-            similar: the other model.
-
         Returns:
             Changes of d in (3), (T - 1, Z), and of h(x̄) in (4), (T, C).
         """
@@ -532,6 +529,9 @@ def compute_transmission_loads(
     simulator: RobotSimulator, acting: ActiveEffects, motion: RobotMotion
 ) -> Array:
     """Compute the loads (2, S, D) of the transmissions in a motion.
+
+    The two kinds of load are the forces `TRANSMISSION_FORCE_FIELDS` of MuJoCo, on which friction of
+    a transmission depends.
 
     Shapes: S steps, D joints.
 

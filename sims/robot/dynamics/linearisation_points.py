@@ -478,7 +478,8 @@ class LinearisationPoints:
     def compute_mass_matrices(self) -> Array:
         """Compute the inertia matrix (N, E, E) at each point, by MuJoCo's composite-body algorithm.
 
-        The E rows are those of the joints and of the floating bodies.
+        The E rows are those of the joints and of the floating bodies. The active effects may change
+        masses, so they are written into the model first.
         """
         import mujoco
 

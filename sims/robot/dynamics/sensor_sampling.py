@@ -90,6 +90,8 @@ def apply_effects_to_readings(
 ) -> Array:
     """Apply sensor effects that act on each sample alone, without filters and time shifts.
 
+    An effect is evaluated only for the batch elements in which it is active.
+
     Shapes: L batch elements, T samples.
 
     Args:

@@ -334,6 +334,9 @@ class TangentModel:
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the changes by an effect's force, one for each joint that it acts on.
 
+        A force within a drive changes what the sensors of the drives read, too; this is one more
+        perturbation.
+
         Shapes: K coefficients.
 
         Args:

@@ -433,9 +433,6 @@ class _Actuator:
         """Add a constant force in N or N m to the force that the actuator computes.
 
         In MuJoCo the force is gain * control + bias; the constant is the first bias parameter.
-
-        Args:
-            force: Force that is added.
         """
         import mujoco
 

@@ -124,10 +124,6 @@ class XmlText:
         """Add an element to the tree at its start tag (called by the parser).
 
         Until its end tag is parsed, `inside` and `end` are the end of the start tag.
-
-        Args:
-            name: name of the element.
-            attributes: its attributes.
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._end_of(tag.begin)
@@ -228,9 +224,7 @@ class XmlText:
     def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
         """Return the text of the elements inserted before all children.
 
-        Args:
-            tag: the element with its new children.
-            indent: indentation of the element.
+        Each comment and each element gets a line with the indentation of the other children.
         """
         child_indent = (
             self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
@@ -247,6 +241,8 @@ class XmlText:
 
     def _render_start_tag(self, tag: XmlElement) -> bytes:
         """Return the changed start tag; unchanged attributes keep their spaces and quotes.
+
+        Attributes are copied, replaced or left out in their order; new ones follow at the end.
 
         Args:
             tag: element with its new and removed attributes, and where it stands in the text.

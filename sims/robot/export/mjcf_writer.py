@@ -164,10 +164,6 @@ class MjcfWriter:
 
         The attribute springdamper would override stiffness and damping, so it is set to
         zero with them.
-
-        Args:
-            tag: element of the joint in the document.
-            statement: values to write.
         """
         values = format_attributes(statement.values)
         hinge = tag.get_attribute("type") in (None, "hinge")
@@ -216,12 +212,7 @@ class MjcfWriter:
 
 
 def _is_needed(name: str, values: tuple[float, ...]) -> bool:
-    """Return whether ``general`` must specify an attribute that a shortcut implies.
-
-    Args:
-        name: name of the attribute.
-        values: its values.
-    """
+    """Return whether ``general`` must specify an attribute that a shortcut implies."""
     if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
         return True
     return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)

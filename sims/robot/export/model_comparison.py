@@ -62,7 +62,8 @@ def _load_library() -> Any:
 def find_first_difference(first_model: Any, second_model: Any, tolerance: float) -> str | None:
     """Find the first field in which two compiled models differ.
 
-    It compares all numeric fields and options. Names and other texts are ignored.
+    This shows that a written model file describes the same robot. All numeric fields and options
+    are compared; names and other texts are ignored.
 
     Args:
         first_model: a mujoco.MjModel.

@@ -75,12 +75,7 @@ def check_written_files(
 
 
 def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
-    """Compile a written MJCF, and check that it equals the intended model.
-
-    Args:
-        written_files: the written files, with the intended model.
-        path: path of the MJCF.
-    """
+    """Compile a written MJCF, and check that it equals the intended model."""
     import mujoco
 
     with capture_mujoco_warnings():
@@ -97,11 +92,6 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     2. Load the written URDF.
     3. Compare fields, inertia tensors and a test motion. Contacts and friction stiffness, which a
        URDF cannot state, are left out.
-
-    Args:
-        robot: model of the robot as read from its URDF.
-        causes: coefficients of all causes.
-        path: path of the written URDF.
 
     Raises:
         RuntimeError: fields, inertia tensors or the motion differ.

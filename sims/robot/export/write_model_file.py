@@ -116,9 +116,6 @@ def render_with_added_elements(applied: ModifiedModel) -> bytes:
     coupled drives, and pairs of geoms with contact parameters of their own. Their numbers are
     written afterwards. Without any of them, the text is unchanged.
 
-    Args:
-        applied: model with the causes applied.
-
     Raises:
         NotEditableError: the text does not contain a required joint, actuator or geom.
     """
@@ -184,6 +181,8 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
 
 def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
     """Write the elements `<pair>` of a robot that the text lacks.
+
+    A pair states the parameters of one contact; it refers to its geoms by their names.
 
     Args:
         document: the MJCF, changed in place.

@@ -177,11 +177,6 @@ class CollisionShapes:
         """Read the data from the model with the whole meshes.
 
         They are rounded differently in a model that is compiled from hulls.
-
-        Args:
-            model: compiled model with the whole meshes.
-            hulls: hulls by name of the mesh.
-            geoms: numbers of the geoms in that model, by geom name.
         """
         fields = {
             name: {field: getattr(model, field)[i].copy() for field in DOUBLE_PRECISION_GEOM_FIELDS}

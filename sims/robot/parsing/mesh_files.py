@@ -40,9 +40,6 @@ class MeshLookup:
     def find(self, name: str) -> tuple[str | None, str]:
         """Find the file of a mesh of a URDF, whose URI often names a ROS package.
 
-        Args:
-            name: file name or URI in the URDF.
-
         Returns:
             The path relative to the model file's folder and an empty text, or None and the reason
             why the mesh cannot be used.

@@ -175,10 +175,6 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     It must have a joint, its time step must be in the allowed range, and masses, inertias, places
     and forces of its joints must be finite and not huge. The message names the first wrong value.
 
-    Args:
-        files: reader of the files of the model, for messages.
-        model: compiled model.
-
     Raises:
         InputError: nothing moves, the time step is out of range, or a number is huge or not finite.
     """

@@ -233,10 +233,6 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     remove repeated elements; repair inertials; remove shapes without a file, meaningless limits,
     and relations between joints (mimics) that MuJoCo cannot represent.
 
-    Args:
-        files: reader of the model file.
-        root: root element of the URDF.
-
     Returns:
         Notes, one line for each kind of repair or omission.
 
@@ -444,10 +440,6 @@ def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
     """Raise an error for wrong MuJoCo settings in a URDF, which MuJoCo would ignore there.
 
     Each setting is parsed alone as an MJCF, in which MuJoCo reports unknown names.
-
-    Args:
-        files: reader of the files of the model.
-        root: root element of the URDF.
     """
     import mujoco
 

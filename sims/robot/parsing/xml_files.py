@@ -103,10 +103,6 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
     file declares. So a parser is used whose calls for each tag build the tree, note the line of
     every element for messages, and refuse declarations.
 
-    Args:
-        files: reader of the model.
-        path: path of the file.
-
     Raises:
         InputError: the file cannot be read, is too large or is not XML, or it declares something
             that an XML parser would fetch or repeat (a document type, an entity).
@@ -165,12 +161,7 @@ class _LineTrackingTreeBuilder:
         return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
-        """Add an element to the tree at its start tag, and store its file and line for messages.
-
-        Args:
-            name: name of the element.
-            attributes: its attributes.
-        """
+        """Add an element to the tree at its start tag, and store its file and line for messages."""
         element = Element(name, attributes)
         self.files.places[element] = self.here
         if self.open:
@@ -204,10 +195,6 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
 
 def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
     """Return the children of an element, with include elements replaced by the included children.
-
-    Args:
-        files: reader of the files of the model.
-        parent: the element.
 
     Raises:
         InputError: an included file is not stated, absent, or included twice.

@@ -32,10 +32,6 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     that contains the geoms and sites of the link and the joints of its child links. A link without
     any is assumed to be as long as its distance from its parent.
 
-    Args:
-        robot: model of the robot.
-        body: name of the body.
-
     Returns:
         (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
         axes of the body's frame.
@@ -126,10 +122,6 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     to that direction is omitted; offsets along the two others give every possible motion. A body
     that only slides has no observable axis. A floating body, or one that turns about several
     directions, has three.
-
-    Args:
-        robot: robot with the body.
-        body: name of the body.
 
     Returns:
         Observable axes, 0, 1, 2 for x, y, z.

@@ -165,6 +165,9 @@ def make_shared_effects(
 ) -> Iterator[type[Effect]]:
     """Yield the class of an effect that all drives share, if they are of one kind.
 
+    Drives with a common supply, for example, lose force together when any of them needs much. At
+    most one class is yielded; none for fewer than two driven joints.
+
     Args:
         effect: registered effect.
         drives: places of the actuators.

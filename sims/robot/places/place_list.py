@@ -274,10 +274,6 @@ def has_radius(robot: RobotModel, geom: int) -> bool:
 def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
     """Make the place of a geom with a radius.
 
-    Args:
-        robot: robot with the geom.
-        name: name of the geom.
-
     Raises:
         InputError: there is no such geom, or it has no radius.
     """
