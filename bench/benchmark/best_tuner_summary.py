@@ -117,19 +117,17 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
 
 
 def format_target_count(statistics: ComparisonStatistics, kind: str) -> str:
-    """Format the number of targets of a range: ``10 targets``, or how many of them decide."""
-    count, deciding_counts = (
-        statistics.target_counts[kind],
-        _select_range(statistics, kind)["targets"],
-    )
+    """Format the number of targets of a range: ``10 targets``, or how many of them decide.
+
+    A target decides between tuners if its data determine at least one direction of the parameters.
+    """
+    count = statistics.target_counts[kind]
+    deciding_counts = _select_range(statistics, kind)["targets"]
     deciding_count = int(deciding_counts.max()) if len(deciding_counts) else 0
     unit = ("starting point" if kind == "real" else "target") + ("" if count == 1 else "s")
-    # Targets whose data identify no direction have no deciding error.
-    return (
-        f"{count} {unit}"
-        if deciding_count == count
-        else f"{deciding_count} of {count} {unit} decide"
-    )
+    if deciding_count == count:
+        return f"{count} {unit}"
+    return f"{deciding_count} of {count} {unit} decide"
 
 
 def format_error_floor(statistics: ComparisonStatistics) -> str:
@@ -172,10 +170,8 @@ def warn_about_target_count(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    ranked, comparison_count = (
-        _select_range(statistics, kind)["targets"],
-        _count_tested_tuners(statistics, kind),
-    )
+    ranked = _select_range(statistics, kind)["targets"]
+    comparison_count = _count_tested_tuners(statistics, kind)
     if not comparison_count or int(ranked.max()) >= (
         required_targets := compute_min_targets(comparison_count)
     ):

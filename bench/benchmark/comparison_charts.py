@@ -396,10 +396,8 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     Returns:
         The chart, with a thinned table `seconds`.
     """
-    x_axis, y_axis = (
-        Axis("seconds per simulation", "log"),
-        Axis("seconds per target", "log"),
-    )
+    x_axis = Axis("seconds per simulation", "log")
+    y_axis = Axis("seconds per target", "log")
     tables, panels = [], []
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]

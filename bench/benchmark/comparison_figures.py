@@ -157,6 +157,8 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     """Draw the shares of the parameters in each direction, as a grid of numbers.
 
+    Directions are combinations of parameters that the data determine more or less well.
+
     Args:
         axis: axes to draw on.
         table: one row for each target and direction: column ``direction``, and the unit vector in

@@ -136,10 +136,8 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
         view: comparison with its statistics, experiment and styles of tuners.
         kind: range of the targets.
     """
-    rankings, title = (
-        best_tuner_summary.rank_at_checkpoints(view.statistics, kind),
-        _format_title(view, kind),
-    )
+    rankings = best_tuner_summary.rank_at_checkpoints(view.statistics, kind)
+    title = _format_title(view, kind)
     if not rankings:
         return f"{title}: the errors on the targets do not decide."
     last_ranking = rankings[-1]

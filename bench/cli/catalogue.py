@@ -265,7 +265,7 @@ def list_schemas() -> list[JsonDocument]:
 def _describe_part(
     registry: Any, name: str, describe_kind: Callable[[Any], JsonDocument]
 ) -> JsonDocument:
-    """Describe a registered part, or why it cannot be used here.
+    """Describe a registered part (such as a tuner), or why it cannot be used here.
 
     `describe_kind` returns the properties that only parts of this kind have, from the class.
     """

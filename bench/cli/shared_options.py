@@ -18,6 +18,9 @@ def add_options(
 ) -> None:
     """Add the options of a command that an options dataclass declares; see `bench.core.options`.
 
+    So options of the command line and arguments in Python are declared once. The annotation of a
+    field decides how a value is parsed, and its entry in the class docstring is the help.
+
     Fields of a type that has no parser here exist in Python only.
 
     Args:

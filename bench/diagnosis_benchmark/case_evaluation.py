@@ -184,11 +184,9 @@ def _format_failure_reason(text: str) -> str:
         text: reason of the failure, mostly a traceback. If the budget was exceeded, it contains the
             name of that exception, and gets `BUDGET_EXCEEDED_REASON` as its first line.
     """
-    return (
-        f"{BUDGET_EXCEEDED_REASON}\n{text}"
-        if "sims.core.simulation_counter.SimulationBudgetExceededError" in text
-        else text
-    )
+    if "sims.core.simulation_counter.SimulationBudgetExceededError" in text:
+        return f"{BUDGET_EXCEEDED_REASON}\n{text}"
+    return text
 
 
 def _diagnose_in_process(

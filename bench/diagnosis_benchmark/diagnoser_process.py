@@ -165,10 +165,8 @@ def diagnose_case(
     try:
         answer = Answer.of(diagnoser.diagnose(case))
     finally:
-        used_simulations, processor_seconds = (
-            SIMULATION_COUNTER.used,
-            time.process_time() - started_at,
-        )
+        used_simulations = SIMULATION_COUNTER.used
+        processor_seconds = time.process_time() - started_at
         SIMULATION_COUNTER.reset()
     return {
         "answer": answer.document(),

@@ -448,11 +448,11 @@ def make_diagnoser_spec(name: str) -> TunerSpec:
     file = str(place) if place else ""
     module_spec = importlib.util.find_spec(module) if module.startswith("bench.") else None
     # Without preloading, packages that a diagnoser imports would be imported again for each answer.
-    preloaded = (
-        find_preloadable_packages(file or (module_spec.origin or "" if module_spec else ""))
-        if file or module_spec
-        else ()
-    )
+    preloaded: tuple[str, ...] = ()
+    if file:
+        preloaded = find_preloadable_packages(file)
+    elif module_spec:
+        preloaded = find_preloadable_packages(module_spec.origin or "")
     return TunerSpec(name, module, file, {}, preloaded)
 
 

@@ -328,11 +328,9 @@ def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
     """
     from scipy.stats import binomtest
 
-    return (
-        float(binomtest(first_only, first_only + second_only).pvalue)
-        if first_only + second_only
-        else 1.0
-    )
+    if first_only + second_only:
+        return float(binomtest(first_only, first_only + second_only).pvalue)
+    return 1.0
 
 
 def index_by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, TableRow]:

@@ -235,9 +235,9 @@ def _find_motion_plane_normal(robot: RobotModel, data: Any) -> Array | None:
 
 
 def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
-    """Compute the corners of bounding boxes of moving and of static shapes.
+    """Compute the corners of bounding boxes of moving and of static shapes, to frame the robot.
 
-    Centres of mass represent bodies without shapes.
+    Floors are left out, since they are endless. Centres of mass represent bodies without shapes.
 
     Args:
         model: mujoco.MjModel.

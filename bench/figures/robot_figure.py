@@ -356,6 +356,8 @@ def _make_labels(
 ) -> list[_Label]:
     """Make a label for each marked place, and for the other joints if the robot has few.
 
+    Several marks of one place share a label, with a line for each.
+
     Args:
         robot: model of the robot.
         data: state at the pose (`mujoco.MjData`), from which places are located.
@@ -629,8 +631,6 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
         int(mujoco.mjtObj.mjOBJ_BODY): data.xipos,
         int(mujoco.mjtObj.mjOBJ_XBODY): data.xpos,
     }
-    return (
-        np.array(positions_by_type[object_type][object_id])
-        if object_type in positions_by_type
-        else None
-    )
+    if object_type in positions_by_type:
+        return np.array(positions_by_type[object_type][object_id])
+    return None

@@ -393,7 +393,7 @@ def finish_figure(
     caption: str = MEDIAN_LINE_CAPTION,
     heading: str = "best over all targets first",
 ) -> None:
-    """Add legend, title and caption to a figure.
+    """Add legend, title and caption to a figure; references are listed below the tuners.
 
     Args:
         figure: Figure of Matplotlib.

@@ -133,10 +133,8 @@ def track_film(
     recording = _build_recording(track, heights, noise, kept_frames, video)
     write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, extra_files=figure_contents)
 
-    count, frames = (
-        int(np.isfinite(heights.z[kept_frames]).sum()),
-        kept_frames.stop - kept_frames.start,
-    )
+    count = int(np.isfinite(heights.z[kept_frames]).sum())
+    frames = kept_frames.stop - kept_frames.start
     lines = (
         f"{out}: {count} of {frames} frames with the ball, z in metres {heights.method}",
         f"noise of one sample: {track.noise:.2g} px, {1e3 * noise:.2g} mm",

@@ -325,11 +325,9 @@ def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
         raise InputError(
             f"expected a system (see `simgap list systems`) or a model, found {found_text}"
         )
-    return (
-        simulators.get(options.system)
-        if options.model is None
-        else make_robot_simulator(options.model, options.actuators or {})
-    )
+    if options.model is None:
+        return simulators.get(options.system)
+    return make_robot_simulator(options.model, options.actuators or {})
 
 
 def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
@@ -340,11 +338,9 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
     if not issubclass(kind, SystemSimulator):
         return DefaultRecording()
     default_recording = kind.system.usual_recording
-    return (
-        default_recording
-        if kind.name == kind.system.name
-        else replace(default_recording, observe=())
-    )
+    if kind.name == kind.system.name:
+        return default_recording
+    return replace(default_recording, observe=())
 
 
 def _count_held_out_runs(options: SimulationSpec) -> int:

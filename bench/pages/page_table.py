@@ -238,7 +238,7 @@ def draw_intervals(
     band: tuple[float, float] | None = None,
     distance: int = 14,
 ) -> IntervalDrawing | None:
-    """Arrange intervals on one scale, which ends with the outermost of them.
+    """Arrange intervals on one scale, which ends with the outermost of them, for a drawing in SVG.
 
     Args:
         intervals: Class of the style sheet, estimate, lower and upper end of each.

@@ -121,11 +121,9 @@ def format_p_value(p: float | None) -> str:
     if p is None or not isfinite(p):
         return "p unknown"
     # In such an extreme tail the exact number has no meaning.
-    return (
-        f"p < {format_number(_MIN_WRITTEN_P_VALUE, 1)}"
-        if p < _MIN_WRITTEN_P_VALUE
-        else f"p = {format_number(p, 2)}"
-    )
+    if p < _MIN_WRITTEN_P_VALUE:
+        return f"p < {format_number(_MIN_WRITTEN_P_VALUE, 1)}"
+    return f"p = {format_number(p, 2)}"
 
 
 def _get_exponent(size: float) -> int:

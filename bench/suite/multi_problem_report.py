@@ -300,6 +300,8 @@ class ComparisonCollection:
 def _compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:
     """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
 
+    Problems have different budgets, so shares of it make them comparable.
+
     Args:
         curves: errors of all runs of one comparison.
         thresholds: thresholds of the runtime distribution.

@@ -129,7 +129,7 @@ def build_guide(tables: SuiteTables) -> pd.DataFrame:
 
 
 def describe_tests(tables: SuiteTables) -> Iterator[str]:
-    """Describe at each checkpoint from which methods the best one differs significantly.
+    """Describe from which methods the best one differs significantly.
 
     Args:
         tables: Statistics of the suite.
@@ -448,6 +448,8 @@ _MAX_PRINTED_TUNERS = 30
 
 def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
     """Write and print the results of a suite, together with the stored runs of other methods.
+
+    If `folder` has comparisons, their runs are stored in it, too.
 
     Args:
         folder: folder of the suite, with one subfolder per problem or with stored runs.

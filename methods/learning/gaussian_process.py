@@ -57,7 +57,7 @@ class GaussianProcess:
         hyper: Array | None = None,
         fit: bool = True,
     ) -> None:
-        """Condition the process on simulated values.
+        """Condition the process on simulated values, and fit its length scales and noise.
 
         Args:
             points: (n, dim) points of the unit cube.

@@ -89,7 +89,7 @@ class HistoryTransformerDesign:
 def get_weight_shapes(
     inputs: int, dim: int, design: HistoryTransformerDesign
 ) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every weight array by name.
+    """Return the shape of every weight array by name, from which saved weights are checked.
 
     Args:
         inputs: length of an input row.

@@ -353,7 +353,7 @@ class InputFeatures:
 
     @classmethod
     def fit(cls, data: TrainingData, reading: FeatureConfig) -> InputFeatures:
-        """Choose the inputs from training data."""
+        """Choose the inputs from training data: samples, or weighted sums that show parameters."""
         data = data._replace(observations=reading.select_channels(data.observations))
         if reading.raw:
             return cls(

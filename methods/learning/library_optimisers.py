@@ -92,7 +92,7 @@ def minimise_with_nlopt(
 def tune_with_optuna(
     make_sampler: Callable[[int], Any], task: Task, rng: np.random.Generator
 ) -> TunerGenerator:
-    """Propose the points of an Optuna study, the task's start first.
+    """Propose the points of an Optuna study, the task's start first, and tell it each loss.
 
     Args:
         make_sampler: makes the sampler from a seed.

@@ -35,6 +35,8 @@ _MIN_DIVISOR = 1e-300
 def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
     """Resample every run to the same number of points by linear interpolation, without gaps.
 
+    A network needs inputs of one size, but runs differ in length and lack samples.
+
     Args:
         observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
             samples.

@@ -55,6 +55,8 @@ class BayesianOptimisation(Tuner):
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Propose one point at a time; the first one is the start.
 
+        A failed simulation counts as the worst loss so far.
+
         Args:
             task: start, observations, number of parameters and budget of the run.
             rng: random numbers of the run.

@@ -169,7 +169,9 @@ class TuneNetLeastSquares(TuneNet):
     def _choose_secants(
         self, steps: Array, finite: Mask, smallest: float
     ) -> tuple[list[int], list[Array]]:
-        """Choose secants among steps from the best point.
+        """Choose secants, steps to earlier points from which derivatives follow at no further cost.
+
+        They must be short and point in different directions; the shortest are preferred.
 
         Args:
             steps: (n, dim) steps from the best point.

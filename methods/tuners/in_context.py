@@ -223,11 +223,9 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
             rng: random numbers of the training.
         """
         window = min(self.window, each - 1)
-        return (
-            make_ordered_histories(each, window)
-            if self.published
-            else make_shuffled_histories(rng, each, window)
-        )
+        if self.published:
+            return make_ordered_histories(each, window)
+        return make_shuffled_histories(rng, each, window)
 
     def restore_network(self, arrays: dict[str, Array]) -> TrainedHistoryNetwork:
         """Restore one network from its arrays; see `TrainedHistoryNetwork.from_arrays`."""

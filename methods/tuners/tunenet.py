@@ -204,7 +204,7 @@ class BroydenSearch:
         self.best = task.start
 
     def propose_next(self, point: Array, residual: Array) -> Array:
-        """Compute the next guess.
+        """Compute the next guess from the best point so far, its residual and the residuals' slope.
 
         Args:
             point: (dim,) simulated point.

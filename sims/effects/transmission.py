@@ -198,11 +198,9 @@ class JointFlexibility(DrivenLoad):
 
     name, noun = "joint.flexibility", "a flexible transmission"
     says = "the load is connected to the drive by a spring, and oscillates"
-    source, coefficients, between = (
-        _SPONG_1987,
-        _LOAD_SPRING_COEFFICIENTS,
-        _SERIES_SPRING_COEFFICIENTS,
-    )
+    source = _SPONG_1987
+    coefficients = _LOAD_SPRING_COEFFICIENTS
+    between = _SERIES_SPRING_COEFFICIENTS
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the spring.
@@ -244,11 +242,9 @@ class JointBacklash(DrivenLoad):
 
     name, noun = "joint.backlash", "backlash in the transmission"
     says = "there is backlash between the drive and its load"
-    source, coefficients, between = (
-        _NORDIN_2002,
-        _LOAD_BACKLASH_COEFFICIENTS,
-        _SERIES_BACKLASH_COEFFICIENTS,
-    )
+    source = _NORDIN_2002
+    coefficients = _LOAD_BACKLASH_COEFFICIENTS
+    between = _SERIES_BACKLASH_COEFFICIENTS
     share, fastest = 1, CONTACT_FREQUENCY
 
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:

@@ -204,11 +204,9 @@ def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]
         timestep: time step h in seconds.
         integrator: MuJoCo's number of the integrator.
     """
-    return (
-        (SOLREF_PLACEHOLDER_STIFFNESS, -MAX_RK4_FRICTION_RATE / timestep)
-        if integrator == RK4_INTEGRATOR_ID
-        else (2.0 * timestep, 1.0)
-    )
+    if integrator == RK4_INTEGRATOR_ID:
+        return (SOLREF_PLACEHOLDER_STIFFNESS, -MAX_RK4_FRICTION_RATE / timestep)
+    return (2.0 * timestep, 1.0)
 
 
 def get_friction_solref_of_batch(fields: Fields, robot: RobotModel) -> tuple[float, float]:
@@ -256,10 +254,8 @@ def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
     model = robot.compiled
     solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
     if robot.friction_form == "stiff":
-        solref, solimp = (
-            get_friction_solref(float(model.opt.timestep), int(model.opt.integrator)),
-            FRICTION_SOLIMP,
-        )
+        solref = get_friction_solref(float(model.opt.timestep), int(model.opt.integrator))
+        solimp = FRICTION_SOLIMP
     timeconst, ratio = (float(value) for value in solref)
     limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     (at_rest, largest), width = limits.tolist(), float(solimp[2])

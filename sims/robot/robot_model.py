@@ -297,8 +297,10 @@ class RobotModel:
             motion = self.joint(joint).motion
         elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
             kinds = {self.joint(name).motion for name in moved_joints}
-            # A spatial tendon has a length, and no joints of its own.
-            motion = kinds.pop() if len(kinds) == 1 else None if kinds else "slide"
+            if not kinds:
+                motion = "slide"  # a spatial tendon has a length, and no joints of its own
+            elif len(kinds) == 1:
+                motion = kinds.pop()
         elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE):
             motion = "slide" if model.actuator_gear[i, :3].any() else "hinge"
         return Actuator(
@@ -508,11 +510,9 @@ def filters() -> tuple[int, int]:
 def _list_axis_suffixes(count: int) -> list[str]:
     """Return name endings for the numbers of a sensor: axes, quaternion entries, or indices."""
     suffixes_by_count = {3: "xyz", 4: "wxyz"}
-    return (
-        list(suffixes_by_count[count])
-        if count in suffixes_by_count
-        else [str(k) for k in range(count)]
-    )
+    if count in suffixes_by_count:
+        return list(suffixes_by_count[count])
+    return [str(k) for k in range(count)]
 
 
 _UNITS: Mapping[int, str] = {

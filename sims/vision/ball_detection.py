@@ -209,11 +209,9 @@ class BallDetector:
             detection = self._measure_object(contours[i], (brightness, difference), shadow_mask)
             if detection is not None:
                 detections.append(self._add_colour(detection, picture))
-        return (
-            detections
-            if ghosts
-            else [detection for detection in detections if not detection.is_ghost]
-        )
+        if ghosts:
+            return detections
+        return [detection for detection in detections if not detection.is_ghost]
 
     def _add_colour(self, detection: BallDetection, picture: RgbImage) -> BallDetection:
         """Add to a detection its colour, its contrast, and whether it is a background artefact.

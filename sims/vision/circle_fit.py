@@ -51,13 +51,11 @@ _INLIER_SHARE = 0.1
 def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
     """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
 
-    A point at the distance d from the centre has the residual d - R, which is to first order
-    n . (du, dv) + dR with the direction n from the centre to the point (2). The normal equations
-    are solved explicitly, because the call of numpy's solver would take most of the time.
-
     With the distance d of a point from the centre, the residual is d - R (1). Each iteration solves
-    residual = n . (du, dv) + dR by weighted least squares (2), with Tukey's weights (1 - (residual
-    / width)^2)^2, zero beyond the width (3).
+    residual = n . (du, dv) + dR, with the direction n from the centre to the point, by weighted
+    least squares (2), with Tukey's weights (1 - (residual / width)^2)^2, zero beyond the width (3).
+    The normal equations are solved explicitly, because the call of numpy's solver would take most
+    of the time.
 
     Args:
         points: Points (n, 2), pixels.

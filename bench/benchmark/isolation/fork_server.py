@@ -140,6 +140,8 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
 def _wait_for_child(child: int, control: int) -> int:
     """Wait for the end of a process, and kill it when the client closes the control socket.
 
+    The process is watched through a descriptor of its end, or else asked for it regularly.
+
     Args:
         child: id of the process.
         control: descriptor of the control socket.

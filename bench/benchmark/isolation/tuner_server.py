@@ -142,7 +142,7 @@ def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | No
 
 
 def load_class(description: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
-    """Load the class of a tuner or of another plugin.
+    """Import the file or module of a tuner or another plugin, and find its class by its name.
 
     Args:
         description: ``name`` of the class, and its ``file`` or ``module``.

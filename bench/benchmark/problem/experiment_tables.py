@@ -123,7 +123,9 @@ Each one has its own folder, and all are checked before the first run.
 def expand_documents(
     path: Path, document: Mapping[str, Any], swept: Mapping[str, Sequence[Any]]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Iterate over all combinations of the values; those of the last key change fastest.
+    """Expand a sweep: yield the tables of an experiment for each combination of the swept values.
+
+    The values of the last key change fastest.
 
     Args:
         path: experiment file, for messages.

@@ -31,7 +31,10 @@ PACKAGE_SCHEME = "package://"
 
 
 def get_simulator_class(experiment: Experiment) -> type[Simulator]:
-    """Return the class of the simulator that an experiment tunes.
+    """Return the class of the simulator that an experiment tunes, registered or of a model file.
+
+    Of a robot, the recording may state actuators, engine and numbers to tune; the experiment's own
+    entries precede them.
 
     Raises:
         InputError: there is no simulator of that name, or its model file cannot be used.

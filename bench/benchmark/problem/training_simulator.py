@@ -262,11 +262,9 @@ class RandomisedSimulator:
 def _get_effect_name(name: str) -> str:
     """Return a coefficient's effect: the coefficient's name, or its part before the last dot."""
     effect_name, prefix = name.partition("@")[0], name.rpartition(".")[0]
-    return (
-        prefix
-        if effect_name not in library.list_names() and prefix in library.list_names()
-        else name
-    )
+    if effect_name not in library.list_names() and prefix in library.list_names():
+        return prefix
+    return name
 
 
 def _order_bounds(

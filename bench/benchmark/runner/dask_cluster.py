@@ -130,7 +130,9 @@ class ClusterPool:
             )
 
     def _hash_workers(self) -> dict[str, Any]:
-        """Return hashes of code and package versions by worker.
+        """Return hashes of code and package versions by worker, which must equal those here.
+
+        Lost workers are left out; if one is lost during the call, it is repeated a few times.
 
         Raises:
             Exception: a worker failed to compute them.

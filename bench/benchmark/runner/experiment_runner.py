@@ -394,10 +394,8 @@ def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -
         results: the comparison; the spectra are added to it.
         progress: makes a progress bar from a title and the number of steps.
     """
-    problem, targets = (
-        results.problem,
-        {job.target.blinded.name: job.target for job in results.plan},
-    )
+    problem = results.problem
+    targets = {job.target.blinded.name: job.target for job in results.plan}
     if not problem.has_several_parameters:
         return
     step = progress("identifiability", len(targets))

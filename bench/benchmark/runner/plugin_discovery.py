@@ -410,6 +410,9 @@ def serve_inspection(
 ) -> None:
     """Answer one question about a plugin; runs in the isolated process.
 
+    To answer, it must import the plugin, whose code is not trusted. After the answer it waits until
+    the harness ends it.
+
     Args:
         channel: channel to the harness.
         _policy: access policy; not used.

@@ -20,7 +20,7 @@ from bench.benchmark.storage.run_status import RunStatus
 def make_unfinished_outcome(
     problem: TuningProblem, target: Target, status: str, reason: str
 ) -> RunOutcome:
-    """Make the outcome of a run that ended without a trace.
+    """Make the outcome of a run that ended without a trace, as if its process was killed.
 
     It has no simulations, and its only recommendation is the start.
     """

@@ -455,8 +455,6 @@ class ProposalEvaluator:
         return errors
 
     def _stack_evaluated_rows(self) -> Array:
-        return (
-            np.concatenate(self._evaluated_squares)
-            if self._evaluated_squares
-            else np.empty((0, len(self._mean_factors)))
-        )
+        if self._evaluated_squares:
+            return np.concatenate(self._evaluated_squares)
+        return np.empty((0, len(self._mean_factors)))

@@ -290,10 +290,8 @@ def build_error_table(
                 curve, tuner_rows, points, (str(tuner), str(kind), metric)
             )
             for point_index, simulations in enumerate(points):
-                errors, times = (
-                    values[:, point_index],
-                    (seconds[0][point_index], seconds[1][point_index]),
-                )
+                errors = values[:, point_index]
+                times = (seconds[0][point_index], seconds[1][point_index])
                 key = (experiment, tuner, kind, simulations, metric)
                 lines.append((*key, *errors, *counts, *fit, *times))
     # A tuner that could not be used has a row too, so that the table names every tuner.

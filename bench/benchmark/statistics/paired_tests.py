@@ -59,7 +59,7 @@ def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERR
 
 
 def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
-    """Compare every pair of tuners on the targets of each experiment and range.
+    """Compare every pair of tuners by a paired test on the targets of each experiment and range.
 
     Args:
         curves: error of every run.

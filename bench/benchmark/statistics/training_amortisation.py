@@ -255,11 +255,9 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
                 tables.append(
                     pd.DataFrame(dict(zip(TIME_PER_TARGET_COLUMNS, columns, strict=True)))
                 )
-    return (
-        pd.concat(tables, ignore_index=True)
-        if tables
-        else pd.DataFrame(columns=TIME_PER_TARGET_COLUMNS)
-    )
+    if tables:
+        return pd.concat(tables, ignore_index=True)
+    return pd.DataFrame(columns=TIME_PER_TARGET_COLUMNS)
 
 
 def map_break_even_counts(table: pd.DataFrame) -> pd.DataFrame:

@@ -113,7 +113,7 @@ def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
 
 
 def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
-    """Convert a column of a CSV file to text, int64, float64 or bool.
+    """Convert a column of a CSV file to text, int64, float64 or bool, as it is declared.
 
     Args:
         column: Declaration of the column: type, range, allowed words, and empty cells.

@@ -50,7 +50,7 @@ def list_tuner_labels(experiment: Experiment) -> list[str]:
 
 
 def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: str) -> None:
-    """Check that a plan belongs to an experiment and is complete.
+    """Check that a plan (the list of all runs) belongs to an experiment and is complete.
 
     Args:
         plan: The id of every run.

@@ -36,7 +36,7 @@ def _run_completion(options: argparse.Namespace, print_line: PrintLine) -> Comma
 
 
 def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
-    """Build the completion script for a shell.
+    """Build the completion script for a shell, in which all names are written out.
 
     Args:
         parser: Parser of the command line.

@@ -97,11 +97,12 @@ def parse_noise(texts: Sequence[str]) -> dict[str, float]:
             "NAME=VALUE"
         )
     named_values = parse_key_numbers("--noise", [text for text in texts if "=" in text])
-    return (
-        {ALL_CHANNELS: parse_number("--noise", "every channel", unnamed_texts[0]), **named_values}
-        if unnamed_texts
-        else named_values
-    )
+    if unnamed_texts:
+        return {
+            ALL_CHANNELS: parse_number("--noise", "every channel", unnamed_texts[0]),
+            **named_values,
+        }
+    return named_values
 
 
 def parse_initial_states(texts: Sequence[str]) -> dict[str, float | tuple[float, float]]:

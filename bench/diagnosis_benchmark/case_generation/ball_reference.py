@@ -40,10 +40,8 @@ class FlightDynamics:
             true_system: true system of a case: constants, parameters and hidden effects.
             number: index of the run in the recording.
         """
-        self.g, self.acting = (
-            true_system.constants["gravity"],
-            {**true_system.effects, **true_system.foreign},
-        )
+        self.g = true_system.constants["gravity"]
+        self.acting = {**true_system.effects, **true_system.foreign}
         self.laws = [
             (ACCELERATION_LAWS[name], c)
             for name, c in self.acting.items()
@@ -208,13 +206,12 @@ def simulate_ball(
             state, resting = _compute_bounce(true_system, time, state)
             state[2] = true_system.constants["radius"]
             # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
-            rise_duration = (
-                0.0
-                if resting
-                else 0.4
-                * state[5]
-                / max(-dynamics.compute_acceleration(time, state, time)[2], 1e-3)
-            )
+            if resting:
+                rise_duration = 0.0
+            else:
+                rise_duration = (
+                    0.4 * state[5] / max(-dynamics.compute_acceleration(time, state, time)[2], 1e-3)
+                )
     return states
 
 

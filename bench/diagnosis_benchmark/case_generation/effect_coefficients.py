@@ -126,10 +126,8 @@ def draw_direction(
         the angle, then the further coefficients.
     """
     angle = rng.uniform(0, 2 * np.pi)
-    cosine_part, sine_part = (
-        coefficient_scale * float(np.cos(angle)),
-        coefficient_scale * float(np.sin(angle)),
-    )
+    cosine_part = coefficient_scale * float(np.cos(angle))
+    sine_part = coefficient_scale * float(np.sin(angle))
     return lambda s: (cosine_part * s, sine_part * s, *further_coefficients)
 
 
@@ -358,10 +356,8 @@ def _draw_position_friction(
     low, high = (0.2, 5.0) if motion.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
-    sine, cosine = (
-        coefficient_scale * share * float(np.sin(angle)),
-        coefficient_scale * share * float(np.cos(angle)),
-    )
+    sine = coefficient_scale * share * float(np.sin(angle))
+    cosine = coefficient_scale * share * float(np.cos(angle))
     return lambda s: (coefficient_scale * (1 - share) * s, sine * s, cosine * s, period)
 
 

@@ -134,13 +134,9 @@ class NuisanceFitter:
                     break
                 continue
             relative_gain = 1.0 - np.sqrt((new_residual @ new_residual) / (residual @ residual))
-            theta, starts, residual, slope, damping = (
-                new_theta,
-                new_starts,
-                new_residual,
-                new_slope,
-                damping / DAMPING_DECREASE,
-            )
+            theta, starts = new_theta, new_starts
+            residual, slope = new_residual, new_slope
+            damping /= DAMPING_DECREASE
             if relative_gain < MIN_RELATIVE_GAIN:
                 break
         return ResidualFit(float(np.sqrt(np.mean(residual**2))), theta, starts)

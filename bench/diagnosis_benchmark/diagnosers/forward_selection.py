@@ -249,8 +249,9 @@ class ForwardBIC(_ForwardSelection):
             NamedCause(name, alternatives, _select_effect_intervals(intervals, name))
             for name, alternatives in causes
         )
-        sets = any(alternatives for _, alternatives in causes)
-        verdict = "ambiguous" if sets else "named" if named_causes else "adequate"
+        verdict = "named" if named_causes else "adequate"
+        if any(alternatives for _, alternatives in causes):
+            verdict = "ambiguous"
         return Answer(verdict, named_causes, parameters)
 
 

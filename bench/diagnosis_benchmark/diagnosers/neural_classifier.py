@@ -72,11 +72,9 @@ class NeuralClassifier(Diagnoser):
 
     def cannot(self, kind: type[SystemSimulator]) -> str:
         """Reject robots: the training precedes the case, so their model file is not available."""
-        return (
-            "it cannot be trained for a robot whose model file is not known beforehand"
-            if kind.has_model
-            else ""
-        )
+        if kind.has_model:
+            return "it cannot be trained for a robot whose model file is not known beforehand"
+        return ""
 
     def train(self, task: DiagnoserTrainingTask) -> Mapping[str, Array]:
         """Simulate recordings until the budget is used up, and train the network.
@@ -423,10 +421,8 @@ def _train_network(
                     )
                 )
             if validation_loss < best:
-                best, state = (
-                    validation_loss,
-                    {k: v.clone() for k, v in network.state_dict().items()},
-                )
+                best = validation_loss
+                state = {k: v.clone() for k, v in network.state_dict().items()}
     return {name: tensor.numpy() for name, tensor in state.items()}
 
 

@@ -96,10 +96,8 @@ class _SparseRegression(Diagnoser):
             The named causes and their significance; None if there are too few samples.
         """
         rows = evidence.build_acceleration_regression(window)
-        fitting_rows, held_out_rows = (
-            rows.select_runs(evidence.fitted),
-            rows.select_runs(evidence.held_out),
-        )
+        fitting_rows = rows.select_runs(evidence.fitted)
+        held_out_rows = rows.select_runs(evidence.held_out)
         row_count = min(len(fitting_rows.residual), len(held_out_rows.residual))
         if row_count <= fitting_rows.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT:
             return None

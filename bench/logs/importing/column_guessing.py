@@ -271,12 +271,9 @@ def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
         words = set(split_name(column.bare))
         is_named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
         if _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
-            rank = 0 if is_named and "header" in words else 1 if is_named else 2
-            ranked_columns.append((rank, position, column))
-    return [
-        column
-        for _, _, column in sorted(ranked_columns, key=lambda ranked_column: ranked_column[:2])
-    ]
+            is_header_stamp = is_named and "header" in words
+            ranked_columns.append((not is_header_stamp, not is_named, position, column))
+    return [column for *_, column in sorted(ranked_columns, key=lambda ranked: ranked[:3])]
 
 
 def guess_time_unit(stamps: Array) -> str | None:
@@ -318,11 +315,9 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
     )
     extremes = np.array([np.nanmin(values), np.nanmax(values)])
     if joint.range is None:
-        return (
-            si_unit
-            if joint.kind != "hinge" or np.abs(extremes).max() <= MAX_UNLIMITED_POSITION_RAD
-            else small_unit
-        )
+        if joint.kind != "hinge" or np.abs(extremes).max() <= MAX_UNLIMITED_POSITION_RAD:
+            return si_unit
+        return small_unit
     for unit, size_of_unit in ((si_unit, 1.0), (small_unit, size)):
         if _is_within_limits(extremes / size_of_unit, joint.range):
             return unit

@@ -208,10 +208,8 @@ class DescriptionWriter:
             name: name of the servo.
             joint: joint that it drives.
         """
-        command, position = (
-            self._signals.inputs[f"u.{name}"],
-            self._signals.get_position(joint.name),
-        )
+        command = self._signals.inputs[f"u.{name}"]
+        position = self._signals.get_position(joint.name)
         samples: list[tuple[Array, Array, Array]] = []
         if position is None:
             return samples

@@ -88,10 +88,8 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         run_lost_count = min(run_lost_count, max(expected_count - steps.size, 0))
         if run_lost_count < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
             run_lost_count = 0
-        lost_count, sample_count = (
-            lost_count + run_lost_count,
-            sample_count + steps.size + run_lost_count,
-        )
+        lost_count += run_lost_count
+        sample_count += steps.size + run_lost_count
         if run_lost_count:
             lossy.append(run.name)
     if jittered:
@@ -124,11 +122,9 @@ def _select_timestamps(run: Run) -> Array:
         recorded_masks, key=lambda mask: int(mask.sum()), default=np.ones(run.times.size, np.bool_)
     )
     sensor_times = run.times[is_recorded]
-    return (
-        run.times
-        if _compute_uneven_share(run.times) <= _compute_uneven_share(sensor_times)
-        else sensor_times
-    )
+    if _compute_uneven_share(run.times) <= _compute_uneven_share(sensor_times):
+        return run.times
+    return sensor_times
 
 
 def _compute_uneven_share(times: Array) -> float:

@@ -147,12 +147,11 @@ def _list_feature_names(info_file: Path, feature: str) -> list[str]:
     # Some datasets group the names by kind: {"motors": [...]}.
     if isinstance(entry_names, dict) and len(entry_names) == 1:
         (entry_names,) = entry_names.values()
-    return (
-        entry_names
-        if isinstance(entry_names, list)
-        and all(isinstance(entry_name, str) for entry_name in entry_names)
-        else []
-    )
+    if isinstance(entry_names, list) and all(
+        isinstance(entry_name, str) for entry_name in entry_names
+    ):
+        return entry_names
+    return []
 
 
 def _find_episode_files(dataset: Path) -> dict[int, list[Path]]:

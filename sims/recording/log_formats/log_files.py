@@ -164,11 +164,9 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
         log = _read_topic(stamp, columns_to_read)
         column_names = {name.lower() for name in log.columns}
         # The error for a missing column lists all columns of the log.
-        return (
-            log
-            if {name.strip().lower() for name in columns_to_read} <= column_names
-            else _read_topic(stamp)
-        )
+        if {name.strip().lower() for name in columns_to_read} <= column_names:
+            return log
+        return _read_topic(stamp)
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:
         file_stats = [file.stat() for file in lerobot_dataset.list_episode_files(*episode)]

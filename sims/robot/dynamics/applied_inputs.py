@@ -159,10 +159,8 @@ def compute_inputs_over_steps(
         Applied inputs (n, S) by name.
     """
     run = RunInputs(scenario, commands, acting, n, steps)
-    fractions, has_sample = (
-        run.get_step_fractions(step, share, is_changed=False),
-        run.find_steps_with_sample(step),
-    )
+    fractions = run.get_step_fractions(step, share, is_changed=False)
+    has_sample = run.find_steps_with_sample(step)
     applied_inputs: dict[str, Array] = {}
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
@@ -205,10 +203,8 @@ def compute_changed_inputs(
     """
     requests_by_grid: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
     for run_index, run in enumerate(runs):
-        fractions, has_sample = (
-            run.get_step_fractions(step, share, is_changed=True),
-            run.find_steps_with_sample(step),
-        )
+        fractions = run.get_step_fractions(step, share, is_changed=True)
+        has_sample = run.find_steps_with_sample(step)
         requests = requests_by_grid.setdefault(
             (run.steps, fractions.tobytes(), has_sample.tobytes()), []
         )
@@ -223,10 +219,8 @@ def compute_changed_inputs(
                 for part in _group_by_active_effects(input_effects, run.n)
             ]
     for (steps, fraction_bytes, sample_bytes), requests in requests_by_grid.items():
-        fractions, has_sample = (
-            np.frombuffer(fraction_bytes),
-            np.frombuffer(sample_bytes, dtype=bool),
-        )
+        fractions = np.frombuffer(fraction_bytes)
+        has_sample = np.frombuffer(sample_bytes, dtype=bool)
         for group in _group_requests(requests):
             values = _compute_applied_inputs(step, group, steps, has_sample, fractions)
             ends = np.cumsum([request.batch_indices.size for request in group])
@@ -352,11 +346,9 @@ def _compute_applied_inputs(
     commands = [{SINGLE_INPUT_NAME: request.signal} for request in requests]
     values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
     parts = values.reshape(run_of_element.size, steps, fractions.size)
-    return (
-        parts[:, :, 0]
-        if fractions.size < STEP_SUBDIVISION.size
-        else compute_step_inputs(parts, has_sample)
-    )
+    if fractions.size < STEP_SUBDIVISION.size:
+        return parts[:, :, 0]
+    return compute_step_inputs(parts, has_sample)
 
 
 def _make_subdivided_grid(

@@ -88,9 +88,9 @@ class JointAddresses:
         one_coordinate_joints = [joint for joint in robot.joints if joint.has_one_coordinate]
         file_joints = [joint for joint in one_coordinate_joints if joint.name not in robot.series]
         series_joints = [robot.joint(name) for name in robot.series]
-        joints = (
-            [*file_joints, *series_joints] if both else series_joints if series else file_joints
-        )
+        joints = series_joints if series else file_joints
+        if both:
+            joints = [*file_joints, *series_joints]
         self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
 
@@ -231,10 +231,8 @@ class MujocoBatch:
         self.robot = robot = with_integrator_settings(robot, settings)
         self.derived = derived
         self.count = count
-        self.file_joints, self.series_joints = (
-            JointAddresses(robot),
-            JointAddresses(robot, series=True),
-        )
+        self.file_joints = JointAddresses(robot)
+        self.series_joints = JointAddresses(robot, series=True)
         self.all_joints = JointAddresses(robot, both=True)
         self.floating = FloatingJoints.from_robot(robot)
         model = compile_batch_model(robot, derived)
@@ -498,13 +496,12 @@ class MujocoBatch:
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
         dofs_in_use = predictor.dof_indices
         ctrl[:batch_size] = controls[:, 0]
-        switches = (
-            {}
-            if off is None or not off.any()
-            else {
+        if off is None or not off.any():
+            switches = {}
+        else:
+            switches = {
                 stretch.start: off[:, stretch.start] for stretch in iterate_constant_stretches(off)
             }
-        )
         ranges = self.force_ranges() if switches else None
         if ranges is not None:
             ranges.write(switches[0])

@@ -438,11 +438,9 @@ class TangentModel:
         """
         quotients = self.quotients
         force_count = quotients.forces.shape[2]
-        steps, control_count, reading_count = (
-            self._steps,
-            quotients.controls.shape[2],
-            self._at.output_count,
-        )
+        steps = self._steps
+        control_count = quotients.controls.shape[2]
+        reading_count = self._at.output_count
         # The series of one owner are contiguous in memory while they are added up.
         inputs = np.zeros((force_count + control_count, count, steps))
         instant_inputs = (

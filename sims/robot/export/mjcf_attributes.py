@@ -304,10 +304,8 @@ def find_differing_statements(
         field_address = get_field_address(model, element)
         values = {}
         for attribute in ATTRIBUTES_BY_KIND[element.kind]:
-            present_value, target_value = (
-                attribute.read(present_values, field_address),
-                attribute.read(target_values, field_address),
-            )
+            present_value = attribute.read(present_values, field_address)
+            target_value = attribute.read(target_values, field_address)
             if not _is_equal(present_value, target_value, tolerance):
                 values[attribute.name] = tuple(float(v) for v in np.atleast_1d(target_value))
         if element.kind == "body" and values:

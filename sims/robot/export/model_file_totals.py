@@ -132,10 +132,8 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
         For each effect, one entry per coefficient; None if the file has no such number.
     """
     robot = add_contact_pairs(robot, [e.place for e, _ in fitted if e.at == "contact"])
-    file_fields, changed_fields = (
-        copy_model_fields(robot.compiled),
-        copy_model_fields(robot.compiled),
-    )
+    file_fields = copy_model_fields(robot.compiled)
+    changed_fields = copy_model_fields(robot.compiled)
     for effect, values in sorted(
         fitted, key=lambda entry: get_write_order(_get_effect_name(entry[0]))
     ):

@@ -178,10 +178,8 @@ def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     """
     # A URDF states a joint's zero as a turned frame, so that its reference pose is another one.
     pose = displace_reference_pose(target_model)
-    reloaded_motion, target_motion = (
-        simulate_test_motion(reloaded_model, pose),
-        simulate_test_motion(target_model, pose),
-    )
+    reloaded_motion = simulate_test_motion(reloaded_model, pose)
+    target_motion = simulate_test_motion(target_model, pose)
     if not np.allclose(
         reloaded_motion, target_motion, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True
     ):

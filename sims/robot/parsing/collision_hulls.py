@@ -330,10 +330,8 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         address_range = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
         model.mesh_polynormal[address_range] = hull.normals
-        first_indices, counts = (
-            model.mesh_polyvertadr[address_range],
-            model.mesh_polyvertnum[address_range],
-        )
+        first_indices = model.mesh_polyvertadr[address_range]
+        counts = model.mesh_polyvertnum[address_range]
         corner_end = _write_lists(
             model.mesh_polyvert, first_indices, counts, hull.polygons, corner_end
         )
@@ -341,10 +339,8 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
         address_range = slice(first_vertex, first_vertex + hull.around.sizes.size)
-        first_indices, counts = (
-            model.mesh_polymapadr[address_range],
-            model.mesh_polymapnum[address_range],
-        )
+        first_indices = model.mesh_polymapadr[address_range]
+        counts = model.mesh_polymapnum[address_range]
         polygon_list_end = _write_lists(
             model.mesh_polymap, first_indices, counts, hull.around, polygon_list_end
         )

@@ -253,8 +253,6 @@ def _make_alias_note(aliases: Mapping[str, str]) -> list[str]:
         groups.setdefault(name, []).append(alias)
     body_notes = [f"{format_name_list(names)} of {body}" for body, names in groups.items()]
     listing = format_name_list(body_notes, separator="; ")
-    return (
-        [f"links on fixed joints are merged into their parent links: {listing}"]
-        if body_notes
-        else []
-    )
+    if body_notes:
+        return [f"links on fixed joints are merged into their parent links: {listing}"]
+    return []

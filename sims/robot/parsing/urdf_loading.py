@@ -390,10 +390,8 @@ def _find_parent_links(
             raise files.make_error(
                 joint, f"joint {label}: {make_unknown_name_error('type', kind, JOINT_TYPES)}"
             )
-        parent, child = (
-            _get_link_name(files, joint, "parent"),
-            _get_link_name(files, joint, "child"),
-        )
+        parent = _get_link_name(files, joint, "parent")
+        child = _get_link_name(files, joint, "child")
         for name in (parent, child):
             if name not in links:
                 raise files.make_error(

@@ -284,11 +284,10 @@ def rename_invalid_names(root: Element) -> list[str]:
             if value in changed and key not in FREE_TEXT_ATTRIBUTES:
                 element.set(key, changed[value])
     pairs = [f"{name} -> {valid_name}" for name, valid_name in changed.items()]
-    return (
-        [f"renamed, since places are written with {RESERVED_CHARACTERS}: {format_name_list(pairs)}"]
-        if pairs
-        else []
-    )
+    if not pairs:
+        return []
+    changes = format_name_list(pairs)
+    return [f"renamed, since places are written with {RESERVED_CHARACTERS}: {changes}"]
 
 
 def name_unnamed_elements(spec: Any) -> list[str]:

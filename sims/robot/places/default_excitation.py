@@ -231,10 +231,8 @@ def _stays_within_ranges(
     addresses_of_joints = [joint.position for joint in limited_joints]
     low, high = np.array([joint.range for joint in limited_joints]).reshape(-1, 2).T
     # The reference pose of a file may violate the file's limits, so limits include it.
-    low, high = (
-        np.minimum(low, model.qpos0[addresses_of_joints]),
-        np.maximum(high, model.qpos0[addresses_of_joints]),
-    )
+    low = np.minimum(low, model.qpos0[addresses_of_joints])
+    high = np.maximum(high, model.qpos0[addresses_of_joints])
     # Inputs named "u.NAME" are commands of actuators; others are forces applied at the joints.
     has_actuators = any(command.name.startswith("u.") for command in commands)
     control_array: Any = data.ctrl if has_actuators else data.qfrc_applied

@@ -367,10 +367,8 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     groups: list[set[int]] = []
     for constraint in range(model.neq):
         kind = int(model.eq_type[constraint])
-        first_object, second_object = (
-            int(model.eq_obj1id[constraint]),
-            int(model.eq_obj2id[constraint]),
-        )
+        first_object = int(model.eq_obj1id[constraint])
+        second_object = int(model.eq_obj2id[constraint])
         if kind == int(constraint_types.mjEQ_JOINT):
             coupled_dofs = [
                 int(model.jnt_dofadr[joint])
@@ -382,10 +380,8 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
                 first_object, second_object = (
                     int(model.site_bodyid[site]) for site in (first_object, second_object)
                 )
-            first_ancestors, second_ancestors = (
-                _list_ancestors(model, first_object),
-                _list_ancestors(model, second_object),
-            )
+            first_ancestors = _list_ancestors(model, first_object)
+            second_ancestors = _list_ancestors(model, second_object)
             coupled_dofs = [
                 dof
                 for body in set(first_ancestors) ^ set(second_ancestors)
