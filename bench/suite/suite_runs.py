@@ -331,8 +331,8 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
         parquet.write_table(
             table,
             path,
-            compression="zstd",
-            compression_level=22,
+            compression="brotli",
+            compression_level=11,
             use_dictionary=False,
             use_byte_stream_split=["seconds"],
             data_page_size=2**26,
