@@ -165,6 +165,8 @@ def _list_limitations(experiment: Experiment) -> list[str]:
 def _describe_best_tuners(view: ComparisonView) -> list[str]:
     """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range.
 
+    A range is where targets are drawn from: the training range, or anywhere within the bounds.
+
     Args:
         view: Comparison with its statistics.
 

@@ -306,16 +306,10 @@ def draw_robot_figure(
         dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
         axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
     _draw_place_rings(axis, robot, data, projection, marks)
-    for side, ((is_left, is_right), offset) in enumerate(
-        zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
-    ):
-        _draw_label_column(
-            axis,
-            label_columns[side],
-            is_left * -half_width + is_right * half_width + offset / scale,
-            scale,
-            tall,
-        )
+    left_labels, right_labels = label_columns
+    gap = 0.12 / scale  # 0.12 inches between the picture and its labels
+    _draw_label_column(axis, left_labels, -half_width - gap, scale, tall)
+    _draw_label_column(axis, right_labels, half_width + gap, scale, tall)
     _draw_scale_bar(axis, projection, scale, tall)
     return figure
 
@@ -453,7 +447,9 @@ def arrange_labels(
 def _draw_label_column(
     axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float
 ) -> None:
-    """Write a column of labels.
+    """Write a column of labels, and a line from each to its place in the picture.
+
+    The labels keep the heights of their places as far as they do not overlap.
 
     Args:
         axis: axes of the figure, in metres.

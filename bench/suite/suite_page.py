@@ -379,10 +379,8 @@ def _build_cells(
             values = curves.select(tuner=tuner).values[:, points]
             with np.errstate(invalid="ignore"):
                 low, median, high = np.percentile(values, [25, 50, 75], axis=0)
-            frame = pd.DataFrame(
-                {"cell": cell, "tuner": tuner, "simulations": points, "median": median,
-                 "low": low, "high": high}
-            )  # fmt: skip
+            columns = {"simulations": points, "median": median, "low": low, "high": high}
+            frame = pd.DataFrame({"cell": cell, "tuner": tuner, **columns})
             curve_tables.append(frame[np.isfinite(frame["median"])])
     page.add_table("curves", pd.concat(curve_tables, ignore_index=True), _DIGITS)
     ticks = tuple(float(k) for k in (0, *tables.checkpoints))

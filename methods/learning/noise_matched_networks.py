@@ -346,7 +346,7 @@ class NoiseMatchedTuner(Tuner, Generic[Learner]):
         held_out: TrainingData | None = None,
         training_range: Array = _UNIT_RANGE,
     ) -> None:
-        """Train on simulations.
+        """Train on simulations, one network for each noise level.
 
         Args:
             data: training data.

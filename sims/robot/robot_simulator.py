@@ -574,7 +574,9 @@ class RobotSimulator(SystemSimulator):
     ) -> BatchResult:
         """Simulate a batch of n elements over all steps, and return its states and readings.
 
-        Effects are evaluated in MuJoCo's callback if they can be compiled, otherwise between steps.
+        Effects are written into the fields of the model before. Those that depend on the state are
+        forces that are evaluated in each step, in MuJoCo's callback if they can be compiled,
+        otherwise between steps. Sensors of drives are corrected afterwards.
 
         Args:
             start: initial states, and the active effects.

@@ -270,17 +270,16 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     states |= {f"qd.{j.name}": 0.0 for j in joints}
     floating = FloatingJoints.from_robot(robot)
     states |= floating.states(model)
-    drives: dict[int, tuple[str, ...]] = {}
-    servos: dict[int, str] = {}
-    gears: dict[int, float] = {}
-    for joint_index, joint in enumerate(joints):
-        joint_actuators = [a for a in robot.actuators if a.joint == joint.name]
-        drives[joint_index] = tuple(f"u.{a.name}" for a in joint_actuators)
-        position_servos = [a for a in joint_actuators if a.kind == "position"]
-        # With several servos at one joint, its motion would not show which one has an error.
-        if len(position_servos) == 1:
-            servos[joint_index] = f"u.{position_servos[0].name}"
-            gears[joint_index] = float(model.actuator_gear[position_servos[0].id, 0])
+    actuators_by_coordinate = {
+        coordinate: [a for a in robot.actuators if a.joint == joint.name]
+        for coordinate, joint in enumerate(joints)
+    }
+    # With several servos at one joint, its motion would not show which one has an error.
+    servo_by_coordinate = {
+        coordinate: servos[0]
+        for coordinate, actuators in actuators_by_coordinate.items()
+        if len(servos := [a for a in actuators if a.kind == "position"]) == 1
+    }
     attributes: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -300,9 +299,14 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "alone": tuple(
             SingleJointSystem() if j.kind == "hinge" else SingleSlideSystem() for j in joints
         ),
-        "drives": drives,
-        "servos": servos,
-        "gears": gears,
+        "drives": {
+            coordinate: tuple(f"u.{a.name}" for a in actuators)
+            for coordinate, actuators in actuators_by_coordinate.items()
+        },
+        "servos": {c: f"u.{servo.name}" for c, servo in servo_by_coordinate.items()},
+        "gears": {
+            c: float(model.actuator_gear[servo.id, 0]) for c, servo in servo_by_coordinate.items()
+        },
         "activations": tuple(
             activation_filter.state for activation_filter in activation_filters(robot)
         ),

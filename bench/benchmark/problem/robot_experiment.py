@@ -169,7 +169,8 @@ def make_robot_experiment(
 ) -> Experiment:
     """Build an experiment that tunes numbers of a robot's model file.
 
-    They are tuned to a recording, or to simulated targets if there is no recording.
+    They are tuned to a recording, or to simulated targets if there is no recording. The user names
+    no experiment file, so everything else has a default.
 
     Args:
         model: MJCF or URDF file; None for the one that the recording's description names.

@@ -439,7 +439,7 @@ class _LazyCalls(Sequence[Call]):
 def _train_learned_entries(
     pool: Pool, results: ExperimentRun, progress: ProgressFactory
 ) -> dict[tuple[str, int], Exception]:
-    """Train every learned entry with each of its seeds.
+    """Train every learned tuner of the experiment with each of its seeds, or load its weights.
 
     Args:
         pool: worker pool that makes the calls.

@@ -157,6 +157,8 @@ def build_break_even_table(
 ) -> pd.DataFrame:
     """Compare every learned tuner with every search tuner by break-even targets.
 
+    They are the number of targets after which training has paid off.
+
     Args:
         experiment: name of the experiment.
         kind: range of the targets.
@@ -202,6 +204,8 @@ def find_cheapest_tuners(
 ) -> list[tuple[float, float, str]]:
     """Find the fastest tuner for each duration of one simulation.
 
+    Slow simulations favour tuners that need few of them, fast ones tuners that think little.
+
     Args:
         costs_by_tuner: cost by tuner.
         targets: number of targets that share the cost of one training.
@@ -210,18 +214,19 @@ def find_cheapest_tuners(
         List of (from, to, tuner): bounds of the duration of one simulation in seconds, and the
         tuner that needs the least time between them. Empty if no tuner reaches the threshold.
     """
-    names = [
-        name for name, cost in costs_by_tuner.items() if np.isfinite(cost.effort.compute_ert())
-    ]
-    if not names:
+    successful_costs = {
+        name: cost
+        for name, cost in costs_by_tuner.items()
+        if np.isfinite(cost.effort.compute_ert())
+    }
+    if not successful_costs:
         return []
-    cheapest = np.argmin(
-        [
-            costs_by_tuner[name].compute_seconds_per_target(SIMULATION_COST_GRID, targets)
-            for name in names
-        ],
-        axis=0,
-    )
+    names = list(successful_costs)
+    seconds = [
+        cost.compute_seconds_per_target(SIMULATION_COST_GRID, targets)
+        for cost in successful_costs.values()
+    ]
+    cheapest = np.argmin(seconds, axis=0)
     changes = np.flatnonzero(np.diff(cheapest)) + 1
     edges = [0, *changes.tolist(), len(SIMULATION_COST_GRID)]
     return [

@@ -169,11 +169,11 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
 def _build_verdict_rows(
     ranking: _Ranking, curves: RunCurves, key: tuple[str, str, int]
 ) -> pd.DataFrame:
-    """Build the rows of one ranking, with each tuner tested against the first.
+    """Build the rows of one ranking, with each tuner tested against the best.
 
-    The test is Wilcoxon's signed-rank test over targets with Holm's correction for several tests. A
-    tuner is WORSE if the difference is significant, EQUAL if it shares the first rank, and
-    otherwise UNDECIDED.
+    The best is the first tuner that has a successful run. The test is Wilcoxon's signed-rank test
+    over targets with Holm's correction for several tests. A tuner is WORSE if the difference is
+    significant, EQUAL if it shares the first rank, and otherwise UNDECIDED.
 
     Args:
         ranking: tuners in the order of their median errors.

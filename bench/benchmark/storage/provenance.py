@@ -78,7 +78,9 @@ def format_explain_command(recordings: Iterable[object], settings: Mapping[str, 
 def write_explanation_environment(
     folder: Path, started: str, settings: Mapping[str, Any], recordings: Iterable[Path]
 ) -> Path:
-    """Write the provenance of an explanation to its folder.
+    """Write the provenance of an explanation to its folder: data, options, machine and packages.
+
+    With it, a result can be reproduced, and doubted if something has changed.
 
     Args:
         folder: Folder of the explanation.

@@ -440,7 +440,9 @@ def check_segment_statuses(
     plan: Sequence[str] | None,
     remedy: str,
 ) -> pd.DataFrame:
-    """Check the statuses that a part or a journal contains.
+    """Check the statuses in a part of the results: its runs must be those of the plan.
+
+    A comparison that is still running stores its results in parts and a journal.
 
     Args:
         path: Path of the part or journal.
@@ -468,7 +470,7 @@ def check_segment_statuses(
     )
     check_statuses(statuses, experiment, make_status_error)
     if plan is not None:
-        expected = [plan[place] if place < len(plan) else "none" for place in plan_indices]
+        expected = [plan[index] if index < len(plan) else "none" for index in plan_indices]
         check_equal(
             statuses["run"],
             pd.Series(expected, dtype=object),

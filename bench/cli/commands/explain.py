@@ -79,7 +79,10 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Explain a recording, write the results, print the text summary."""
+    """Execute `simgap explain`: explain recordings, write the results, print the text summary.
+
+    The search shows its progress on stderr, and Ctrl-C ends it with the best result so far.
+    """
     from bench.api.explain import explain
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
     from bench.cli.progress_display import ProgressDisplay
@@ -146,7 +149,11 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
 
 
 def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Explain every recording separately, print each result, then print the overall summary."""
+    """Explain every recording separately, print each result, then print the overall summary.
+
+    Worker processes share the recordings. Results that an earlier call has left in the output
+    folder are kept, so that an interrupted call can be continued.
+    """
     from bench.benchmark.runner.plugin_discovery import Plugin
     from bench.benchmark.runner.worker_pools import make_pool
     from bench.benchmark.storage.provenance import (

@@ -739,14 +739,7 @@ class _CellKind:
         """
         number_lists: list[list[float]] = []
         for cell_index, text in enumerate(self.texts):
-            match = NUMBERS.fullmatch(text)
-            try:
-                list_entries = match["inside"].replace(",", " ").split() if match else None
-                number_list = (
-                    [float(part) for part in list_entries] if list_entries is not None else None
-                )
-            except ValueError:
-                number_list = None
+            number_list = _parse_number_list(text)
             if (
                 number_list is None
                 or (number_lists and len(number_list) != len(number_lists[0]))
@@ -779,3 +772,14 @@ class _CellKind:
         return InputError(
             f"{path}, row {line}, column {name}: expected {expected}, found {cell_text}{note}"
         )
+
+
+def _parse_number_list(text: str) -> list[float] | None:
+    """Return the numbers of a cell such as ``[0.1, 0.2]``; None if it is not such a list."""
+    match = NUMBERS.fullmatch(text)
+    if match is None:
+        return None
+    try:
+        return [float(part) for part in match["inside"].replace(",", " ").split()]
+    except ValueError:
+        return None

@@ -423,6 +423,9 @@ class RunLinearisation:
     ) -> Array:
         """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
 
+        Positions and velocities are those of the motion plus their changes; other channels are
+        sensor readings. Then the sensor effects act on them.
+
         Shapes: S steps, T samples, C channels.
 
         Args:

@@ -316,7 +316,8 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
 def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
     """Make the family of an effect: all its places, with one coefficient each or a shared one.
 
-    The coefficients are named ``coefficient@place``, or shared for `SHARED_COEFFICIENT_EFFECTS`.
+    A family acts at all places at once, as if it were one effect; `parts` divides it. The
+    coefficients are named ``coefficient@place``, or shared for `SHARED_COEFFICIENT_EFFECTS`.
     Searches test a family before its single places.
 
     Args:

@@ -110,103 +110,135 @@ def list_places(
         robot: robot whose places are listed.
         channels: names and units of the channels that it can observe.
     """
+    joints = _list_joint_places(robot)
+    touching = {geom for pair in robot.contacts for geom in find_pair_geoms(robot, pair)}
+    return {
+        "joint": joints,
+        "actuator": _list_actuator_places(robot, joints),
+        "body": _list_body_places(robot),
+        "channel": [_make_channel_place(name, unit, joints) for name, unit in channels],
+        "contact": [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts],
+        "geom": [
+            make_geom_place(robot, get_geom_name(robot.compiled, geom))
+            for geom in sorted(touching)
+            if has_radius(robot, geom)
+        ],
+    }
+
+
+def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
+    """List the joints with one coordinate; the index of each is that of its coordinate."""
     from sims.robot.dynamics.inverse_dynamics import coefficient_scales
 
     scales = coefficient_scales(robot)
-    kinds = ("joint", "actuator", "body", "channel")
-    places: dict[str, list[EffectPlace]] = {kind: [] for kind in kinds}
-    places["contact"] = [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts]
-    touching = {geom for pair in robot.contacts for geom in find_pair_geoms(robot, pair)}
-    places["geom"] = [
-        make_geom_place(robot, get_geom_name(robot.compiled, geom))
-        for geom in sorted(touching)
-        if has_radius(robot, geom)
-    ]
-    joint_numbers: dict[str, int] = {}
-    mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
     last_joint_of_body = {int(body): i for i, body in enumerate(bodies)}
-    for joint_index, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
-        joint_numbers[joint.name] = joint_index
-        places["joint"].append(
-            EffectPlace(
-                joint.name,
-                joint.kind,
-                joint_index,
-                "",
-                joint.unit,
-                scales.force[joint_index],
-                scales.inertia[joint_index],
-                _get_file_values(robot, joint.velocity, joint.id),
-                f"joint {joint.name}",
-                last=last_joint_of_body[int(bodies[joint.id])] == joint.id,
-                coupled=joint.name in may_be_coupled,
-                tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
-                is_base=joint.name in robot.base_joints,
-            )
+    return [
+        EffectPlace(
+            name=joint.name,
+            kind=joint.kind,
+            coordinate=coordinate,
+            signal="",
+            unit=joint.unit,
+            size=scales.force[coordinate],
+            inertia=scales.inertia[coordinate],
+            stated=_get_file_values(robot, joint.velocity, joint.id),
+            words=f"joint {joint.name}",
+            last=last_joint_of_body[int(bodies[joint.id])] == joint.id,
+            coupled=joint.name in may_be_coupled,
+            tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
+            is_base=joint.name in robot.base_joints,
         )
+        for coordinate, joint in enumerate(j for j in robot.joints if j.has_one_coordinate)
+    ]
+
+
+def _list_actuator_places(robot: RobotModel, joints: Sequence[EffectPlace]) -> list[EffectPlace]:
+    """List the actuators; most attributes are those of the joint that they drive.
+
+    Actuators that move no joint, or joints in an unknown way, are left out.
+
+    Args:
+        robot: robot whose actuators are listed.
+        joints: places of its joints.
+    """
+    mass = _compute_moving_mass(robot)
+    joints_by_name = {place.name: place for place in joints}
+    places = []
     for actuator in robot.actuators:
-        joint_place = next((s for s in places["joint"] if s.name == actuator.joint), None)
-        if joint_place is None:
-            joint_place = _make_actuator_place(actuator, places["joint"], mass)
-        if joint_place is None:
+        joint = joints_by_name.get(actuator.joint or "")
+        joint = joint or _make_actuator_place(actuator, joints, mass)
+        if joint is None:
             continue
-        places["actuator"].append(
-            joint_place._replace(
+        places.append(
+            joint._replace(
                 name=actuator.name,
                 signal=f"u.{actuator.name}",
                 unit=actuator.control_unit,
                 stated=_get_servo_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
-                servo=actuator.kind == "position" and joint_place.coordinate is not None,
+                servo=actuator.kind == "position" and joint.coordinate is not None,
             )
         )
+    return places
+
+
+def _list_body_places(robot: RobotModel) -> list[EffectPlace]:
+    """List the moving bodies, with how far a wrong centre of mass or a payload may be off."""
+    mass = _compute_moving_mass(robot)
     longest_link = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
+    places = []
     for body in robot.bodies:
-        description = f"body {body.name}"
-        offset_limits = compute_centre_of_mass_limits(robot, body.name)
-        observed_axes = observable_axes(robot, body.name)
-        observable_limits = np.where(
-            np.isin(range(3), observed_axes)[:, None], offset_limits, 0.0
-        ).tolist()
-        offsets = {
-            axis: (low, high) for axis, (low, high) in zip("xyz", observable_limits, strict=True)
-        }
-        box_centre = offset_limits.mean(axis=1).tolist()
-        payload_reach = max(float(np.ptp(offset_limits, axis=1).max()), 0.5 * longest_link)
-        payload_limits = {
-            axis: (box_centre[k] - payload_reach, box_centre[k] + payload_reach)
-            if k in observed_axes
-            else (0.0, 0.0)
-            for k, axis in enumerate("xyz")
-        }
-        body_place = EffectPlace(
-            body.name,
-            "hinge",
-            None,
-            "",
-            "kg",
-            1.0,
-            1.0,
-            _get_body_file_values(robot, body.id),
-            description,
-            limits={"mass.offset": offsets, "payload": payload_limits},
-            mass=mass,
-        )
-        places["body"].append(body_place)
-    for name, unit in channels:
-        _, _, joint_name = name.partition(".")
-        coordinate = (
-            joint_numbers.get(joint_name) if name.startswith(("q.", "qd.", "tau.")) else None
-        )
-        joint_place = places["joint"][coordinate] if coordinate is not None else None
-        kind, size = (joint_place.kind, joint_place.size) if joint_place else ("hinge", 1.0)
-        description = f"channel {name}"
-        places["channel"].append(
-            EffectPlace(name, kind, coordinate, name, unit, size, 1.0, {}, description)
+        link_box = compute_centre_of_mass_limits(robot, body.name)
+        box_centre = link_box.mean(axis=1)
+        payload_reach = max(float(np.ptp(link_box, axis=1).max()), 0.5 * longest_link)
+        payload_box = np.stack([box_centre - payload_reach, box_centre + payload_reach], axis=1)
+        is_observed = np.isin(range(3), observable_axes(robot, body.name))
+        limits = {}
+        for effect, box in (("mass.offset", link_box), ("payload", payload_box)):
+            ends = np.where(is_observed[:, None], box, 0.0).tolist()
+            limits[effect] = {
+                axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)
+            }
+        places.append(
+            EffectPlace(
+                name=body.name,
+                kind="hinge",
+                coordinate=None,
+                signal="",
+                unit="kg",
+                size=1.0,
+                inertia=1.0,
+                stated=_get_body_file_values(robot, body.id),
+                words=f"body {body.name}",
+                limits=limits,
+                mass=mass,
+            )
         )
     return places
+
+
+def _make_channel_place(name: str, unit: str, joints: Sequence[EffectPlace]) -> EffectPlace:
+    """Make the place of a channel, with kind and size of the joint that it shows, if it shows one.
+
+    Args:
+        name: name of the channel, such as ``q.elbow`` or ``s.gyro``.
+        unit: its unit.
+        joints: places of the joints.
+    """
+    quantity, _, joint_name = name.partition(".")
+    joint = next((place for place in joints if place.name == joint_name), None)
+    if joint is None or quantity not in ("q", "qd", "tau"):
+        return EffectPlace(name, "hinge", None, name, unit, 1.0, 1.0, {}, f"channel {name}")
+    return EffectPlace(
+        name, joint.kind, joint.coordinate, name, unit, joint.size, 1.0, {}, f"channel {name}"
+    )
+
+
+def _compute_moving_mass(robot: RobotModel) -> float:
+    """Return the mass of all moving bodies, kg."""
+    return sum(body.mass for body in robot.bodies)
 
 
 def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> EffectPlace:
