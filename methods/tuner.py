@@ -109,7 +109,10 @@ class Task:
         return np.where(np.isnan(self.observed), 0.0, difference).reshape(len(observations), -1)
 
     def compute_finite_residuals(self, evaluation: Evaluation) -> Array:
-        """Return the residuals of an evaluation; those of a failed simulation are large numbers."""
+        """Return the residuals of an evaluation; those of a failed simulation are large numbers.
+
+        Libraries for least squares do not accept NaN.
+        """
         return np.nan_to_num(
             self.residuals(evaluation.observations),
             nan=FAILED_RESIDUAL,

@@ -457,7 +457,7 @@ def _names(kind: type[SystemSimulator]) -> list[str]:
 
 
 def check_not_extended(kind: type[SystemSimulator]) -> None:
-    """Check that a simulator is not extended already, because its effects are fixed.
+    """Refuse a simulator that is extended already, since effects cannot be added to it again.
 
     Raises:
         InputError: The simulator is extended already.

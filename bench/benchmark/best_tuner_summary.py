@@ -136,7 +136,7 @@ def format_error_floor(statistics: ComparisonStatistics) -> str:
 
 
 def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
-    """Explain the test of the ranking and the notation.
+    """Explain the test of the ranking and the notation; empty if no tuners were compared.
 
     Args:
         statistics: Statistics of the comparison.
@@ -166,21 +166,23 @@ def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
 def warn_about_target_count(statistics: ComparisonStatistics, kind: str) -> str:
     """Warn if there are too few targets for any significant difference; empty otherwise.
 
+    With few targets even a tuner that wins on all of them may do so under the null hypothesis.
+
     Args:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    ranked = _select_range(statistics, kind)["targets"]
     comparison_count = _count_tested_tuners(statistics, kind)
-    if not comparison_count or int(ranked.max()) >= (
-        required_targets := compute_min_targets(comparison_count)
-    ):
+    if not comparison_count:
         return ""
-    targets = int(ranked.max())
+    targets = int(_select_range(statistics, kind)["targets"].max())
+    required_targets = compute_min_targets(comparison_count)
+    if targets >= required_targets:
+        return ""
     return (
         f"{targets} target{'s' if targets != 1 else ''} cannot decide between "
-        f"{comparison_count + 1} "
-        f"tuners: at least {required_targets} are needed (--targets {required_targets})."
+        f"{comparison_count + 1} tuners: at least {required_targets} are needed "
+        f"(--targets {required_targets})."
     )
 
 

@@ -311,7 +311,7 @@ def draw_figure(
 def check_references_allowed(
     stored: StoredComparison, name: str, references: Sequence[ReferenceResult]
 ) -> None:
-    """Reject references that cannot be drawn in a figure.
+    """Reject references (stored comparisons) that cannot be drawn in grey in a figure.
 
     Args:
         stored: Comparison read from its result folder: configuration, runs and statuses.

@@ -292,7 +292,7 @@ def format_redraws(results: ComparisonReportData) -> str:
 
 
 def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
-    """Yield notes on isolation, salt and targets that limit the results.
+    """Yield notes on isolation, salt and targets that limit how far the results can be trusted.
 
     Args:
         results: Comparison with its configuration and the record of its environment.

@@ -54,7 +54,7 @@ class TrackingResult(NamedTuple):
     lines: tuple[str, ...]
 
     def to_document(self) -> dict[str, Any]:
-        """Return the result as a JSON document."""
+        """Return the result as a JSON document, as `simgap track --json` prints it."""
         return {
             "frames": self.frames,
             "frames_with_ball": self.seen,

@@ -264,7 +264,7 @@ class FrameDescription:
     description: Mapping[str, Any] | None = None
 
     def refuse_for_files(self, recording: object) -> None:
-        """Reject a description of a data frame if the recording is not a data frame.
+        """Reject a description of a data frame if the recording is a file, which has its own.
 
         Raises:
             InputError: units, constants or a description are given.

@@ -142,7 +142,7 @@ def _format_sign(text: str) -> str:
 
 
 def format_csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format a table as CSV.
+    """Format a table as CSV that a spreadsheet can open safely.
 
     Args:
         head: Names of the columns.

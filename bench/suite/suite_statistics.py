@@ -463,7 +463,7 @@ class SuiteTables:
         return self.over_common_targets.ranks if self.has_partial_tuners else self.ranks.iloc[:0]
 
     def build_tables(self) -> dict[str, pd.DataFrame]:
-        """Return all tables by name."""
+        """Return all tables of the suite by name; the name is that of the CSV file."""
         return {
             "ranks_common_targets": self.ranks_over_common_targets,
             "errors": self.errors,

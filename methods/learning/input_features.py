@@ -427,7 +427,7 @@ class InputFeatures:
         )
 
     def to_arrays(self) -> dict[str, Array]:
-        """Return everything as plain arrays by name."""
+        """Return everything as plain arrays by name, as a weights file stores it."""
         state: dict[str, Array] = {}
         for name in _OBSERVATION_FEATURE_ARRAYS:
             state[f"inputs.{name}"] = np.asarray(getattr(self.observation_features, name))

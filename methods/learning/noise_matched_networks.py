@@ -156,7 +156,10 @@ class NoiseMatchedNetworks(Generic[Learner]):
         return self.noisy if (roughness > self.limit).any() else self.clean
 
     def to_arrays(self) -> dict[str, Array]:
-        """Return everything as plain arrays by name."""
+        """Return both networks as plain arrays by name, as a weights file stores them.
+
+        If one network serves for all noise levels, it is stored once.
+        """
         arrays = {f"clean.{name}": array for name, array in self.clean.to_arrays().items()}
         if self.noisy is not self.clean:
             arrays |= {f"noisy.{name}": array for name, array in self.noisy.to_arrays().items()}

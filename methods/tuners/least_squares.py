@@ -119,7 +119,10 @@ class LeastSquares(Tuner):
         return "the simulation reproduces the target"
 
     def fit_from_point(self, run: EvaluationHistory, point: Array) -> SimulationGenerator[None]:
-        """Fit from a point that has not been simulated.
+        """Fit from a point that has not been simulated; nothing follows if its simulation fails.
+
+        It is simulated, the derivatives there are computed by finite differences, and the fit
+        begins.
 
         Args:
             run: history of the run.
@@ -352,7 +355,7 @@ class EvaluationHistory:
         self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
 
     def simulate(self, points: Array, recommend: Array | None = None) -> SimulationGenerator[Array]:
-        """Simulate points.
+        """Simulate points: yield them to the caller, who sends back their evaluation, and store it.
 
         Args:
             points: (n, dim) points, which are clipped to the unit cube.

@@ -546,7 +546,7 @@ def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 def _read_columns(
     path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
 ) -> dict[str, _Column]:
-    """Return the conversion of each column of one kind ("channel" or "input").
+    """Return the conversion to SI units of each column of one kind ("channel" or "input").
 
     Args:
         path: path of the description, for messages.

@@ -210,7 +210,7 @@ class RobotSimulator(SystemSimulator):
     def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """Simulate observations, see `SystemSimulator`.
+        """Simulate observations, see `SystemSimulator`; equal scenarios share their inputs.
 
         Args:
             theta: (L, P) parameters of L batch elements.
@@ -340,7 +340,10 @@ class RobotSimulator(SystemSimulator):
         return observations
 
     def _get_floating_states(self, run_batches: Sequence[RobotRunBatch]) -> FloatingState:
-        """Return the initial states of floating bodies for all batch elements."""
+        """Return the initial states of floating bodies for all batch elements, run after run.
+
+        All batch elements of a run begin in the same state.
+        """
         initial_states = [self.get_floating_start(batch) for batch in run_batches]
         sizes = [len(batch.x) for batch in run_batches]
         return FloatingState(

@@ -95,7 +95,7 @@ class RobotSnapshot(StateSnapshot):
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def select_element(self, batch_index: int) -> RobotSnapshot:
-        """Select one batch element."""
+        """Return the state of one batch element, as a batch of one."""
         selected = slice(batch_index, batch_index + 1)
         return replace(
             self,

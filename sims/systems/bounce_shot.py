@@ -129,7 +129,7 @@ class ShotSystem(System):
         return moment.gravity * down  # (1)
 
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
-        """Return a horizontal unit vector in the incline's frame (L, 3).
+        """Return a horizontal unit vector of the world in the frame of the incline, (L, 3).
 
         Shapes: L batch elements.
 

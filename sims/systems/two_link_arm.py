@@ -278,7 +278,7 @@ class TwoLinkArm(OwnSimulator):
             self._step = seconds
 
     def _advance(self, torques: tuple[float, float]) -> tuple[float, float]:
-        """Advance Bullet by one step with torques in N m; return the joint rates in rad/s."""
+        """Advance Bullet by one step with torques in N m; return the new joint rates in rad/s."""
         for joint in (0, 1):
             if torques[joint]:  # Bullet forgets them after each step
                 self._push(self._arm, joint, self._torque, force=torques[joint])

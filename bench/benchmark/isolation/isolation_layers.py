@@ -60,6 +60,8 @@ class RunEndedError(Exception):
 def with_isolation(reason: str) -> str:
     """Return a reason with `ISOLATION_NOTE` at its end, if the isolation may be the cause.
 
+    It may be if an exception in the traceback is about an access that the isolation refuses.
+
     Args:
         reason: traceback of an isolated tuner.
     """

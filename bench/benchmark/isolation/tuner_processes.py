@@ -97,7 +97,7 @@ def remove_stale_folders() -> None:
 
 
 def _lock_folder(path: str, is_blocking: bool) -> int | None:
-    """Lock a folder, and return the file descriptor.
+    """Lock a folder, so that no other process uses or deletes it, and return the descriptor.
 
     Args:
         path: path of the folder.

@@ -189,7 +189,10 @@ def _explain_missing_engine(experiment: Experiment) -> str:
 
 
 def _get_default_engine(experiment: Experiment) -> str:
-    """Return the default engine of an experiment; empty if its simulator is not known."""
+    """Return the engine that an experiment uses if it names none.
+
+    It is empty if the simulator is not known, or has no engine.
+    """
     if experiment.model:
         return "mujoco"
     if experiment.simulator not in simulators.names():

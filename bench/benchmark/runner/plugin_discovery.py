@@ -449,7 +449,7 @@ def _describe_plugin_file(file: str) -> list[dict[str, Any]]:
 
 
 def _describe_installed_part(question: dict[str, str]) -> dict[str, Any]:
-    """Describe an installed tuner or diagnoser."""
+    """Describe an installed tuner or diagnoser; runs in an isolated process, as it imports it."""
     kind, name = question["kind"], question["name"]
     try:
         return _describe_class(kind, _REGISTRY_OF[kind].get(name))

@@ -83,7 +83,7 @@ def _find_active_layers() -> tuple[str, ...]:
 
 
 def close_isolated_processes() -> None:
-    """End all tuner processes of this process, and its fork server."""
+    """End the idle tuner processes that this process keeps for reuse, and its fork servers."""
     while _idle_tuners:
         _idle_tuners.popitem()[1].child.end()
     while _fork_servers:

@@ -512,7 +512,9 @@ def _train_isolated(
 
 
 def _check_weights(request: TrainingRequest, path: Path) -> None:
-    """Raise an error if the tuner does not accept the weights.
+    """Restore the tuner from stored weights, to raise an error if it does not accept them.
+
+    The code of a tuner that is not trusted runs in an isolated process.
 
     Raises:
         WeightsError: the tuner does not accept the weights.

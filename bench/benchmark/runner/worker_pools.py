@@ -161,7 +161,7 @@ def _discard_output() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent ends, even if a run hangs."""
+    """End this process when its parent ends, even if a run hangs; runs in a thread of its own."""
     from multiprocessing import connection, parent_process
 
     parent = parent_process()

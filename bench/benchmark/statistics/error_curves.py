@@ -545,7 +545,11 @@ def _get_values(frame: pd.DataFrame) -> Array:
 
 
 def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
-    """Return the target names of each group: 0 inside the training range, then by distance."""
+    """Group targets by their distance from the training range.
+
+    Group 0 has the targets inside; those outside are divided into groups of about equal size, the
+    nearest first. Empty groups are left out.
+    """
     names_inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)
     count = min(max(len(outside) // _MIN_GROUP_SIZE, 1), _MAX_GROUPS)

@@ -113,6 +113,8 @@ def _divide_by_successes(
 ) -> Array:
     """Divide the total effort by the number of successes; infinite without a success.
 
+    So failed runs make a success more costly (expected running time).
+
     Args:
         efforts: (targets,) effort of all runs of each target, in simulations or seconds.
         successes: (targets,) number of runs of each target that reached the threshold.

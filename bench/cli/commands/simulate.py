@@ -57,7 +57,7 @@ def parse_number(option: str, name: str, text: str) -> float:
 
 
 def parse_key_numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
-    """Parse NAME=NUMBER texts."""
+    """Parse NAME=NUMBER texts of an option into numbers by name."""
     return {
         name: parse_number(option, name, text)
         for name, text in parse_key_values(option, texts).items()
@@ -74,7 +74,7 @@ def parse_parameters(texts: Sequence[str]) -> dict[str, float] | list[float]:
 
 
 def parse_coefficients(texts: Sequence[str]) -> dict[str, list[float]]:
-    """Parse NAME=VALUE[,VALUE] texts of effects."""
+    """Parse NAME=VALUE[,VALUE] texts of effects into lists of coefficients by name."""
     return {
         name: [parse_number("--effect", name, cell) for cell in text.split(",")]
         for name, text in parse_key_values("--effect", texts).items()

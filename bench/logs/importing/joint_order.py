@@ -189,7 +189,7 @@ MAX_COMPARED_JOINTS = 7
 
 
 def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> list[int] | None:
-    """Find the order of positions that follows commands best.
+    """Find the order of positions that follows commands best, as a log may not name its columns.
 
     Args:
         commands: (T,) command of each joint, SI units.

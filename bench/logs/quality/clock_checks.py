@@ -463,6 +463,9 @@ class _Estimate(NamedTuple):
 def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find the clock drift, pooled over all runs and driven coordinates, if it is significant.
 
+    The clock of the sensors may run faster or slower than that of the commands. Then measured
+    positions follow their commands later and later.
+
     Args:
         recording: Recording to check.
         kind: Simulator class of its system.

@@ -63,6 +63,8 @@ def make_instruction_runner(
 ) -> Callable[[], None]:
     """Return a function that runs instructions on the present values of the registers.
 
+    Machine code does not check array bounds, so the instructions are checked once, here.
+
     Args:
         code: (n, 5) instructions; see `ProgramArrays`.
         first: index of the first instruction.

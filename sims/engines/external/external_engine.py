@@ -451,7 +451,10 @@ class ElementForces:
         return 0.0 if self._limit is None else self._numbers[self._limit]
 
     def compute_impact(self, speed: float) -> tuple[float, float]:
-        """Return restitution and friction coefficient of an impact at this speed (m/s)."""
+        """Return restitution and friction coefficient of an impact at this speed (m/s).
+
+        The compiled program reads its inputs from `_numbers`, and writes its results there.
+        """
         numbers = self._numbers
         numbers[self._e], numbers[self._mu], numbers[self._speed] = self._restitution, 0.0, speed
         self._run_impact()

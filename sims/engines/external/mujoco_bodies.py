@@ -321,7 +321,10 @@ class MujocoSoftBall(MujocoMover):
         self._contact_values = math.nan, math.nan
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
-        """Set friction, and the damping that gives this restitution for short steps."""
+        """Set friction, and the damping with which the contact has this restitution.
+
+        The contact is a spring and a damper, so it is so only if the steps are short.
+        """
         if (restitution, friction) != self._contact_values:
             self._contact_values = restitution, friction
             # For stiffness k and damping b per unit mass, the damping ratio is b / (2 sqrt k).
@@ -333,7 +336,11 @@ class MujocoSoftBall(MujocoMover):
         return gap <= 0.0
 
     def advance(self, force: Vector) -> BallState:
-        """Advance by one step with a force per unit mass at the centre, and contact friction."""
+        """Advance by one step with a force per unit mass at the centre, and contact friction.
+
+        MuJoCo's own contact is frictionless here. Friction opposes the horizontal velocity, and is
+        proportional to the normal force of the last step.
+        """
         friction = self._contact_values[1]
         if friction and self._data.nefc:
             vx, vy, _ = self._w.tolist()

@@ -247,7 +247,7 @@ def _read_cached(stamp: FileVersion) -> LogFile:
 
 
 def _read_text_table(path: Path) -> LogFile:
-    """Read a text table of any layout."""
+    """Read a text table of any layout as a log."""
     table = read_text_table(path)
     return LogFile(
         path,

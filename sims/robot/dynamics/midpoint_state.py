@@ -78,6 +78,8 @@ class JointStates(NamedTuple):
 def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
     """Predict positions and velocities half a step later, for a constant acceleration.
 
+    Forces that depend on the state are evaluated there, which is accurate to second order.
+
     Args:
         x: positions.
         v: velocities.

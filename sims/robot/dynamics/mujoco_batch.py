@@ -711,7 +711,10 @@ class BatchCache:
         return variant
 
     def _evict_unused_variants(self) -> None:
-        """Drop the least recently used variants, except the last one, until the limit is met."""
+        """Drop the least recently used variants of the batch until their memory is within limits.
+
+        The last variant is in use, and stays.
+        """
         sizes = {added: variant.nbytes for added, variant in self._extended.items()}
         for added in list(sizes)[:-1]:
             if sum(sizes.values()) <= self._limit:

@@ -318,7 +318,10 @@ class DriveSensorModel:
         return any(one.actuator == actuator for one in activation_filters(self.robot))
 
     def _get_force_limits(self, actuator: Actuator) -> tuple[float, float]:
-        """Return lower and upper limit of an actuator's joint force; infinite if unspecified."""
+        """Return lower and upper limit of an actuator's joint force; infinite if unspecified.
+
+        The actuator's own limit is multiplied by its gear; the joint may have a limit, too.
+        """
         gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
         low, high = actuator.force or (-np.inf, np.inf)
         assert actuator.joint is not None

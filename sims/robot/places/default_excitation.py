@@ -156,7 +156,7 @@ def _compute_reference_forces(
 
 
 def _choose_amplitude(joint: Joint, start: float) -> float:
-    """Return the amplitude of a joint's motion, in rad or m.
+    """Return the amplitude of a joint's motion, in rad or m; it stays clear of the joint's limits.
 
     Args:
         joint: joint to move.
