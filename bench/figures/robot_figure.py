@@ -265,53 +265,63 @@ def draw_robot_figure(
     """
     data = make_posed_data(robot, dict(positions))
     projection = choose_projection(robot, data)
-    labels = _make_labels(robot, data, projection, marks)
-    label_columns = _divide_labels(labels)
-    columns = [_compute_column_width(side) for side in label_columns]
+    left_labels, right_labels = _divide_labels(_make_labels(robot, data, projection, marks))
+    # Sizes in inches; coordinates of the axes are metres.
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
-    label_height = max(_compute_column_height(side) for side in label_columns)
     width, height = scale * projection.width, scale * projection.height
-    tall = max(height, label_height)
+    left_width, right_width = (
+        _compute_column_width(left_labels),
+        _compute_column_width(right_labels),
+    )
+    tall = max(height, _compute_column_height(left_labels), _compute_column_height(right_labels))
     # 0.15 inches are the space above the scale bar.
-    size = (columns[0] + width + columns[1], tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
+    size = (left_width + width + right_width, tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
     figure, axes = make_panel_grid(1, 1, size, layout=None)
     axis = axes[0, 0]
     bottom_margin = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
-    axis.set_position((columns[0] / size[0], bottom_margin, width / size[0], height / size[1]))
+    axis.set_position((left_width / size[0], bottom_margin, width / size[0], height / size[1]))
     axis.set_axis_off()
     half_width, half_height = projection.width / 2, projection.height / 2
     axis.set(xlim=(-half_width, half_width), ylim=(-half_height, half_height))
     axis.set_autoscale_on(False)
 
-    image = (
-        render_robot(robot.compiled, data.qpos.copy(), projection) if _has_shapes(robot) else None
-    )
-    if image is None:
-        draw_skeleton(axis, robot, data, projection)
-    else:
-        axis.imshow(
-            image,
-            extent=(-half_width, half_width, -half_height, half_height),
-            zorder=0,
-            aspect="auto",
-        )
-        # Shapes may be missing between joints, if their meshes are absent or were never drawn.
-        for segment in compute_link_segments(robot, data):
-            axis.plot(
-                *projection.project(np.stack(segment)).T,
-                color=CAPTION_GREY,
-                linewidth=0.7,
-                zorder=3,
-            )
-        dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
-        axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
+    _draw_robot(axis, robot, data, projection)
     _draw_place_rings(axis, robot, data, projection, marks)
-    left_labels, right_labels = label_columns
     gap = 0.12 / scale  # 0.12 inches between the picture and its labels
     _draw_label_column(axis, left_labels, -half_width - gap, scale, tall)
     _draw_label_column(axis, right_labels, half_width + gap, scale, tall)
     _draw_scale_bar(axis, projection, scale, tall)
     return figure
+
+
+def _draw_robot(axis: Axes, robot: RobotModel, data: Any, projection: Projection) -> None:
+    """Draw the rendered robot with thin lines along its links, or its skeleton without shapes.
+
+    Args:
+        axis: axes to draw on, in metres.
+        robot: model of the robot.
+        data: state at the pose (`mujoco.MjData`).
+        projection: camera.
+    """
+    image = (
+        render_robot(robot.compiled, data.qpos.copy(), projection) if _has_shapes(robot) else None
+    )
+    if image is None:
+        draw_skeleton(axis, robot, data, projection)
+        return
+    half_width, half_height = projection.width / 2, projection.height / 2
+    axis.imshow(
+        image,
+        extent=(-half_width, half_width, -half_height, half_height),
+        zorder=0,
+        aspect="auto",
+    )
+    # Shapes may be missing between joints, if their meshes are absent or were never drawn.
+    for segment in compute_link_segments(robot, data):
+        line = projection.project(np.stack(segment))
+        axis.plot(*line.T, color=CAPTION_GREY, linewidth=0.7, zorder=3)
+    dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
+    axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
 
 
 def compute_joint_positions(

@@ -183,21 +183,19 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
     errors[has_ended_early[:, None] & is_after_end] = np.nan
     errors[curves.failed] = np.inf
-    parameter_count = _count_parameters(experiment)
+    properties = {
+        "problem": problem,
+        "parameters": _count_parameters(experiment),
+        "tags": ";".join(experiment.tags),
+        "negligible_error": experiment.negligible_error,
+        "metric": statistics.metric,
+        "title": experiment.title,
+        "tests": experiment.says,
+        "identifiable": experiment.identifiable,
+        "suite": experiment.suite,
+    }
     cell_rows = [
-        (
-            cell,
-            problem,
-            condition or str(kind),
-            parameter_count,
-            ";".join(experiment.tags),
-            experiment.negligible_error,
-            statistics.metric,
-            experiment.title,
-            experiment.says,
-            experiment.identifiable,
-            experiment.suite,
-        )
+        {"cell": cell, "range": condition or str(kind), **properties}
         for cell, kind in dict(zip(cells, keys["range"], strict=True)).items()
     ]
     training = pd.DataFrame(

@@ -82,16 +82,7 @@ def find_layout(path: Path) -> Layout:
     Raises:
         InputError: The table has no rows, or its header has another number of cells than its rows.
     """
-    with path.open("rb") as file:
-        first_bytes = file.read(_HEAD_BYTES)
-        is_complete = not file.read(1)
-    encoding = _detect_encoding(path, first_bytes)
-    lines = first_bytes.decode(encoding, errors="replace").splitlines()
-    if not is_complete and len(lines) > 1:
-        lines.pop()  # the last line is incomplete
-    lines = lines[:_HEAD_LINES]
-    if not any(line.strip() for line in lines):
-        raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
+    encoding, lines = _read_first_lines(path)
     data_lines = [line for line in lines if line.strip() and not COMMENT.match(line)]
     separator = _detect_separator(data_lines)
     rows = {
@@ -100,19 +91,17 @@ def find_layout(path: Path) -> Layout:
     width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
     columns = _find_numeric_columns(rows.values(), width)
     first_data_line = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
+    # Lines are numbered from 1; 0 stands for no line.
     rows_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
-    units_row: dict[int, str] = {}
-    if (
-        rows_above
-        and first_data_line
-        and (row_units := _parse_units(_normalise_row(rows[rows_above[-1]], width), columns))
-    ):
-        units_row = row_units
+    units_by_column: dict[int, str] = {}
+    if rows_above and first_data_line:
+        units_by_column = _parse_units(_normalise_row(rows[rows_above[-1]], width), columns)
+    if units_by_column:
         rows_above.pop()
     for n in reversed(rows_above):
         names = _parse_header(lines[n - 1], separator, width, columns)
         if names is not None:
-            units = {names[place]: unit for place, unit in units_row.items()}
+            units = {names[column]: unit for column, unit in units_by_column.items()}
             return Layout(encoding, separator, names, units, n, first_data_line or n + 1, width)
     if not first_data_line:
         first_line = format_value(lines[0].strip())
@@ -129,6 +118,25 @@ def find_layout(path: Path) -> Layout:
             f"{first_data_line}, found {len(rows[n])}; give each column a name"
         )
     return Layout(encoding, separator, (), {}, 0, first_data_line, width)
+
+
+def _read_first_lines(path: Path) -> tuple[str, list[str]]:
+    """Return the encoding of a file and its first complete lines, at most `_HEAD_LINES`.
+
+    Raises:
+        InputError: the file is empty, or holds binary data.
+    """
+    with path.open("rb") as file:
+        first_bytes = file.read(_HEAD_BYTES)
+        is_complete = not file.read(1)
+    encoding = _detect_encoding(path, first_bytes)
+    lines = first_bytes.decode(encoding, errors="replace").splitlines()
+    if not is_complete and len(lines) > 1:
+        lines.pop()  # the last line is incomplete
+    lines = lines[:_HEAD_LINES]
+    if not any(line.strip() for line in lines):
+        raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
+    return encoding, lines
 
 
 def _detect_encoding(path: Path, head: bytes) -> str:
