@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.cli.interrupt_handler import InterruptHandler
 from bench.cli.output import (
@@ -24,6 +26,9 @@ from bench.cli.shared_options import (
     make_cluster_pool,
     parse_name_list,
 )
+
+if TYPE_CHECKING:
+    from bench.diagnosis.many_logs import BatchLog, LogResult
 
 _FIGURE_SUFFIXES = (".html", ".png", ".pdf")
 """File extensions of figures and reports, which are not listed one by one."""
@@ -156,22 +161,10 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     """
     from bench.benchmark.runner.plugin_discovery import Plugin
     from bench.benchmark.runner.worker_pools import make_pool
-    from bench.benchmark.storage.provenance import (
-        format_explain_command,
-        get_utc_time,
-        write_explanation_environment,
-    )
+    from bench.benchmark.storage.provenance import get_utc_time
     from bench.cli.progress_display import ProgressDisplay
     from bench.core.resource_estimates import count_available_cores
-    from bench.diagnosis.many_logs import (
-        LOGS_TABLE_FILE,
-        LogResult,
-        explain_batch,
-        format_cause,
-        list_logs,
-        summarise_causes,
-    )
-    from bench.diagnosis.many_logs_page import BatchPageInput, write_summary_page
+    from bench.diagnosis.many_logs import explain_batch, format_cause, list_logs
     from sims.core.files import make_timestamped_path
 
     settings = {
@@ -223,6 +216,37 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
                 print_finished_recording,
                 interrupts.is_stop_requested,
             )
+    return _report_batch(options, output_folder, started, logs, log_results, print_line)
+
+
+def _report_batch(
+    options: argparse.Namespace,
+    output_folder: Path,
+    started: str,
+    logs: Sequence[BatchLog],
+    log_results: Sequence[LogResult],
+    print_line: PrintLine,
+) -> CommandResult:
+    """Write the page over all recordings and how it was made, and print the summary.
+
+    Args:
+        options: parsed command line.
+        output_folder: folder with the results of all recordings.
+        started: time of the start, UTC.
+        logs: all recordings.
+        log_results: results of those that are explained.
+        print_line: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code: EXIT_INTERRUPTED if recordings remain.
+    """
+    from bench.benchmark.storage.provenance import (
+        format_explain_command,
+        write_explanation_environment,
+    )
+    from bench.diagnosis.many_logs import LOGS_TABLE_FILE, summarise_causes
+    from bench.diagnosis.many_logs_page import BatchPageInput, write_summary_page
+
     remaining = len(logs) - len(log_results)
     folders = {log.name: log.folder for log in logs}
     relevant = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}

@@ -301,9 +301,6 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     All coordinates share the stamps, so a coordinate that moves as expected clears them; another
     one may belong to a link without inertia in the model file.
 
-    At rest in the recorded positions, the system's own forces would move it equally far within T' =
-    (var x / mean a^2)^(1/4) (2), with its acceleration a.
-
     Args:
         recording: recorded runs, with their channels, inputs and constants.
         run: recorded run: times, channels and inputs.
@@ -326,12 +323,11 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         values = run.channels.get(name)
         if values is None:
             continue
-        spread = float(np.nanstd(values))
-        rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
-        if not (spread > MIN_MOTION_SHARE * typical_sizes.get(name, 1.0) and rms_acceleration > 0):
+        min_spread = MIN_MOTION_SHARE * typical_sizes.get(name, 1.0)
+        expected_seconds = _compute_free_motion_time(values, accelerations[:, column], min_spread)
+        if expected_seconds is None:
             continue
-        expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
-        recorded_seconds = interval * _estimate_lag(values)
+        recorded_seconds = interval * _estimate_lag(values)  # Equation (1).
         ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
             moves = (
@@ -358,6 +354,27 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
             f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain
         )
     return doubtful
+
+
+def _compute_free_motion_time(
+    values: Array, accelerations: Array, min_spread: float
+) -> float | None:
+    """Return the time in which its own forces would move a coordinate as far as in the recording.
+
+    It is T' = (var x / mean a^2)^(1/4) (2), with the acceleration a that the forces cause at rest
+    in the recorded positions x; None if the coordinate hardly moves, or no force acts.
+
+    Args:
+        values: (T,) recorded positions x.
+        accelerations: (T,) accelerations a.
+        min_spread: smallest standard deviation of the positions that counts as motion.
+    """
+    spread = float(np.nanstd(values))
+    rms_acceleration = float(np.sqrt(np.nanmean(accelerations**2)))
+    if not (spread > min_spread and rms_acceleration > 0):
+        return None
+    seconds: float = (spread / rms_acceleration) ** 0.5
+    return seconds
 
 
 def _has_inputs(run: Run) -> bool:
