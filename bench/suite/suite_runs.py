@@ -225,7 +225,7 @@ def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -
 
 
 def _count_parameters(experiment: Experiment) -> int:
-    """Return the number of tuned parameters, for which the simulator must be built."""
+    """Return the number of tuned parameters; the simulator must be built, as it declares them."""
     from bench.benchmark.problem.tuning_problem import TuningProblem
 
     problem = TuningProblem(experiment)

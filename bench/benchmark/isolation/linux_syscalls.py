@@ -182,7 +182,7 @@ def make_mounts_read_only() -> None:
 
 
 def _call_mount(kind: str, mount_point: str, flags: int, options: str) -> None:
-    """Call mount(2).
+    """Mount a file system by the system call mount(2).
 
     Args:
         kind: type of the file system, which also serves as its source.

@@ -183,7 +183,7 @@ def _serve_simulation(
 
 
 def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
-    """Simulate the requested points.
+    """Simulate the points that an isolated tuner has requested in its training.
 
     Args:
         message: message with the points of the unit cube and the state of the tuner's random

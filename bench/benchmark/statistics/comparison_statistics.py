@@ -118,6 +118,8 @@ class ComparisonStatistics:
     def sort_rows(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Sort rows that have the columns range and tuner: range by range, the best tuner first.
 
+        Rows of tuners that could not be used come last.
+
         Args:
             frame: Table with the columns `range` and `tuner`.
         """

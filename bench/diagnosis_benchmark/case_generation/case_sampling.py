@@ -75,7 +75,7 @@ Each entry is a system, whether it has an input, and the effects. The initial st
 
 
 def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset[str]:
-    """Return an effect and all effects that are equivalent to it.
+    """Return an effect and all effects that are equivalent to it: no recording tells them apart.
 
     Args:
         system: name of the system, such as ``pendulum``.

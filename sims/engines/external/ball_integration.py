@@ -60,7 +60,7 @@ BallState = tuple[Vector, Vector]
 
 
 def get_gravity(element: ElementWork) -> Vector:
-    """Return the acceleration of gravity, which is constant."""
+    """Return the acceleration of gravity, a vector, as the system computes it; it is constant."""
     start = np.zeros((1, 1))
     zeros = np.zeros((1, 3))
     moment = element.make_snapshot(start, zeros, zeros, {})

@@ -249,7 +249,11 @@ class _InputRequest(NamedTuple):
 
 
 def _restrict_to_input(scenario: Scenario, name: str) -> Scenario:
-    """Restrict a scenario to one input, under the name `SINGLE_INPUT_NAME`."""
+    """Restrict a scenario to the interpolation and the history of one input.
+
+    It gets the name `SINGLE_INPUT_NAME`, so that inputs of several names are computed in one batch.
+    Its commands are passed separately.
+    """
     return replace(
         scenario,
         inputs={},

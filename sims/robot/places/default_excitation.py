@@ -175,6 +175,8 @@ def _make_command(
 ) -> ExcitationCommand:
     """Make a sinusoidal command of an actuator that moves its joint within all limits.
 
+    It excites the robot when simulated recordings are made without commands of the user.
+
     A servo receives a position or a velocity, a motor a force. The centre of the oscillation is
     moved if the control range leaves it no room.
 
