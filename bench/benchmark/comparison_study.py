@@ -145,7 +145,7 @@ class Comparison(Study):
         results.run_sink = journal
 
     def _check_kept(self, journal: RunJournal, ids: list[str]) -> None:
-        """Check every stored row, because damaged rows would falsify the results.
+        """Check every stored row before a study is continued: damaged rows would falsify results.
 
         Args:
             journal: journal of the stored runs.

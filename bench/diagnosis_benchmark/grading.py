@@ -100,7 +100,7 @@ def list_named_sets(verdict: Mapping[str, Any]) -> NamedSets:
 def grade_sets(
     kind: str, effects: Iterable[str], verdict: Mapping[str, Any], equivalents: EquivalentEffects
 ) -> tuple[str, int, int]:
-    """Grade the named causes of an answer.
+    """Grade an answer by its verdict and its named causes, depending on the kind of case.
 
     Args:
         kind: kind of the case; every kind but clean and foreign hides effects of the library.

@@ -211,12 +211,12 @@ def _build_recording(
     run = Run(
         "1",
         make_read_only(track.times[part]),
-        {"z": make_read_only(heights.z[part])},
-        {},
-        {},
-        {},
-        False,
-        {name: make_read_only(values[part]) for name, values in pixels.items()},
+        channels={"z": make_read_only(heights.z[part])},
+        inputs={},
+        constants={},
+        initial={},
+        held_out=False,
+        extra={name: make_read_only(values[part]) for name, values in pixels.items()},
     )
     title = f"{video.name}, tracked; z {heights.method}"
     constants = {"radius": heights.radius, "gravity": ball_heights.DEFAULT_GRAVITY}

@@ -57,7 +57,7 @@ def load_recording(
     divide: bool = True,
     fix_base: bool = False,
 ) -> tuple[Recording, type[Simulator]]:
-    """Read a recording and find its simulator.
+    """Read a recording and find its simulator; its runs are divided for fitting and validation.
 
     Args:
         source: Path of the table, or a recording in memory.
@@ -383,14 +383,16 @@ def read_content(path: Path) -> bytes:
 
 
 def _list_included_files(model: Path) -> list[Path]:
-    """Return a model file and the files that it includes, searched in the folder of the model."""
-    files, visited_count = [model], 0
-    while visited_count < len(files):
-        visited_file = files[visited_count]
-        names = _INCLUDE.findall(visited_file.read_bytes()) if visited_file.is_file() else []
+    """Return a model file and the files that it includes, directly or through others.
+
+    They are searched in the folder of the model.
+    """
+    files = [model]
+    # Files that are appended here are visited later in this loop.
+    for file in files:
+        names = _INCLUDE.findall(file.read_bytes()) if file.is_file() else []
         included_files = [model.parent / name.decode(errors="replace") for name in names]
-        files += [file for file in dict.fromkeys(included_files) if file not in files]
-        visited_count += 1
+        files += [included for included in dict.fromkeys(included_files) if included not in files]
     return files
 
 

@@ -344,7 +344,7 @@ def train_history_transformer(
     rng: np.random.Generator,
     watched: HistoryValidationMonitor | None = None,
 ) -> dict[str, Array]:
-    """Train the weights; equal generators give bit-identical weights.
+    """Train the weights by Adam, on the CPU; equal generators give bit-identical weights.
 
     Args:
         material: training data.

@@ -22,7 +22,7 @@ class DualAnnealing(Tuner):
     requires: ClassVar[tuple[str, ...]] = ("scipy",)
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Pass SciPy's points to the harness one by one."""
+        """Pass SciPy's points to the harness one by one; SciPy calls back for the loss of each."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
             """Minimise the loss over the unit cube with dual annealing; return why it stopped."""

@@ -76,7 +76,9 @@ class TrainedHistoryNetwork:
     def propose_next(
         self, target: Array, simulations_seen: list[Array], tried: list[Array]
     ) -> Array:
-        """Propose the next point (dim,) of the unit cube.
+        """Propose the next point (dim,) of the unit cube, from the latest simulations.
+
+        The network sees points relative to the middle of the training range.
 
         Args:
             target: (d,) projected row of the target.

@@ -709,6 +709,8 @@ class RobotSimulator(SystemSimulator):
     ) -> tuple[Array, Array | None]:
         """Return the values (n, S + 1) of a channel at all steps, and their slopes if known.
 
+        With the slopes, positions are interpolated more accurately between the steps.
+
         Args:
             result: motion and recorded fields of n batch elements.
             name: name of the channel.

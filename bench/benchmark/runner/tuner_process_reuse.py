@@ -112,7 +112,7 @@ def retry_if_killed(work: Callable[[], Result]) -> Result:
 
 
 def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
-    """Return the specification of the tuner of an entry, for an isolated process."""
+    """Return where the code of a tuner is, and what its isolated process preloads."""
     kind = tuners.get(entry.tuner)
     file = tuners.place(entry.tuner)
     module = getattr(kind, "module", "") or kind.__module__

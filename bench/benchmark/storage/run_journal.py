@@ -124,7 +124,9 @@ _DAMAGE_ERRORS = (
 
 
 def _convert_statuses(entries: Any) -> dict[int, RunStatus]:
-    """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
+    """Convert ``[[index, {column: value}], ...]`` to statuses by index, checking every cell.
+
+    The index is the place of the run in the plan.
 
     Args:
         entries: JSON list from the footer of a file.

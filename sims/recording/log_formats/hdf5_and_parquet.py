@@ -121,6 +121,8 @@ def group_of(path: Path) -> tuple[Path, str] | None:
 def list_run_paths(path: Path) -> list[Path]:
     """List the log of each run of a file: its numbered groups, or the file itself.
 
+    Datasets of robot learning have groups such as ``data/demo_0``, ``data/demo_1``, one for a run.
+
     Raises:
         InputError: The file cannot be read, or h5py is not installed.
     """

@@ -78,7 +78,7 @@ class LogFile:
     first: int = 2
 
     def get_column(self, name: str) -> Array:
-        """Return one column (T,), or one entry of a column of lists.
+        """Return one column (T,), or one entry of a column of lists, such as ``position[2]``.
 
         Raises:
             InputError: There is no such column; the message is one line.

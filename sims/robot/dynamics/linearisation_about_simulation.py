@@ -530,6 +530,9 @@ def _select_sensor_effects(
 ) -> ActiveEffects:
     """Return the sensor effects on a channel: those of the run, then the additional ones.
 
+    Each batch element has its own additional effects. They are joined by name, so that an effect is
+    evaluated once for all elements.
+
     Args:
         channel: name of the channel.
         run_effects: effects that are active in the run.
