@@ -202,7 +202,7 @@ class FollowedRuns:
             [compute_joint_scales(robot).force, compute_floating_forces(robot)]
         )
         best: FollowedRuns | None = None
-        first_states: Array | None = None
+        first_states: Sequence[FirstState | None] = [None] * len(evaluator.prepared_runs)
         linear: list[MeasuredLinear] = []
         for iteration in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
@@ -220,7 +220,7 @@ class FollowedRuns:
                     run,
                     motion[run],
                     neighbour,
-                    first_state=None if first_states is None else first_states[run],
+                    first_state=first_states[run],
                 )
                 for run, neighbour in enumerate(neighbours)
             ]
@@ -232,7 +232,7 @@ class FollowedRuns:
             is_first = iteration < (1 if robot.is_on_ground else 2)
             best = followed if is_first or gain > 0.0 else best
             if robot.is_on_ground:
-                first_states = followed.get_first_states()
+                first_states = followed._weight_first_states(followed.get_first_states())
             else:
                 trajectories = followed.trajectories
             if not gain > LINEARISED_GAIN:
@@ -264,9 +264,9 @@ class FollowedRuns:
         )
         neighbours = (similar or self).linear
         motions: Sequence[Trajectory | None] = [None] * len(neighbours)
-        first_states: Sequence[Array | None] = [None] * len(neighbours)
+        starts: Sequence[FirstState | None] = [None] * len(neighbours)
         if self.is_on_ground:
-            first_states = list(self.get_first_states())
+            starts = self._weight_first_states(self.get_first_states())
         else:
             motions = self.trajectories
         linear = [
@@ -276,7 +276,7 @@ class FollowedRuns:
                 first_state=first_state,
             )
             for run, (motion, neighbour, first_state) in enumerate(
-                zip(motions, neighbours, first_states, strict=True)
+                zip(motions, neighbours, starts, strict=True)
             )
         ]
         filter_arguments = self.noise, linear, self.force, self.typical
@@ -703,6 +703,29 @@ class FollowedRuns:
             first_states.append(np.concatenate([x, v]))
         return np.array(first_states)
 
+    def _weight_first_states(self, states: Array) -> list[FirstState]:
+        """Return first states (R, 2 D) of a robot on the ground with their weights."""
+        return [FirstState(*pair) for pair in zip(states, self._first_state_weights, strict=True)]
+
+    @cached_property
+    def _first_state_weights(self) -> Array:
+        """Square roots W (R, 2 D, 2 D) of the inverse covariance of the first states.
+
+        With the derivatives H of the readings by the first state, their noise sigma, and the prior
+        standard deviations p of the first state,
+
+            W^T W = sum H^T H / sigma^2 + diag(1 / p^2)
+
+        is the Fisher information of the readings of the whole run, if no force is missing.
+        """
+        derivatives = self.compute_state_sensitivities() / self.noise.sigma[:, None]
+        derivatives[~self.runs.recorded] = 0.0
+        run_count, samples, channels, size = derivatives.shape
+        rows = derivatives.reshape(run_count, samples * channels, size)
+        prior = np.diag(1.0 / self._get_prior_of_measured_states())
+        rows = np.concatenate([rows, np.tile(prior, (run_count, 1, 1))], axis=1)
+        return np.array([np.linalg.qr(run_rows).R for run_rows in rows])
+
     def _get_prior_of_measured_states(self) -> Array:
         """Return prior standard deviations (2 D,) in multiples of the noise of the positions.
 
@@ -748,7 +771,7 @@ class FollowedRuns:
         best: Array = first_states[np.argmin(squares, axis=0), np.arange(runs)]
         return best
 
-    def settle(self, theta: Array, states: Array) -> Array:
+    def settle(self, theta: Array, states: Array, is_other_geometry: bool = False) -> Array:
         """Return first states (R, 2 D) near given ones at which the contacts are in equilibrium.
 
         Otherwise a simulated robot would jump at the first step, because noise of its pose makes
@@ -757,14 +780,22 @@ class FollowedRuns:
         Args:
             theta: (P,) parameters of the model.
             states: (R, 2 D) positions and velocities of D coordinates in R runs.
+            is_other_geometry: whether the states may be those of another geometry, so that contacts
+                farther away may be closed.
         """
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
-        deviations = _get_noise_of_states(self.evaluator, self.noise)
+        factor = MEASURED_PRIOR if is_other_geometry else 1.0
+        noise = _get_noise_of_states(self.evaluator, self.noise)
+        deviations = factor * noise[0], factor * noise[1]
         settled = []
-        for run_data, state in zip(self.evaluator.prepared_runs, states, strict=True):
+        for run_data, state, weights in zip(
+            self.evaluator.prepared_runs, states, self._first_state_weights, strict=True
+        ):
             x, v = np.split(state, 2)
-            start = settle_contacts(simulator, theta, run_data.scenario, (x, v), deviations)
+            start = settle_contacts(
+                simulator, theta, run_data.scenario, (x, v), deviations, weights
+            )
             settled.append(np.concatenate(start))
         return np.array(settled)
 
@@ -808,6 +839,18 @@ class FollowedRuns:
                         s[:, :size] += added if inputs is None else inputs[:, i] @ added
         responses[~np.isfinite(responses)] = 0.0
         return responses
+
+
+class FirstState(NamedTuple):
+    """First state of a run of a robot on the ground.
+
+    Attributes:
+        state: (2 D,) positions and velocities.
+        weights: (2 D, 2 D) square root W of the inverse W^T W of its covariance.
+    """
+
+    state: Array
+    weights: Array
 
 
 class _NoiseFit(NamedTuple):
@@ -869,7 +912,7 @@ def _linearise_run(
     simulator: RobotSimulator | None = None,
     reuses_jacobians: bool = True,
     reuses_loads: bool = False,
-    first_state: Array | None = None,
+    first_state: FirstState | None = None,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
@@ -889,8 +932,7 @@ def _linearise_run(
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives are taken from the neighbour.
         reuses_loads: whether loads at the joints are taken from the neighbour.
-        first_state: (2 D,) first positions and velocities of a robot on the ground; None for those
-            of the readings.
+        first_state: first state of a robot on the ground; None for that of the readings.
     """
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
@@ -900,8 +942,9 @@ def _linearise_run(
     assert isinstance(robot, RobotSimulator)
     measured: Mapping[int, Array] | None = None
     is_simulated = robot.robot.is_on_ground and trajectory is None
+    weights: Array | None = None
     if is_simulated and first_state is not None:
-        start = first_state[:half], first_state[half:]
+        start, weights = (first_state.state[:half], first_state.state[half:]), first_state.weights
     elif trajectory is None:
         measured = estimate_measured_states(evaluator, noise.sigma, run)
     if is_simulated:
@@ -909,7 +952,7 @@ def _linearise_run(
             start[0][joint], start[1][joint] = states[0, :2]
         measured = None
         deviations = _get_noise_of_states(evaluator, noise)
-        start = settle_contacts(robot, theta, scenario, start, deviations)
+        start = settle_contacts(robot, theta, scenario, start, deviations, weights)
     return MeasuredLinear(
         *(robot, theta, scenario, start, trajectory, measured, neighbour),
         *(reuses_jacobians and not is_simulated, reuses_loads),

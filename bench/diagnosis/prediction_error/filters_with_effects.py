@@ -423,6 +423,27 @@ class ModelFilters:
         states[:, : positions.shape[1]] = np.where(is_offset, positions, measured_positions)
         return states
 
+    def estimate_start(self, start: FitStart) -> FitStart:
+        """Return a start with the first states of its own model, and derivatives by them.
+
+        For a robot on the ground, another radius or mass has contacts of another depth, and the
+        derivatives depend on which contacts are closed.
+
+        Args:
+            start: start of a fit.
+        """
+        # The first states of the base model are biased by what is missing.
+        followed = FollowedRuns.follow(
+            self.evaluator, start.theta, self.noise, max_linearisations=1
+        )
+        if not followed.has_expected_innovations:
+            return start
+        return replace(
+            start,
+            initial_states=followed.get_first_states(),
+            state_jacobian=followed.compute_state_sensitivities(),
+        )
+
     def penalty(self, name: str) -> float:
         """Return the minimum gain of an effect in twice the log-likelihood."""
         count = len(self.evaluator.get_coefficient_indices(name))

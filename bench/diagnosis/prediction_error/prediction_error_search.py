@@ -4,6 +4,8 @@
 fitted to whole simulated runs (output errors), which decide. The search ends as soon as the
 residual of a set is only noise. The order is:
 
+    0. For a robot on the ground, fit the single effects that explain most of the residual of its
+       simulated pieces (`output_error_scores`).
     1. Select effects with few shapes by regression. If the selection leaves a large residual of a
        robot with servos, identify the servos (`servo_identification`), and do nothing of the
        following. Otherwise fit the dry friction among them first, because it is not linear where a
@@ -58,6 +60,7 @@ from bench.diagnosis.prediction_error.identification_without_simulation import (
     identify_incomplete,
     simulate_identified,
 )
+from bench.diagnosis.prediction_error.output_error_scores import fit_best_scored
 from bench.diagnosis.prediction_error.regression_columns import build_regression_about
 from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
@@ -175,6 +178,11 @@ class PredictionErrorSearch(EffectSearch):
                 that form.
         """
         context = self._search_context
+        best_single = self.base_model
+        if context.filters.base.is_on_ground:
+            best_single = fit_best_scored(context)
+            if is_explained(context, best_single):
+                return best_single
         selected = context.columns.select()
         if not self.is_form_given:
             check_selection(context, selected)
@@ -204,7 +212,7 @@ class PredictionErrorSearch(EffectSearch):
         # The quick fits may have skipped the selection because it is slow to simulate.
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
-        return best
+        return select_more_likely(best, best_single)
 
     def _identify_servos(self, selected: Selected) -> IdentifiedSet | None:
         """Identify the servos of a real arm, whose model is incomplete at most joints.

@@ -68,9 +68,7 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
     """
     search, evaluator = context.search, context.evaluator
     if context.filters.base.is_on_ground:
-        # Another radius or mass has contacts of another depth.
-        settled = context.filters.base.settle(start.theta, start.initial_states)
-        start = replace(start, initial_states=settled)
+        start = context.filters.estimate_start(start)
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
