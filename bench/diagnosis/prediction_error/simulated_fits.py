@@ -38,8 +38,11 @@ NEARLY_EXPLAINED_SHARE = 0.1
 """Maximum excess, as a share of that of the base model, at which effects are only added."""
 NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE = 0.1, 0.005
 """Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
+NEGLIGIBLE_EXCESS_ON_GROUND = 0.3
+"""Maximum absolute excess of a robot on the ground.
 
-
+Simulated contacts creep, so that wheels and feet slip a little where real ones hold.
+"""
 MAX_SURPLUS = 2
 """Maximum number of consecutive effects with too little gain before a selection is cut."""
 MAX_SLOW_EFFECTS = 2
@@ -176,8 +179,10 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     if has_dry_friction(context.evaluator, model.effects) and not context.filters.is_soft:
         return False
     compute_excess = context.search.compute_excess_residual
+    is_on_ground = context.filters.base.is_on_ground
     return compute_excess(model) < min(
-        NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE * compute_excess(context.search.base_model)
+        NEGLIGIBLE_EXCESS_ON_GROUND if is_on_ground else NEGLIGIBLE_EXCESS,
+        NEGLIGIBLE_EXCESS_SHARE * compute_excess(context.search.base_model),
     )
 
 
