@@ -69,6 +69,12 @@ The noise of a velocity is that of positions per sample interval.
 """
 SMOOTHED_SHARES = (1.0, 0.5, 0.0)
 """Shares of the smoothed change of a first state that are tried for a robot on the ground."""
+MAX_FIRST_STATE_STEPS = 5
+"""Maximum number of Gauss-Newton steps of the first states of a robot on the ground."""
+STEP_SHARES = (1.0, 0.5, 0.1)
+"""Shares of such a step that are tried."""
+MIN_STEP_DECREASE = 0.02
+"""Minimum relative decrease of the sum of squares for another such step."""
 FIRST_FORCE = 0.1
 """Initial missing force of the process noise fit, as a share of a typical force."""
 MAX_LINEARISATIONS = 4
@@ -740,7 +746,6 @@ class FollowedRuns:
         A contact that begins or ends makes the motion nonlinear. So each run begins at the share of
         the smoothed change whose simulation is closest to the readings.
         """
-        evaluator = self.evaluator
         changes = []
         for linear, change in zip(self.linear, self.smoothed.states[:, 0], strict=True):
             joints = linear.trajectory.x.shape[1]
@@ -758,18 +763,75 @@ class FollowedRuns:
                 for share in SMOOTHED_SHARES
             ]
         )
-        count, runs, size = first_states.shape
-        simulated = evaluator.simulate(
-            np.tile(self.theta, (count * runs, 1)),
-            np.tile(np.arange(runs), count),
-            first_states.reshape(-1, size),
-        ).reshape(count, *evaluator.observed.shape)
-        with np.errstate(all="ignore"):
-            residuals = (simulated - evaluator.observed) / self.noise.sigma
-            squares = np.nansum(np.square(residuals), axis=(2, 3))
-        squares[~np.isfinite(simulated).any(axis=(2, 3))] = np.inf
-        best: Array = first_states[np.argmin(squares, axis=0), np.arange(runs)]
+        squares = np.array([self.compute_squares(self.theta, states) for states in first_states])
+        best: Array = first_states[np.argmin(squares, axis=0), np.arange(len(self.linear))]
         return best
+
+    def improve_first_states(self, theta: Array, states: Array) -> Array:
+        """Return first states (R, 2 D) with settled contacts whose simulations are closer.
+
+        The smoother explains a part of the readings by forces that a simulation does not have.
+        Gauss-Newton steps minimise the residual of the simulated runs instead, with the prior of
+        first states. Contacts are settled after each step, since a simulation from a state between
+        settled ones begins with a jump, which ends other fits in a local minimum.
+
+        Args:
+            theta: (P,) parameters of the model, near those of this linearisation.
+            states: (R, 2 D) settled positions and velocities of D coordinates in R runs.
+        """
+        runs = np.arange(len(states))
+        squares = self.compute_squares(theta, states)
+        sensitivities = self.compute_state_sensitivities() / self.noise.sigma[:, None]
+        sensitivities[~self.runs.recorded] = 0.0
+        derivatives = sensitivities.reshape(len(states), -1, states.shape[1])
+        for _ in range(MAX_FIRST_STATE_STEPS):
+            residuals = self._simulate_residuals(theta, states).reshape(len(states), -1)
+            steps = []
+            for rows, weights, residual in zip(
+                derivatives, self._first_state_weights, residuals, strict=True
+            ):
+                # W^T W = H^T H + diag(1 / p^2), so that W^T W step = H^T residual.
+                step = np.linalg.solve(weights.T, rows.T @ residual)
+                steps.append(np.linalg.solve(weights, step))
+            tried, all_squares = [states], [squares]
+            for share in STEP_SHARES:
+                tried.append(self.settle(theta, states + share * np.array(steps)))
+                all_squares.append(self.compute_squares(theta, tried[-1]))
+            best = np.argmin(all_squares, axis=0)
+            states, new_squares = np.array(tried)[best, runs], np.array(all_squares)[best, runs]
+            is_converged = new_squares.sum() > (1.0 - MIN_STEP_DECREASE) * squares.sum()
+            squares = new_squares
+            if is_converged:
+                break
+        return states
+
+    def _simulate_residuals(self, theta: Array, states: Array) -> Array:
+        """Return the residuals (R, T, C) of simulations from first states, in units of the noise.
+
+        A sample that is not recorded has a residual of zero.
+
+        Args:
+            theta: (P,) parameters of the model.
+            states: (R, 2 D) positions and velocities of D coordinates in R runs.
+        """
+        number = len(states)
+        simulated = self.evaluator.simulate(np.tile(theta, (number, 1)), np.arange(number), states)
+        with np.errstate(all="ignore"):
+            residuals: Array = (self.evaluator.observed - simulated) / self.noise.sigma
+        residuals[~self.runs.recorded] = 0.0
+        return residuals
+
+    def compute_squares(self, theta: Array, states: Array) -> Array:
+        """Return the sum of squared residuals of each run (R,); infinite if it diverges.
+
+        Args:
+            theta: (P,) parameters of the model.
+            states: (R, 2 D) positions and velocities of D coordinates in R runs.
+        """
+        with np.errstate(all="ignore"):
+            squares = np.square(self._simulate_residuals(theta, states)).sum(axis=(1, 2))
+        result: Array = np.where(np.isfinite(squares), squares, np.inf)
+        return result
 
     def settle(self, theta: Array, states: Array, is_other_geometry: bool = False) -> Array:
         """Return first states (R, 2 D) near given ones at which the contacts are in equilibrium.

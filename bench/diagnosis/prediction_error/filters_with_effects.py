@@ -25,6 +25,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
+from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.effect import members_of
 from sims.core.simulator import Array
@@ -427,7 +428,8 @@ class ModelFilters:
         """Return a start with the first states of its own model, and derivatives by them.
 
         For a robot on the ground, another radius or mass has contacts of another depth, and the
-        derivatives depend on which contacts are closed.
+        derivatives depend on which contacts are closed. Coefficients and first states are improved
+        in turn, because a joint fit leaves the states with settled contacts, and stops there.
 
         Args:
             start: start of a fit.
@@ -441,9 +443,22 @@ class ModelFilters:
         )
         if not followed.has_expected_innovations:
             return start
+        states = followed.improve_first_states(start.theta, followed.get_first_states())
+        refined = SettledSimulations(self.evaluator, followed, states).refine(start)
+        settled = followed.settle(refined.theta, states, is_other_geometry=True)
+        refined_states = followed.improve_first_states(refined.theta, settled)
+        costs = [
+            followed.compute_squares(theta, first_states).sum()
+            for theta, first_states in (
+                (start.theta, states),
+                (refined.theta, refined_states),
+            )
+        ]
+        if costs[1] < costs[0]:
+            start, states = refined, refined_states
         return replace(
             start,
-            initial_states=followed.get_first_states(),
+            initial_states=states,
             state_jacobian=followed.compute_state_sensitivities(),
         )
 

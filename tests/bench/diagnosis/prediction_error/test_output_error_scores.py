@@ -92,9 +92,9 @@ def test_the_response_to_a_radius_is_that_of_rolling(scores):
 
 
 def test_a_planted_radius_explains_most_of_the_residual(scores):
-    start = scores.refine(scores.list_starts()[0])
+    start = scores.simulations.refine(scores.list_starts()[0])
     assert start.effects == ("geom.radius@left_tyre",)
     (index,) = scores.context.evaluator.get_coefficient_indices("geom.radius@left_tyre")
     assert start.theta[index] == pytest.approx(PLANTED, rel=0.05)
-    base_cost = scores.compute_cost(scores.context.filters.base.theta)
-    assert scores.compute_cost(start.theta) < 0.2 * base_cost
+    base_cost = scores.simulations.compute_cost(scores.context.filters.base.theta)
+    assert scores.simulations.compute_cost(start.theta) < 0.2 * base_cost
