@@ -2,8 +2,8 @@
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
 # make test      the tests that take a few seconds each (about 6 minutes on two cores)
-# make test-all  these and the slow ones: exams, comparisons, clusters, kills (about 15 minutes)
-# make test-rest the slow ones and those that depend on recordings beside the clone
+# make test-rest the slow ones and those that depend on recordings beside the clone, as in CI
+# make test-all  all of them, those of minutes too: whole examples, exams and clusters (30 minutes)
 # make check     lint, types, import rules and language
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
 # make exam      hides causes in hundreds of recordings and has explain find them (10 minutes; QUICK=--quick, EXAM=robots)
@@ -34,6 +34,7 @@ install:
 COMMA := ,
 LARGE := torch pybullet
 LEFT_OUT := $(subst $(COMMA), ,$(WITHOUT))
+SELDOM := /(tests|testing|pip|mypyc?|debugpy|OpenGL|jedi|IPython|playwright|pybullet_envs|_inductor|_vendor)/
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 $(STAMP): requirements.lock requirements-explain.txt pyproject.toml
@@ -48,9 +49,9 @@ else
 	$(PIP) install --no-compile --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
 	$(PIP) install --no-deps --no-build-isolation --editable .
 endif
-	@# pip would compile on one core. A package may have files for another version of Python. Nobody
-	@# imports the tests of packages, a quarter of all files.
-	$(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests/' $(VENV)/lib bench methods sims simgap.py || true
+	@# pip would compile on one core. A package may have files for another version of Python. Files
+	@# that few commands import are compiled when they are imported: two fifths of all.
+	$(BIN)/python -W ignore -m compileall -qq -j 0 -x '$(SELDOM)' $(VENV)/lib bench methods sims simgap.py || true
 	$(BIN)/python -m bench.diagnosis.kalman.precompile
 	$(BIN)/python -m bench.pages.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@
@@ -76,13 +77,13 @@ robot: $(STAMP)
 PYTEST := $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not long"
 
 test-all: $(STAMP)
 	$(PYTEST)
 
 test-rest: $(STAMP)
-	$(PYTEST) -m "slow or data"
+	$(PYTEST) -m "(slow or data) and not long"
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -107,7 +107,7 @@ def undrawn():
         yield
 
 
-SLOW_OR_DATA = "slow or data"
+SLOW_OR_DATA = "(slow or data) and not long"
 """Marker expression of `make test-rest`."""
 
 

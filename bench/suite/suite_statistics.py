@@ -119,12 +119,8 @@ class SuiteTables:
         Args:
             cell: Name of the problem and range.
         """
-        curves = self.curves[cell]
         with np.errstate(invalid="ignore"):
-            medians = [
-                np.median(curves.select(tuner=tuner).values[:, -1])
-                for tuner in curves.list_tuners()
-            ]
+            medians = [np.median(c.values[:, -1]) for c in self._tuner_curves[cell].values()]
         return min((float(m) for m in medians if np.isfinite(m)), default=0.0)
 
     @cached_property
@@ -144,12 +140,10 @@ class SuiteTables:
             k: number of simulations.
             training: `FREE` or `COUNTED`.
         """
-        curves, columns = self.curves[cell], {}
-        for tuner in curves.list_tuners():
-            tuner_curves = curves.select(tuner=tuner)
+        columns = {}
+        for tuner, means in self._target_means[cell].items():
             share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
-            column = tuner_curves.values[:, max(int(k - share), 0)]
-            target_means = pd.Series(column).groupby(tuner_curves.keys["target"]).mean()
+            target_means = means[max(int(k - share), 0)]
             if share > k:
                 start_errors = self._start_errors[cell].reindex(target_means.index)
                 target_means = start_errors.fillna(target_means)
@@ -157,6 +151,28 @@ class SuiteTables:
             logs = compute_log_errors(means_array, self.floors[cell])
             columns[tuner] = pd.Series(logs, index=target_means.index)
         return pd.DataFrame(columns)
+
+    @cached_property
+    def _tuner_curves(self) -> dict[str, dict[str, RunCurves]]:
+        """Curves of the runs of each tuner, by cell and tuner."""
+        return {
+            cell: {tuner: curves.select(tuner=tuner) for tuner in curves.list_tuners()}
+            for cell, curves in self.curves.items()
+        }
+
+    @cached_property
+    def _target_means(self) -> dict[str, dict[str, pd.DataFrame]]:
+        """Mean errors over seeds, by cell and tuner.
+
+        Each table has a row per target and a column per number of simulations.
+        """
+        return {
+            cell: {
+                tuner: pd.DataFrame(curves.values).groupby(curves.keys["target"]).mean()
+                for tuner, curves in by_tuner.items()
+            }
+            for cell, by_tuner in self._tuner_curves.items()
+        }
 
     @cached_property
     def _start_errors(self) -> dict[str, pd.Series[float]]:
@@ -233,9 +249,8 @@ class SuiteTables:
         lines = []
         for simulations in self.checkpoints:
             ranks = self.get_ranks(simulations)
-            for cell, curves in self.curves.items():
-                for tuner in curves.list_tuners():
-                    tuner_curves = curves.select(tuner=tuner)
+            for cell, by_tuner in self._tuner_curves.items():
+                for tuner, tuner_curves in by_tuner.items():
                     with np.errstate(invalid="ignore"):
                         median = float(np.median(tuner_curves.values[:, simulations]))
                     counts = tuner_curves.keys["target"].nunique(), int(tuner_curves.failed.sum())
@@ -329,8 +344,7 @@ class SuiteTables:
                 if row.range == "real"
                 else list(ERROR_LEVELS)
             )
-            for tuner in self.curves[cell].list_tuners():
-                curves = self.curves[cell].select(tuner=tuner)
+            for tuner, curves in self._tuner_curves[cell].items():
                 share = self._get_training_share(cell, tuner)
                 for number, threshold in enumerate(levels, 1):
                     lines.append(

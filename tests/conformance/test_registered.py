@@ -20,9 +20,19 @@ def subject(registry, name):
         pytest.skip(f"{name}: {reason}")
 
 
+LONG = ("hybrid", "in_context", "tunenet-published", "tunenet-vision")
+"""Tuners whose networks train for minutes, and whose base class another tuner shares."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", tuners.names())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.long] if name in LONG else [])
+        for name in tuners.names()
+    ],
+)
 def test_tuner(name, check):
     kind = subject(tuners, name)
     if reason := kind.known_failures.get(check.__name__):

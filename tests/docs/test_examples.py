@@ -29,7 +29,7 @@ def test_the_experiment_of_the_page_loads_as_described(tmp_path):
     assert [entry.tuner for entry in experiment.tuners] == ["least_squares", "cma_es", "random"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_simulator_of_the_page_does_what_the_page_says(tmp_path):
     page = "own-simulator.md"
     (tmp_path / "cart.py").write_text(block(page, "cart.py"), encoding="utf-8")
@@ -83,7 +83,7 @@ def table_commands():
     return [shlex.split(line)[1:] for line in lines if line.startswith("simgap ")]
 
 
-@pytest.mark.slow(seconds=45)
+@pytest.mark.long
 def test_the_commands_of_the_readme_work_as_written_in_a_clone_that_stands_alone(tmp_path):
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     env = {k: v for k, v in os.environ.items() if k not in ("SIMGAP_DATA", "SIMGAP_ROBOTS")}

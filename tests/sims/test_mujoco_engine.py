@@ -154,7 +154,7 @@ def test_soft_contact_sinks_in_by_weight_over_stiffness():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Ball, Slider])
+@pytest.mark.parametrize("kind", [Slider, pytest.param(Ball, marks=pytest.mark.long)])
 def test_four_thousand_rollouts_leak_nothing(kind):
     assert growth(kind, 4_000, 4, [{}], engine="mujoco") < 4_000 * 250
 

@@ -299,7 +299,7 @@ def test_world_that_cannot_be_had_is_skipped_with_its_reason(
     assert "skipped: the world needs mujoco" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path, capsys):
     assert "bounce-shot" in list_experiment_names()
     text = f"""{SMALL}

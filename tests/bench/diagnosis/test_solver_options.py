@@ -120,7 +120,7 @@ def test_a_planted_cone_is_the_only_cause_and_is_written_into_the_model_file(tmp
     assert 'cone = "elliptic"' in (tmp_path / "out" / "extended.toml").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
     changed = ('friction="0.6"', 'friction="0.7"')
     answer = explain(write_block_recording(tmp_path, change=changed, samples=100)).answer
@@ -128,7 +128,7 @@ def test_wrong_friction_is_not_explained_by_an_option(tmp_path):
     assert answer.causes[0].coefficients["coefficient"].value == pytest.approx(0.1, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_integrator_that_hardly_shows_is_the_only_cause(tmp_path):
     """The residual is 1.2 times the noise, and the coarser integrator made the recording."""
     changed = (OPTIONS, 'integrator="Euler"')
@@ -138,7 +138,7 @@ def test_an_integrator_that_hardly_shows_is_the_only_cause(tmp_path):
     assert answer.causes[0].coefficients["coefficient"].value == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_solver_that_does_not_converge_is_named_with_its_iterations(tmp_path):
     path = write_block_recording(tmp_path, 'solver="PGS" iterations="3"', samples=100)
     answer = explain(path).answer

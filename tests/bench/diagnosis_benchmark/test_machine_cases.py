@@ -115,7 +115,7 @@ DRAWN_CASES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("system", "name"), DRAWN_CASES)
 def test_each_effect_agrees_with_the_library(system, name, arm):
     c = SOMEWHERE[name.partition("@")[0]]
@@ -179,7 +179,11 @@ def case_of(item, folder):
 
 
 @pytest.mark.parametrize(
-    ("system", "effect"), [("servo", "friction.coulomb"), ("arm2", "input.delay")]
+    ("system", "effect"),
+    [
+        pytest.param("servo", "friction.coulomb", marks=pytest.mark.long),
+        ("arm2", "input.delay"),
+    ],
 )
 def test_residuals_have_the_size_of_the_hidden_effect(system, effect, tmp_path):
     item = draw_case("single", system, 11, effect, 6.0, RequestedConditions(50, 3))

@@ -15,6 +15,9 @@ from bench.diagnosis_benchmark.case_set import draw_case, render_recording
 
 PUBLISHED = json.loads(Path(__file__).with_name("published_cases.json").read_text())
 
+LONG = ("single/servo/friction.stribeck/3", "foreign/servo/gust/3", "single/arm2/input.lag/3")
+"""Cases that take more than five seconds."""
+
 
 def measure(kind, system, effect, seed):
     """Return hidden coefficients by effect, and RMS values by column of the recording."""
@@ -25,7 +28,10 @@ def measure(kind, system, effect, seed):
     return {name: list(c) for name, c in case.effects.items()}, sizes
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in PUBLISHED],
+)
 def test_a_published_case_is_drawn_as_before(name):
     kind, system, effect, seed = name.split("/")
     effects, sizes = measure(kind, system, effect, int(seed))

@@ -23,7 +23,7 @@ def started(tmp_path):
         yield running
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_nothing(
     started, tmp_path
 ):
@@ -57,7 +57,7 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     same(folder, tmp_path / "local")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_resume(
     started, tmp_path
 ):
@@ -115,7 +115,7 @@ shot = { balls = ["golf"] }
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_path):
     """Recordings and weights are sent to the workers, which do not use paths of this machine."""
     (tmp_path / "shot.toml").write_text(SHOT)

@@ -48,11 +48,13 @@ def test_a_case_shows_its_discrepancy_and_a_clean_one_has_none():
     [
         (ContactQuestion("single", "hopper", "contact.damping", 1), 1.5),
         # The held-out run is explained only from states that belong to the fitted number.
-        (ContactQuestion("single", "arm", "contact.damping", 0), 1.5),
+        pytest.param(
+            ContactQuestion("single", "arm", "contact.damping", 0), 1.5, marks=pytest.mark.long
+        ),
         # The first state of the held-out run has to be found by simulation.
-        (ContactQuestion("clean", "hopper", "any", 2), inf),
+        pytest.param(ContactQuestion("clean", "hopper", "any", 2), inf, marks=pytest.mark.long),
         # The smoothed initial states leave a residual of 1.3 times the noise.
-        (ContactQuestion("clean", "arm", "any", 0), inf),
+        pytest.param(ContactQuestion("clean", "arm", "any", 0), inf, marks=pytest.mark.long),
     ],
     ids=lambda part: getattr(part, "name", None),
 )
@@ -60,7 +62,7 @@ def test_the_command_names_a_wrong_contact_and_no_other(question, seconds, tmp_p
     assert answer(question, tmp_path, seconds).strict
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_joint_damping_of_a_hopper_is_one_of_two_equivalent_causes(tmp_path):
     # The damping of the servo is the same number as that of the joint.
     assert answer(ContactQuestion("single", "hopper", "drag.linear", 0), tmp_path, inf).few

@@ -43,6 +43,15 @@ SEEDS = {
 """By convention, the seed of a log that breaks it, and the expected message."""
 QUICK = ("exchanged positions",)
 """Conventions of the fast tests."""
+SLOW = ("sign of both", "zero of both", "unit of all", "late commands")
+"""Conventions of the slow tests; the others differ from these in what they concern."""
+
+
+def mark(broken):
+    """Return a broken convention with the mark of its duration."""
+    if broken in QUICK:
+        return broken
+    return pytest.param(broken, marks=pytest.mark.slow if broken in SLOW else pytest.mark.long)
 
 
 def check(path):
@@ -50,9 +59,7 @@ def check(path):
     return ConventionComparison(Subject(kind, recording, None))
 
 
-@pytest.mark.parametrize(
-    "broken", [b if b in QUICK else pytest.param(b, marks=pytest.mark.slow) for b in BROKEN]
-)
+@pytest.mark.parametrize("broken", [mark(broken) for broken in BROKEN])
 def test_a_broken_convention_is_found_and_its_correction_leaves_none(broken, tmp_path, capsys):
     seed, message = SEEDS[broken]
     log = write_log(tmp_path / "log", seed, broken)
@@ -96,6 +103,7 @@ def test_soft_friction_is_not_taken_for_another_zero(tmp_path):
     assert comparison.differences() == []
 
 
+@pytest.mark.long
 def test_a_model_that_diverges_between_samples_gives_no_difference(tmp_path):
     """Milliseconds read as seconds: in 20 s an unstable joint exceeds the range of numbers."""
     model = valid_input.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')

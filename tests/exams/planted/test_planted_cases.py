@@ -72,7 +72,12 @@ def errors(model, item, path):
 
 @pytest.mark.parametrize(
     "name",
-    ["walker-servo/kp/0", "walker-servo/damping/0", "reacher/armature/1", "pusher/frictionloss/0"],
+    [
+        pytest.param("walker-servo/kp/0", marks=pytest.mark.long),
+        pytest.param("walker-servo/damping/0", marks=pytest.mark.long),
+        "reacher/armature/1",
+        "pusher/frictionloss/0",
+    ],
 )
 def test_a_model_file_with_the_planted_number_fits_the_data(name, tmp_path):
     item = drawn(name)
@@ -104,6 +109,7 @@ def test_a_planted_mass_equals_a_changed_urdf():
     assert model.body_subtreemass[1] == pytest.approx(expected.body_subtreemass[1])
 
 
+@pytest.mark.long
 def test_a_case_is_drawn_the_same_every_time(tmp_path):
     first, second = drawn("reacher/damping/0"), drawn("reacher/damping/0")
     assert first == second
@@ -116,6 +122,7 @@ def test_a_case_is_drawn_the_same_every_time(tmp_path):
     assert first.change.effect == f"drag.linear@{first.place}"
 
 
+@pytest.mark.long
 def test_no_file_of_a_recording_names_the_answer(tmp_path):
     item = drawn("walker-servo/armature/0")
     path = item.write(tmp_path)

@@ -60,7 +60,13 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long) if "kuka" in name else name  # seven joints
+        for name in CASES
+    ],
+)
 def test_a_cause_hidden_in_an_unchanged_model_file_is_found(name, tmp_path):
     case = CASES[name]
     if not case.path.exists():

@@ -195,6 +195,7 @@ def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
     assert np.pi / np.mean(np.diff(turns)) == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.long
 def test_backlash_decouples_the_link_within_its_gap():
     """The motor has a tenth of the roller's inertia and moves alone until it meets the flank."""
     gap = 0.02

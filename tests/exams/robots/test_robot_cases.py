@@ -16,6 +16,8 @@ from tests.exams.robots.cause_sizing import CompetingCauses
 from tests.exams.robots.reference_world import Run, World
 from tests.exams.robots.robot_signals import observed
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def item():

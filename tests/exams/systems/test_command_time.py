@@ -12,6 +12,8 @@ CASES = (
     ("slider", "friction.load", 2), ("slider", "wind", 2), ("pendulum", "spring.cubic", 3),
     ("slider", "input.bias", 3),
 )  # fmt: skip
+LONG = ("spring.cubic", "input.bias")
+"""Effects of the cases that take more than twenty seconds."""
 COMPUTE_APPLIED_INPUT = joint_reference.compute_applied_input
 
 
@@ -35,7 +37,13 @@ def sets_of(explained):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=[effect for _, effect, _ in CASES])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case[1], marks=[pytest.mark.long] if case[1] in LONG else [])
+        for case in CASES
+    ],
+)
 def test_interpolated_commands_and_the_hidden_cause_are_both_named(case, tmp_path, monkeypatch):
     item = drawn(*case)
     moved(monkeypatch, **{"input.hold": (1.0,)})

@@ -51,7 +51,7 @@ def test_it_moves_as_mujoco_moves_the_model_with_a_dragging_bearing():
     np.testing.assert_allclose(read_angles(poses), read_angles(rows), atol=5e-3)
 
 
-@pytest.mark.slow(seconds=50)
+@pytest.mark.long
 def test_the_dragging_bearing_is_found():
     answer = explain(EXAMPLE / "log.csv").answer
     assert [cause.effect for cause in answer.causes] == ["drag.linear@left"]

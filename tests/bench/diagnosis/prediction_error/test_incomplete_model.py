@@ -54,7 +54,7 @@ def error_in_segments(log, extended_path, seconds):
     return float(np.sqrt(np.mean(error**2)))
 
 
-@pytest.mark.slow(seconds=50)
+@pytest.mark.long
 def test_mass_and_friction_of_the_emps_are_those_of_inverse_dynamics(tmp_path):
     """Published: 95.11 kg; by direction 166.7 and 240.4 N s/m, 20.14 and 20.63 N."""
     log, answer, extended = explained("emps", tmp_path)
@@ -72,7 +72,7 @@ def test_mass_and_friction_of_the_emps_are_those_of_inverse_dynamics(tmp_path):
     assert error_in_segments(log, extended, 0.5) < 0.1225e-3
 
 
-@pytest.mark.slow(seconds=70)
+@pytest.mark.slow(seconds=40)
 def test_inertias_stated_about_the_joints_and_dry_friction_are_found(tmp_path):
     """The file has 0.0319 and 0.0509 kg m^2 for 0.0109 and 0.0100 kg m^2."""
     _, answer, _ = explained("dfki_double_pendulum", tmp_path)
