@@ -11,9 +11,9 @@ method::
             return "adequate"
 
 Its input is what a user has (`DiagnosisCase`): the recording, the simulator, the library of
-effects, the
-noise if it is stated, and held-out runs. It never gets the true causes, nor anything from which
-they follows. It returns an `Answer`, a word of `VERDICTS`, or a dictionary like verdict.json.
+effects, the noise if it is stated, and held-out runs. It never gets the true causes, nor anything
+from which they follow. It returns an `Answer`, a word of `VERDICTS`, or a dictionary like
+verdict.json.
 """
 
 from __future__ import annotations

@@ -230,15 +230,15 @@ class PinholeCamera:
     def estimate_heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
         """Estimate the heights of a ball on a vertical line from the centres of its outlines.
 
-        A point on that vertical is linear in z, base + z up. Multiplied by Z, both equations (2)
-        are
-        linear in z; with k = (u - u0, v - v0) / f they read
+        In the camera frame, whose third axis Z is the depth, a point on that vertical line is
+        base + z up. The projection (2) says that its first two coordinates are k times its depth,
+        with the pixel coordinates k = (u - u0, v - v0) / f. So
 
             (7)  (base_XY - k base_Z) + z (up_XY - k up_Z) = 0
 
-        and are solved for z by least squares. The small offset between outline and projected centre
-        is
-        subtracted iteratively.
+        These two equations are solved for z by least squares. The outline of a ball is not centred
+        at the projection of its centre; this small offset is computed from the height found, and
+        subtracted from the pixels, a few times.
 
         Args:
             centres: Centres of the outlines (..., 2), pixels.
@@ -251,13 +251,13 @@ class PinholeCamera:
         """
         pixels = np.asarray(centres, dtype=np.float64)
         base = self.to_camera_frame((x, y, 0.0))
-        vertical = self.axes[:, 2]
+        up = self.axes[:, 2]
         shift: Array = np.zeros_like(pixels)
         z: Array = np.full(pixels.shape[:-1], np.nan)
         for _ in range(_REFINEMENT_COUNT):
-            ratio = (pixels - shift - self.principal_point) / self.focal
-            constant = base[:2] - ratio * base[2]
-            slope = vertical[:2] - ratio * vertical[2]
+            k = (pixels - shift - self.principal_point) / self.focal
+            constant = base[:2] - k * base[2]
+            slope = up[:2] - k * up[2]
             constant_product = (constant * slope).sum(axis=-1)
             square = (slope * slope).sum(axis=-1)
             z = -constant_product / square  # (7)

@@ -847,6 +847,8 @@ class FollowedRuns:
         """
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
+        # They bound how far from closed a contact is that may be closed. Another geometry moves
+        # the points of contact by more than the noise.
         factor = MEASURED_PRIOR if is_other_geometry else 1.0
         noise = _get_noise_of_states(self.evaluator, self.noise)
         deviations = factor * noise[0], factor * noise[1]

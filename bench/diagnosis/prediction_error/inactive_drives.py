@@ -454,10 +454,11 @@ class _Intervals:
         ]
 
     def _compute_largest_errors(self, masks: Sequence[Mask], length: int) -> list[float]:
-        """Return the largest force error of the model's drive in a window, by joint.
+        """Return the largest force error of the model's drive in any fully active window, by joint.
 
         The error in an inactive interval is compared with it: a model whose drive is wrong in other
-        short windows too does not show that the drive is off.
+        short windows too does not show that the drive is off. A force error is the missing force
+        under the hypothesis that the drive is on (row `ON` of the residuals of a joint and run).
 
         Args:
             masks: (T,) samples of each run in which the drive is active.
@@ -466,11 +467,12 @@ class _Intervals:
         largest = [0.0] * len(self._joints)
         for run, mask in enumerate(masks):
             for first in range(0, mask.size - length + 1, max(length // 2, 1)):
-                if not mask[first : first + length].all():
+                window = slice(first, first + length)
+                if not mask[window].all():
                     continue
-                for place, of_runs in enumerate(self._residuals):
-                    error = _compute_magnitude(of_runs[run][ON, first : first + length])
-                    largest[place] = max(largest[place], error)
+                for joint, residuals_by_run in enumerate(self._residuals):
+                    error = _compute_magnitude(residuals_by_run[run][ON, window])
+                    largest[joint] = max(largest[joint], error)
         return largest
 
     def _is_at_rest(

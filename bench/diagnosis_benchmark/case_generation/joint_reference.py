@@ -187,7 +187,7 @@ class ReferenceLoad(ABC):
             weight: gravity force of both together, as a function of position.
             share: fraction of both that belongs to the load.
         """
-        self.whole, self.inertia, self.weight = inertia, share * inertia, weight
+        self.total_inertia, self.inertia, self.weight = inertia, share * inertia, weight
         self.share = share
 
     @abstractmethod
@@ -220,13 +220,16 @@ class ReferenceLoad(ABC):
     def rates(self, x: float, v: float, y: float, w: float) -> tuple[float, float]:
         """Compute the time derivatives of the load's states: its velocity and its acceleration.
 
+        The acceleration by the drive side does not include gravity. Gravity accelerates drive side
+        and load alike, by the weight of both over the inertia of both.
+
         Args:
             x: position of the drive side.
             v: velocity of the drive side.
             y: position of the load.
             w: velocity of the load.
         """
-        return w, self.compute_load_acceleration(x, v, y, w) + self.weight(y) / self.whole
+        return w, self.compute_load_acceleration(x, v, y, w) + self.weight(y) / self.total_inertia
 
 
 class FlexibleReferenceLoad(ReferenceLoad):
@@ -254,7 +257,7 @@ class FlexibleReferenceLoad(ReferenceLoad):
             x: initial position of the drive side, rad or m.
             v: its initial velocity.
         """
-        return x + self.weight(x) / self.whole / self.frequency**2, v
+        return x + self.weight(x) / self.total_inertia / self.frequency**2, v
 
     def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
         """Compute the acceleration of the load by spring and damper; see `ReferenceLoad`.

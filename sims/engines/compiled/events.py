@@ -480,8 +480,10 @@ def handle_standstill(block: Block, i: int) -> None:
     """
     a = block.a
     d = block.flags[DIMENSIONS]
-    deceleration = dot(a, K4, DIRECTION, d, i)
-    correction = -dot(a, V, DIRECTION, d, i) / deceleration if deceleration < 0.0 else 0.0
+    # K4 holds the acceleration at the end of the step. A Newton step leads to the time at which
+    # the velocity along the direction of motion is zero.
+    acceleration = dot(a, K4, DIRECTION, d, i)
+    correction = -dot(a, V, DIRECTION, d, i) / acceleration if acceleration < 0.0 else 0.0
     correction = shift_time(block, i, correction)
     for k in range(d):
         a[X + k, i] += correction * a[V + k, i]
