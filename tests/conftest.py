@@ -3,6 +3,7 @@ import os
 import signal
 from collections import Counter
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 
@@ -107,6 +108,25 @@ def undrawn():
         yield
 
 
+def pytest_addoption(parser):
+    parser.addoption("--part", metavar="K/N", help="of the slow test files, the Kth of N parts")
+
+
+def is_in_part(path, part):
+    """Return whether a test file belongs to a part.
+
+    Parts are drawn by the name of the file, so that they have similar durations.
+
+    Args:
+        path: path of the file.
+        part: number of the part from 1, and number of parts, as "1/3"; None for all files.
+    """
+    if part is None:
+        return True
+    number, count = map(int, part.split("/"))
+    return crc32(path.name.encode()) % count == number - 1
+
+
 SLOW_OR_DATA = "(slow or data) and not long"
 """Marker expression of `make test-rest`."""
 
@@ -117,7 +137,11 @@ def pytest_ignore_collect(collection_path, config):
     Each worker would import them, which takes half of the time of the collection.
     """
     is_test_file = collection_path.match("test_*.py")
-    if is_test_file and config.getoption("markexpr") == SLOW_OR_DATA:
+    if not is_test_file:
+        return None
+    if not is_in_part(collection_path, config.getoption("part")):
+        return True
+    if config.getoption("markexpr") == SLOW_OR_DATA:
         return True if not can_be_slow_or_data(collection_path.read_text()) else None
     return None
 

@@ -2,7 +2,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import SLOW_OR_DATA, pytest_collection_modifyitems, pytest_ignore_collect
+from tests.conftest import (
+    SLOW_OR_DATA,
+    is_in_part,
+    pytest_collection_modifyitems,
+    pytest_ignore_collect,
+)
 from tests.data_dependence import find_data_dependent_names
 
 MODULE = """
@@ -53,7 +58,7 @@ class Config:
         self.expression = expression
 
     def getoption(self, name):
-        return {"markexpr": self.expression}[name]
+        return {"markexpr": self.expression, "part": None}[name]
 
 
 @pytest.mark.parametrize(
@@ -84,4 +89,12 @@ def test_a_mark_that_the_source_does_not_show_stops_the_collection(request, monk
 
 def test_the_makefile_uses_the_expression_for_which_files_are_ignored():
     makefile = Path(__file__).parents[1] / "Makefile"
-    assert f'test-rest: $(STAMP)\n\t$(PYTEST) -m "{SLOW_OR_DATA}"\n' in makefile.read_text()
+    assert f'test-rest: $(STAMP)\n\t$(PYTEST) -m "{SLOW_OR_DATA}" ' in makefile.read_text()
+
+
+def test_each_test_file_is_in_one_part():
+    paths = sorted(Path(__file__).parent.rglob("test_*.py"))
+    parts = [[path for path in paths if is_in_part(path, f"{number}/3")] for number in (1, 2, 3)]
+    assert sorted(path for part in parts for path in part) == paths
+    assert all(len(part) > 0.25 * len(paths) for part in parts)
+    assert all(is_in_part(path, None) for path in paths)

@@ -17,7 +17,7 @@ def test_every_public_name_is_on_the_page():
     assert [name for name in dir(simgap) if name not in page and not name.startswith("_")] == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     code = "\n".join(text for _, text in blocks(text_of("python.md"), "python"))
     (tmp_path / "page_on_python.py").write_text(code, encoding="utf-8")

@@ -243,7 +243,7 @@ def test_a_plugins_simulator_without_forces_is_explained(tmp_path):
     assert {"stiffness", "damping"} == set(found.answer.parameters)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_plugins_simulator_with_forces_is_explained(tmp_path):
     pytest.importorskip("pybullet")
     load_plugins([EXAMPLES / "puck.py"])

@@ -165,7 +165,7 @@ def test_explain_says_the_form_and_its_files_reproduce_it(tmp_path, monkeypatch,
     assert errors[0]["normalised_rmse"] < 1.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
     """The form is a parameter, not a cause: the files contain it and the user is informed."""
 

@@ -149,7 +149,7 @@ def test_names_that_look_like_formulas_are_text_and_numbers_have_their_range():
     assert summarise_causes(rows) == ["force.bias@a or x: in 2 of 2 logs, k 1 to 3.5 N"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_finds_what_this_machine_finds(logs, explained_logs, tmp_path):
     there = tmp_path / "there"
     with cluster(tmp_path) as running:

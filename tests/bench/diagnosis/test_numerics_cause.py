@@ -161,7 +161,7 @@ def test_data_made_with_the_files_own_step_are_not_explained_by_another(tmp_path
         assert value == pytest.approx(0.3, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_coarse_step_is_found_with_a_cause(tmp_path):
     answer = explain(log(tmp_path, DAMPED, divide=4, integrator="RK4")).answer
     step, cause = answer.causes

@@ -108,7 +108,7 @@ def test_a_flight_that_the_model_predicts_is_adequate(tmp_path):
     assert explain(write_flights(tmp_path, keep), jobs=1).answer.verdict == "adequate"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_weak_rotor_of_the_example_is_named_and_written_into_the_file(tmp_path):
     log, out = EXAMPLE / "log.csv", tmp_path / "mine"
     assert main(["explain", str(log), "--out", str(out), "--jobs", "1"]) == 0

@@ -46,7 +46,7 @@ def test_the_width_is_that_of_the_fit(tmp_path):
     assert by_name["drag.linear"].word == "identifiable"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_called_identifiable_has_intervals_that_hold(tmp_path):
     held = []
     for seed in range(18):

@@ -175,7 +175,7 @@ def test_an_encoder_that_is_a_quarter_turn_off_is_refused_and_named_if_the_user_
     assert cause.coefficients["coefficient"].value == pytest.approx(1.57, abs=5e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_swapped_joints_are_refused_and_have_no_cause_that_would_explain_them(tmp_path):
     path = table_of(tmp_path, lambda v: v[:, [0, 1, 3, 2]])
     with pytest.raises(InputError, match="channels of shoulder, elbow look exchanged"):

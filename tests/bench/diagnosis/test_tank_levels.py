@@ -54,7 +54,7 @@ def test_the_simulator_follows_the_solver_to_a_third_of_the_noise(log_script, ri
     assert (exact[:, 0].max() == rim) == (rim == log_script.RIM)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_rim_is_named_with_its_height(log_script):
     answer = explain(RECORDING).answer
     (cause,) = answer.causes

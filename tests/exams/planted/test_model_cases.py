@@ -97,7 +97,7 @@ def test_unmeasured_joints_of_a_loop_have_no_channel():
     assert "left_knee" in experiment.places
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_large_armature_and_the_inertia_of_its_body_are_equals(tmp_path):
     # The regression is linear and far off; the competing filter needs several steps.
     case = drawn("quadruped-hanging", 1)
@@ -109,7 +109,7 @@ def test_a_large_armature_and_the_inertia_of_its_body_are_equals(tmp_path):
     assert {cause["effect"], *cause["alternatives"]} == {case.change.effect, "inertia.scale@RR_hip"}
 
 
-@pytest.mark.slow(seconds=14)
+@pytest.mark.long
 def test_wheels_that_roll_as_the_file_says_raise_no_alarm(tmp_path):
     """The noise of the recorded pose is larger than the depth of the contacts, 0.15 mm."""
     case = drawn("differential-drive", -1)

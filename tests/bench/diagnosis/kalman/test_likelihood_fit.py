@@ -76,7 +76,7 @@ def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypat
     assert not stopped.causes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mass_is_identified_with_friction_that_the_file_lacks(answer):
     """Without friction in the model, the fitted mass would be ten times too large."""
     assert answer.verdict == "named"

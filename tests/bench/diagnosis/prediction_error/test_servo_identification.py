@@ -85,7 +85,7 @@ def write_log(folder):
     return folder / "log.csv"
 
 
-@pytest.mark.slow(seconds=35)
+@pytest.mark.long
 def test_profiles_friction_and_stiffness_of_all_servos_are_found(tmp_path):
     """The model lacks two laws at each of four joints, and its stiffness is wrong."""
     answer = explain(write_log(tmp_path)).answer
