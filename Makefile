@@ -34,7 +34,7 @@ install:
 COMMA := ,
 LARGE := torch pybullet
 LEFT_OUT := $(subst $(COMMA), ,$(WITHOUT))
-SELDOM := /(tests|testing|pip|mypyc?|debugpy|OpenGL|jedi|IPython|playwright|pybullet_envs|_inductor|_vendor)/
+RARELY_IMPORTED := /(tests|testing|pip|mypyc?|debugpy|OpenGL|jedi|IPython|playwright|pybullet_envs|_inductor|_vendor)/
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 $(STAMP): requirements.lock requirements-explain.txt pyproject.toml
@@ -51,7 +51,7 @@ else
 endif
 	@# pip would compile on one core. A package may have files for another version of Python. Files
 	@# that few commands import are compiled when they are imported: two fifths of all.
-	$(BIN)/python -W ignore -m compileall -qq -j 0 -x '$(SELDOM)' $(VENV)/lib bench methods sims simgap.py || true
+	$(BIN)/python -W ignore -m compileall -qq -j 0 -x '$(RARELY_IMPORTED)' $(VENV)/lib bench methods sims simgap.py || true
 	$(BIN)/python -m bench.diagnosis.kalman.precompile
 	$(BIN)/python -m bench.pages.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@

@@ -279,7 +279,7 @@ class _FolderLogs:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
 
         Without stamps, they follow from the sampling rate, in seconds. Few repeated stamps are
-        tolerated (only the first row of each counts), many mean that the column is no clock.
+        tolerated (only the first row of each counts), many mean that the column is not a clock.
 
         Args:
             log: log: its columns of numbers by name.

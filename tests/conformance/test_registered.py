@@ -21,7 +21,7 @@ def subject(registry, name):
 
 
 LONG = ("hybrid", "in_context", "tunenet-published", "tunenet-vision")
-"""Tuners whose networks train for minutes, and whose base class another tuner shares."""
+"""Tuners that train longest: their checks take minutes of processor time."""
 
 
 @pytest.mark.slow

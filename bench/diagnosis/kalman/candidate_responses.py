@@ -711,26 +711,26 @@ class FollowedRuns:
 
     def _weight_first_states(self, states: Array) -> list[FirstState]:
         """Return first states (R, 2 D) of a robot on the ground with their weights."""
-        return [FirstState(*pair) for pair in zip(states, self._first_state_weights, strict=True)]
+        return [FirstState(*pair) for pair in zip(states, self.first_state_factors.r, strict=True)]
 
     @cached_property
-    def _first_state_weights(self) -> Array:
-        """Square roots W (R, 2 D, 2 D) of the inverse covariance of the first states.
-
-        With the derivatives H of the readings by the first state, their noise sigma, and the prior
-        standard deviations p of the first state,
-
-            W^T W = sum H^T H / sigma^2 + diag(1 / p^2)
-
-        is the Fisher information of the readings of the whole run, if no force is missing.
-        """
-        derivatives = self.compute_state_sensitivities() / self.noise.sigma[:, None]
-        derivatives[~self.runs.recorded] = 0.0
-        run_count, samples, channels, size = derivatives.shape
-        rows = derivatives.reshape(run_count, samples * channels, size)
+    def first_state_factors(self) -> FirstStateFactors:
+        """Information of the readings about the first states of a robot on the ground."""
+        derivatives = self.scale_by_noise(self.compute_state_sensitivities())
         prior = np.diag(1.0 / self._get_prior_of_measured_states())
-        rows = np.concatenate([rows, np.tile(prior, (run_count, 1, 1))], axis=1)
-        return np.array([np.linalg.qr(run_rows).R for run_rows in rows])
+        factors = [
+            np.linalg.qr(np.concatenate([rows.reshape(-1, len(prior)), prior]))
+            for rows in derivatives
+        ]
+        return FirstStateFactors(np.array([f.Q for f in factors]), np.array([f.R for f in factors]))
+
+    def scale_by_noise(self, values: Array) -> Array:
+        """Return values of the readings (R, T, C, ...) in units of the noise; 0 if not recorded."""
+        sigma = self.noise.sigma.reshape(-1, *[1] * (values.ndim - 3))
+        with np.errstate(all="ignore"):
+            scaled: Array = values / sigma
+        scaled[~self.runs.recorded] = 0.0
+        return scaled
 
     def _get_prior_of_measured_states(self) -> Array:
         """Return prior standard deviations (2 D,) in multiples of the noise of the positions.
@@ -781,21 +781,17 @@ class FollowedRuns:
         """
         runs = np.arange(len(states))
         squares = self.compute_squares(theta, states)
-        sensitivities = self.compute_state_sensitivities() / self.noise.sigma[:, None]
-        sensitivities[~self.runs.recorded] = 0.0
-        derivatives = sensitivities.reshape(len(states), -1, states.shape[1])
         for _ in range(MAX_FIRST_STATE_STEPS):
-            residuals = self._simulate_residuals(theta, states).reshape(len(states), -1)
-            steps = []
-            for rows, weights, residual in zip(
-                derivatives, self._first_state_weights, residuals, strict=True
-            ):
-                # W^T W = H^T H + diag(1 / p^2), so that W^T W step = H^T residual.
-                step = np.linalg.solve(weights.T, rows.T @ residual)
-                steps.append(np.linalg.solve(weights, step))
+            residuals = self.simulate_residuals(theta, states).reshape(len(states), -1)
+            steps = np.array(
+                [
+                    np.linalg.solve(r, q[: residual.size].T @ residual)
+                    for q, r, residual in zip(*self.first_state_factors, residuals, strict=True)
+                ]
+            )
             tried, all_squares = [states], [squares]
             for share in STEP_SHARES:
-                tried.append(self.settle(theta, states + share * np.array(steps)))
+                tried.append(self.settle(theta, states + share * steps))
                 all_squares.append(self.compute_squares(theta, tried[-1]))
             best = np.argmin(all_squares, axis=0)
             states, new_squares = np.array(tried)[best, runs], np.array(all_squares)[best, runs]
@@ -805,21 +801,24 @@ class FollowedRuns:
                 break
         return states
 
-    def _simulate_residuals(self, theta: Array, states: Array) -> Array:
-        """Return the residuals (R, T, C) of simulations from first states, in units of the noise.
-
-        A sample that is not recorded has a residual of zero.
+    def simulate(self, theta: Array, states: Array) -> Array:
+        """Simulate all runs (R, T, C) of a robot on the ground from given first states.
 
         Args:
             theta: (P,) parameters of the model.
             states: (R, 2 D) positions and velocities of D coordinates in R runs.
         """
         number = len(states)
-        simulated = self.evaluator.simulate(np.tile(theta, (number, 1)), np.arange(number), states)
-        with np.errstate(all="ignore"):
-            residuals: Array = (self.evaluator.observed - simulated) / self.noise.sigma
-        residuals[~self.runs.recorded] = 0.0
-        return residuals
+        return self.evaluator.simulate(np.tile(theta, (number, 1)), np.arange(number), states)
+
+    def simulate_residuals(self, theta: Array, states: Array) -> Array:
+        """Return the residuals (R, T, C) of simulations from first states, in units of the noise.
+
+        Args:
+            theta: (P,) parameters of the model.
+            states: (R, 2 D) positions and velocities of D coordinates in R runs.
+        """
+        return self.scale_by_noise(self.evaluator.observed - self.simulate(theta, states))
 
     def compute_squares(self, theta: Array, states: Array) -> Array:
         """Return the sum of squared residuals of each run (R,); infinite if it diverges.
@@ -829,7 +828,7 @@ class FollowedRuns:
             states: (R, 2 D) positions and velocities of D coordinates in R runs.
         """
         with np.errstate(all="ignore"):
-            squares = np.square(self._simulate_residuals(theta, states)).sum(axis=(1, 2))
+            squares = np.square(self.simulate_residuals(theta, states)).sum(axis=(1, 2))
         result: Array = np.where(np.isfinite(squares), squares, np.inf)
         return result
 
@@ -854,7 +853,7 @@ class FollowedRuns:
         deviations = factor * noise[0], factor * noise[1]
         settled = []
         for run_data, state, weights in zip(
-            self.evaluator.prepared_runs, states, self._first_state_weights, strict=True
+            self.evaluator.prepared_runs, states, self.first_state_factors.r, strict=True
         ):
             x, v = np.split(state, 2)
             start = settle_contacts(
@@ -915,6 +914,25 @@ class FirstState(NamedTuple):
 
     state: Array
     weights: Array
+
+
+class FirstStateFactors(NamedTuple):
+    """Factors of the derivatives H of the readings by the first states, with their prior.
+
+    H is in units of the noise, and p are the prior standard deviations of the first states:
+
+        Q R = [H; diag(1 / p)]
+
+    R^T R is the inverse covariance of the first states, if no force is missing. Columns of Q span
+    what first states explain.
+
+    Attributes:
+        q: (R, n, 2 D) Q of each run; its n rows are readings, then first states.
+        r: (R, 2 D, 2 D) R of each run.
+    """
+
+    q: Array
+    r: Array
 
 
 class _NoiseFit(NamedTuple):

@@ -113,7 +113,7 @@ class CauseSearch:
         Args:
             base: Base model, fitted with stiff friction.
             stiff_search: Search with stiff friction; its results are reused where they are valid.
-            likely: Model that may explain the runs, which is fitted first; None if there is none.
+            likely: Model that may explain the runs, which is fitted first; None without one.
         """
         stiff_runs, context = base.runs, base.runs.context
         context.say(SOFT_FRICTION)

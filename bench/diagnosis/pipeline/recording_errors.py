@@ -50,7 +50,7 @@ class RecordingErrorCheck:
             result: result of the search.
 
         Returns:
-            The wrong units and signs; empty if there are none or if nothing was tested.
+            The wrong units and signs; empty if all are right or if nothing was tested.
         """
         is_over = result.runs.context.search_control.is_over()
         if not _is_checked_late(result.runs) or result.is_explained or is_over:

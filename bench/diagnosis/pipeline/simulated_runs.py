@@ -117,7 +117,7 @@ class SimulatedRuns:
     ) -> SimulatedRuns:
         """Build run evaluators, noise floor and validation.
 
-        The validation predicts held-out runs; if there are none but several folds, it is
+        The validation predicts held-out runs; without held-out runs but with several folds, it is
         cross-validation.
 
         Args:

@@ -444,17 +444,11 @@ class ModelFilters:
         if not followed.has_expected_innovations:
             return start
         states = followed.improve_first_states(start.theta, followed.get_first_states())
-        refined = SettledSimulations(self.evaluator, followed, states).refine(start)
+        refined = SettledSimulations(followed, states).refine(start)
         settled = followed.settle(refined.theta, states, is_other_geometry=True)
         refined_states = followed.improve_first_states(refined.theta, settled)
-        costs = [
-            followed.compute_squares(theta, first_states).sum()
-            for theta, first_states in (
-                (start.theta, states),
-                (refined.theta, refined_states),
-            )
-        ]
-        if costs[1] < costs[0]:
+        cost = followed.compute_squares(start.theta, states).sum()
+        if followed.compute_squares(refined.theta, refined_states).sum() < cost:
             start, states = refined, refined_states
         return replace(
             start,

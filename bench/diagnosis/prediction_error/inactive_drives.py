@@ -259,8 +259,8 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
     """Find drives that are inactive in some samples, by (1) of the module docstring.
 
     Forces are computed from the recorded motion, at every k-th sample of long recordings. Each
-    joint is tested alone for a drive that is off. If there is none, all joints together are tested
-    for a brake or an emergency stop that holds them. Masks are then extended to all samples.
+    joint is tested alone for a drive that is off. If no drive is off, all joints together are
+    tested for a brake or an emergency stop that holds them. Masks are then extended to all samples.
 
     Args:
         recording: the recording as it was read.

@@ -3,13 +3,10 @@
 Where wheels and feet lift off and land, a Kalman filter needs much process noise, which hides most
 of what an effect does to the following samples. The pieces are short, so that a simulation of the
 base model stays near the recording (output error; L. Ljung, System Identification, 2nd ed., 1999,
-section 7.2). With the residual r of the simulation, its derivatives H by the first states, and the
-responses s_k of the candidates, all divided by the noise, and p the prior standard deviations of
-first states,
+section 7.2). With the residual r of the simulation and the responses s_k of the candidates, both in
+units of the noise, and the projection P of `settled_simulations` on what no first state explains,
 
-    minimise |P (r - sum_k c_k s_k)|^2,    P = I - Q Q^T,    Q R = [H; diag(1 / p)]            (1)
-
-so that only what no first state explains counts.
+    minimise |P (r - sum_k c_k s_k)|^2                                                         (1)
 
 A larger wheel or foot raises the body, and rolls farther per turn, v = omega r. A linear response
 begins with the wheel inside the floor and is that of a jump. So the response to another geometry is
@@ -90,7 +87,7 @@ class OutputErrorScores:
     def simulations(self) -> SettledSimulations:
         """Simulations from the first states of the base model."""
         base = self.context.filters.base
-        return SettledSimulations(self.context.evaluator, base, base.get_first_states())
+        return SettledSimulations(base, base.get_first_states())
 
     def list_starts(self) -> list[FitStart]:
         """Return starts with one effect each, the one with the smallest residual first.
@@ -120,8 +117,10 @@ class OutputErrorScores:
         for column, probe in enumerate(library.probes):
             if self._changes_geometry(probe):
                 responses[..., column] = self._simulate_geometry(probe)
-        target = context.evaluator.observed - self._base_simulation
-        projected = self.simulations.project(np.concatenate([responses, target[..., None]], axis=3))
+        target = followed.simulate_residuals(followed.theta, followed.get_first_states())
+        projected = self.simulations.project(
+            np.concatenate([followed.scale_by_noise(responses), target[..., None]], axis=3)
+        )
         products = np.einsum("rnk,rnl->rkl", projected, projected)
         contains = {
             name: effect.contains for name, effect in context.evaluator.available_effects.items()
@@ -162,9 +161,3 @@ class OutputErrorScores:
             simulated.append(self.simulations.simulate_settled(changed))
         response: Array = np.nan_to_num((simulated[0] - simulated[1]) / (2.0 * step))
         return response
-
-    @cached_property
-    def _base_simulation(self) -> Array:
-        """Simulation (R, T, C) of the base model."""
-        followed = self.context.filters.base
-        return self.simulations.simulate(followed.theta, followed.get_first_states())

@@ -1,23 +1,19 @@
 """Fit coefficients of a robot on the ground by simulations that begin with settled contacts.
 
-With the residual r of the simulated pieces, its derivatives H by the first states, both divided by
-the noise, and the prior standard deviations p of first states, the projected residual is
+The residual r of the simulated pieces, in units of the noise, is projected on what no first state
+explains (variable projection; G. Golub, V. Pereyra, Inverse Problems 19, 2003,
+doi:10.1088/0266-5611/19/2/201), with Q of `FirstStateFactors`:
 
-    P r,    P = I - Q Q^T,    Q R = [H; diag(1 / p)]                                           (1)
-
-so that only what no first state explains counts (variable projection; G. Golub, V. Pereyra, Inverse
-Problems 19, 2003, doi:10.1088/0266-5611/19/2/201).
+    P r,    P = I - Q Q^T                                                                      (1)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
@@ -35,12 +31,10 @@ class SettledSimulations:
     """Simulations of the pieces of a robot on the ground from settled first states.
 
     Attributes:
-        evaluator: the pieces.
         followed: linearised model of the pieces.
         states: (R, 2 D) first positions and velocities of D coordinates in R pieces.
     """
 
-    evaluator: RunEvaluator
     followed: FollowedRuns
     states: Array
 
@@ -51,7 +45,7 @@ class SettledSimulations:
             start: start whose coefficients are improved by Gauss-Newton steps.
         """
         theta = start.theta
-        bounds = get_bounds_by_index(self.evaluator, start.effects)
+        bounds = get_bounds_by_index(self.followed.evaluator, start.effects)
         residual = self.compute_residual(theta)
         for _ in range(MAX_REFINEMENTS):
             columns = []
@@ -92,12 +86,12 @@ class SettledSimulations:
         Args:
             theta: (P,) parameters of the model.
         """
-        residual = self.evaluator.observed - self.simulate_settled(theta)
+        residual = self.followed.simulate_residuals(theta, self._settle(theta))
         return self.project(residual[..., None]).reshape(-1)
 
     def get_difference(self, place: int) -> float:
         """Return the finite change of a coefficient, by its index in theta."""
-        low, high = self.evaluator.parameters[place].bounds
+        low, high = self.followed.evaluator.parameters[place].bounds
         return DIFFERENCE_SHARE * (float(high) - float(low))
 
     def simulate_settled(self, theta: Array) -> Array:
@@ -106,50 +100,17 @@ class SettledSimulations:
         Args:
             theta: (P,) parameters of the model.
         """
-        return self.simulate(
-            theta, self.followed.settle(theta, self.states, is_other_geometry=True)
-        )
+        return self.followed.simulate(theta, self._settle(theta))
 
-    def simulate(self, theta: Array, states: Array) -> Array:
-        """Simulate all pieces (R, T, C) from first states (R, 2 D) as they are.
-
-        Args:
-            theta: (P,) parameters of the model.
-            states: first positions and velocities.
-        """
-        runs = len(states)
-        return self.evaluator.simulate(np.tile(theta, (runs, 1)), np.arange(runs), states)
+    def _settle(self, theta: Array) -> Array:
+        """Return the first states (R, 2 D), settled for a model that may have another geometry."""
+        return self.followed.settle(theta, self.states, is_other_geometry=True)
 
     def project(self, values: Array) -> Array:
-        """Return P v of (1), (R, n, K), for values v (R, T, C, K) of the readings.
-
-        Unrecorded samples count as zero.
-        """
-        followed = self.followed
+        """Return P v of (1), (R, n, K), for values v (R, T, C, K) in units of the noise."""
+        bases = self.followed.first_state_factors.q
         runs, samples, channels, count = values.shape
-        with np.errstate(all="ignore"):
-            scaled = values / followed.noise.sigma[:, None]
-        scaled[~followed.runs.recorded] = 0.0
-        rows = np.zeros((runs, len(self._bases[0]), count))
-        rows[:, : samples * channels] = scaled.reshape(runs, -1, count)
-        projected: Array = np.array(
-            [
-                run_rows - basis @ (basis.T @ run_rows)
-                for basis, run_rows in zip(self._bases, rows, strict=True)
-            ]
-        )
+        rows = np.zeros((runs, bases.shape[1], count))
+        rows[:, : samples * channels] = values.reshape(runs, -1, count)
+        projected: Array = rows - bases @ (bases.transpose(0, 2, 1) @ rows)
         return projected
-
-    @cached_property
-    def _bases(self) -> list[Array]:
-        """Q of (1) for each run; the rows are readings, then the prior of first states."""
-        followed = self.followed
-        derivatives = followed.compute_state_sensitivities() / followed.noise.sigma[:, None]
-        derivatives[~followed.runs.recorded] = 0.0
-        prior = followed.get_state_prior()
-        assert prior is not None
-        size = derivatives.shape[3]
-        return [
-            np.linalg.qr(np.concatenate([rows.reshape(-1, size), np.diag(1.0 / prior)]))[0]
-            for rows in derivatives
-        ]

@@ -508,7 +508,7 @@ def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, fl
     """Return recorded joint positions at the sample of a run that is farthest from its start.
 
     In this pose the drawing of the robot shows more than at rest. Only joints with recorded
-    positions are returned; the result is empty if there are none.
+    positions are returned; the result is empty without positions.
 
     Args:
         report: Report data.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import ceil, floor, isfinite, log10
 from typing import NamedTuple
 
@@ -365,16 +366,12 @@ def _make_panels(
         tells=tooltip_lines,
         height=heights[0],
     )
-    residual_panel = Panel(
+    residual_panel = replace(
+        motion_panel,
         title=f"{name}: residual",
-        table=MOTION_TABLE_NAME,
-        x="t",
         series=tuple(residuals),
-        across=time_axis,
         up=residual,
-        facets=facets,
         spans=noise_band,
-        tells=tooltip_lines,
         height=heights[1],
     )
     return motion_panel, residual_panel

@@ -298,7 +298,7 @@ class HeldOutRuns:
 def find_first_states(
     evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
 ) -> FitStart | None:
-    """Return a start with better first states of fitted runs; None if there are none.
+    """Return a start with better first states of fitted runs; None without better ones.
 
     They are fitted to ever longer parts of the runs, as those of held-out runs, with the parameters
     of the fit, and must reduce the sum of squares. A robot on the ground keeps its first states,

@@ -83,7 +83,7 @@ class RegressionData:
         return RegressionData(*(getattr(self, field.name)[is_selected] for field in fields(self)))
 
     def project_out_base(self) -> tuple[Array, Array]:
-        """Project out parameters and initial states: what they can explain is no evidence.
+        """Project out parameters and initial states: what they can explain is not evidence.
 
         Returns:
             The residual (N,) and the effect columns (N, K), without the part that parameters and

@@ -558,7 +558,7 @@ class LinearisationPoints:
     def _compute_dry_friction(self, joint: int, limit: Array) -> Array:
         """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
 
-        MuJoCo's dry friction is no jump of the force with the sign of the velocity. It is a
+        MuJoCo's dry friction is not a jump of the force with the sign of the velocity. It is a
         constraint that pulls the velocity to zero with a force of at most the limit
         (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
         constraint has the reference acceleration -b v with b = 2 / (d_max timeconst), and the

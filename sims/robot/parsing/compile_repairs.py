@@ -345,7 +345,7 @@ def remove_keyframes(spec: Any) -> str:
     """Remove the keyframes (stored states) of a model, and return the end of a note about them.
 
     A caller that changes joints must remove them, because they have values for the former
-    coordinates. The text is empty if there are none.
+    coordinates. The text is empty without them.
 
     Args:
         spec: a mujoco.MjSpec; it is changed in place.

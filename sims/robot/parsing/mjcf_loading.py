@@ -84,7 +84,7 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
     """Read the files that an MJCF refers to, and insert placeholders for missing ones.
 
     Reading adds the files to the digest of the model, so that a changed mesh is another model. A
-    missing file is no error yet: a robot can be simulated without a visual mesh. The folders of
+    missing file is not an error yet: a robot can be simulated without a visual mesh. The folders of
     the files are those of the element ``<compiler>``; later settings replace earlier ones.
 
     Args:

@@ -79,8 +79,10 @@ def test_the_response_to_a_radius_is_that_of_rolling(scores):
     # The drives need 0.06 s for the new speeds.
     change = response[-1] - response[20]
     left, right = (evaluator.channels.index(f"q.{side}") for side in SIDES)
-    turned = np.ptp(scores._base_simulation[1, 20:, left])
-    heading = scores._base_simulation[1, -1, yaw]
+    base = scores.context.filters.base
+    simulated = base.simulate(base.theta, base.get_first_states())
+    turned = np.ptp(simulated[1, 20:, left])
+    heading = simulated[1, -1, yaw]
     forward = change[x] * np.cos(heading) + change[y] * np.sin(heading)
     rolled_left, rolled_right = RADIUS * (turned + change[left]), RADIUS * change[right]
     # The wide tyres creep sideways while they turn.
