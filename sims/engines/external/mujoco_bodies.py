@@ -30,6 +30,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from sims.core.mujoco_import import disable_step_profiler
 from sims.engines.external import ball_integration
 from sims.engines.external.ball_integration import BallState
 from sims.engines.external.external_engine import Vector
@@ -52,6 +53,7 @@ def import_mujoco() -> Any:
     """
     import mujoco
 
+    disable_step_profiler()
     return mujoco
 
 

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sims.core.effect import ActiveEffects
+from sims.core.mujoco_import import disable_step_profiler
 from sims.core.simulator import Array
 from sims.robot.dynamics.drive_limits import (
     FORCE_FIELDS,
@@ -227,6 +228,7 @@ class MujocoBatch:
         import mujoco
         from mujoco import batch
 
+        disable_step_profiler()
         # Fields that effects write depend on the time step, so it is set first.
         self.robot = robot = with_integrator_settings(robot, settings)
         self.derived = derived
