@@ -23,6 +23,7 @@ EXAMS = {
     "floating": "tests.exams.robots.robot_cases:FLOATING_EXAM",
     "planted": "tests.exams.planted.planted_cases:EXAM",
     "models": "tests.exams.planted.model_cases:EXAM",
+    "geometry": "tests.exams.planted.geometry_cases:EXAM",
     "contacts": "tests.exams.contacts.contact_cases:EXAM",
     "conventions": "tests.exams.conventions.convention_cases:EXAM",
     "recordings": "tests.exams.recordings.recording_cases:EXAM",

@@ -219,6 +219,14 @@ def _link_length(model, place, c):
     model.body_pos[model.body(place).id] *= 1 + c[0]
 
 
+def _joint_axis(model, place, c):
+    axis, turned = model.joint(place).axis, np.zeros(3)
+    turn = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, c / max(np.linalg.norm(c), 1e-12), np.linalg.norm(c))
+    mujoco.mju_rotVecQuat(turned, axis.copy(), turn)
+    axis[:] = turned
+
+
 def _gravity_scale(model, _, c):
     model.opt.gravity[:] *= 1 + c[0]
 
@@ -286,6 +294,7 @@ FORMS = {
     ],
     "joint.zero": [_planted("zero", "angle", lambda model, place: -np.inf)],
     "link.length": [_Form(("ratio",), edit=_link_length)],
+    "joint.axis": [_Form(("angle",) * 3, edit=_joint_axis, begin=(0, 0, 0))],
     "contact.friction": [_planted("friction", "ratio", _ratio)],
     "inertia.scale": [_Form(("ratio",), edit=_inertia_scale, at_least=_ratio)],
     "actuator.stiffness": [_planted("kp", "ratio", _ratio)],

@@ -51,6 +51,7 @@ POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FLIGHT_SHARES = 0.1, 0.3  # Sizes at a drone, as shares of the largest one.
 TRIALS = 5  # Places at which a kind of number is tried.
 PLACES = 3  # Wrong numbers of each model.
+WHEELS = ("left_tyre", "right_tyre")
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class ModelQuestion(Question):
         """Draw the case; another seed gives another exam."""
         try:
             if self.system in MODELS:
-                return _draw_model_case(self, seed)
+                return draw_model_case(self, seed)
             number = "clean" if self.kind == "clean" else self.numbers[0]
             return PlantedQuestion(self.system, number, max(self.index, 0)).draw(seed)
         except MissingModelError as error:
@@ -197,9 +198,13 @@ class ModelExperiment(Experiment):
             self.sigma = np.concatenate([pose, self.sigma])
 
     def simulator(self, change=None):
-        model = self.robot.compile()
-        if change is not None:
-            change.apply(model)
+        if change is not None and change.kind == "gravcomp":
+            # MuJoCo decides when it compiles whether any weight is carried.
+            model = self.robot.compile(gravcomp={change.place: change.size})
+        else:
+            model = self.robot.compile()
+            if change is not None:
+                change.apply(model)
         return Simulator(model, [] if self.robot.is_touching else self.bodies)
 
 
@@ -265,7 +270,7 @@ class _FlightController:
         return self.thrusts @ np.array([thrust, *(self.inertia * (angles - rates))])
 
 
-def _draw_model_case(question, seed):
+def draw_model_case(question, seed):
     """Return the case of a question about a model of `MODELS`.
 
     Raises:
@@ -292,7 +297,7 @@ def _draw_model_case(question, seed):
         if question.kind == "clean":
             return make(swing, "clean", "", 0.0, 0.0, 0.0)
         for number in question.numbers:
-            for place in rng.permutation(_places(experiment, number))[:TRIALS]:
+            for place in rng.permutation(list_places(experiment, number))[:TRIALS]:
                 for sign in rng.permutation([1.0, -1.0]):
                     peaks = experiment.nominal_peaks.max(0)
                     largest = find_largest_change(experiment, number, str(place), sign, peaks)
@@ -310,16 +315,18 @@ def _draw_model_case(question, seed):
     raise UndrawableError(f"{question.name}: no place shows a gap of {MIN_GAP:g} noises")
 
 
-def _places(experiment, number):
-    """Return the joints, bodies, actuators or contacts that may have the wrong number."""
+def list_places(experiment, number):
+    """Return the joints, bodies, actuators, geoms or contacts that may have the wrong number."""
     model = experiment.model
     if number in ("kp", "gear"):
         return [model.actuator(i).name for i in range(model.nu)]
     if number == "friction":
         rounded = [g for g in range(1, model.ngeom) if model.geom_contype[g]]
         return [f"floor/{model.geom(g).name}" for g in rounded if model.geom_condim[g] > 1]
-    if number in ("mass", "com", "payload"):
+    if number in ("mass", "com", "payload", "length", "gravcomp"):
         return [model.body(b).name for b in experiment.bodies if model.body_mass[b] > 0]
+    if number == "radius":
+        return [model.geom(g).name for g in range(model.ngeom) if model.geom(g).name in WHEELS]
     return experiment.places
 
 

@@ -78,10 +78,18 @@ class ModelFile:
                     parent.remove(child)
         return ElementTree.tostring(tree, encoding="unicode")
 
-    def compile(self, force_limits=None):
-        """Compile the simulated robot with plain MuJoCo."""
+    def compile(self, force_limits=None, gravcomp=None):
+        """Compile the simulated robot with plain MuJoCo.
+
+        Args:
+            force_limits: not used.
+            gravcomp: share of the weight that is carried, by body.
+        """
         files = {name: text.encode() for name, text in self.files.items()}
-        return mujoco.MjModel.from_xml_string(self.simulated_text, files)
+        spec = mujoco.MjSpec.from_string(self.simulated_text, files)
+        for body, share in (gravcomp or {}).items():
+            spec.body(body).gravcomp += share
+        return spec.compile()
 
     @cached_property
     def gains(self):

@@ -72,8 +72,12 @@ MAX_KP = 1.0  # Relative increase.
 MAX_ARMATURE = 3.0  # Multiples of M.
 MAX_DAMPING = 100.0  # Multiples of M per second, and multiples of kv for servos.
 MAX_PAYLOAD = 1.0  # Multiple of the mass of the body.
-# Gear (relative), centre of mass (m), zero of a joint (rad or m), friction coefficient.
-MAX_DIFFERENCES = {"gear": 0.3, "com": 0.05, "zero": 0.09, "friction": 0.5}
+# Gear (relative), centre of mass (m), zero of a joint (rad or m), friction coefficient, length and
+# radius (relative), tilt of an axis (rad).
+MAX_DIFFERENCES = {
+    "gear": 0.3, "com": 0.05, "zero": 0.09, "friction": 0.5, "length": 0.2, "radius": 0.1,
+    "axis": 0.3,
+}  # fmt: skip
 MAX_FRICTION = 0.8  # Multiple of the largest torque at the joint.
 
 
@@ -494,6 +498,8 @@ def find_largest_change(experiment, kind, place, sign, torques):
         return MAX_KP if sign > 0 else MAX_DECREASE
     if kind == "payload":  # A payload has no negative mass.
         return MAX_PAYLOAD * model.body(place).mass[0] if sign > 0 else 0.0
+    if kind == "gravcomp":
+        return 1.0 if sign > 0 else 0.0
     if kind in MAX_DIFFERENCES:
         return MAX_DIFFERENCES[kind]
     dof = model.joint(place).dofadr[0]

@@ -24,9 +24,9 @@ class Change:
 
     Attributes:
         kind: a key of `EFFECTS`.
-        place: joint, body, actuator or contact (GEOM/GEOM).
-        size: for mass, kp and gear a relative change; the mass of a payload, kg; otherwise the
-            difference of the number.
+        place: joint, body, actuator, geom or contact (GEOM/GEOM).
+        size: for mass, kp, gear, length and radius a relative change; the mass of a payload, kg;
+            the angle of a tilted axis, rad; otherwise the difference of the number.
     """
 
     kind: str
@@ -56,6 +56,12 @@ class Change:
             model.qpos0[model.joint(self.place).qposadr[0]] += self.size
         elif self.kind == "friction":
             model.geom(self.place.partition("/")[2]).friction[0] += self.size
+        elif self.kind == "length":
+            model.body_pos[model.body(self.place).id] *= 1 + self.size
+        elif self.kind == "axis":
+            tilt_axis(model, self.place, self.size)
+        elif self.kind == "radius":
+            model.geom(self.place).size[0] *= 1 + self.size
         else:
             actuator = model.actuator(self.place).id
             model.actuator_gainprm[actuator, 0] *= 1 + self.size
@@ -63,6 +69,17 @@ class Change:
                 model.actuator_biasprm[actuator, 1] *= 1 + self.size
         if self.kind != "zero":  # Otherwise the bodies' places would follow qpos0.
             mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def tilt_axis(model, joint, angle):
+    """Tilt the axis of a joint by an angle (rad) about the axis of its body that is most across."""
+    axis = model.joint(joint).axis
+    rotation = np.zeros(3)
+    rotation[np.argmin(np.abs(axis))] = angle
+    turn, tilted = np.zeros(4), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(turn, rotation / abs(angle), abs(angle))
+    mujoco.mju_rotVecQuat(tilted, axis.copy(), turn)
+    axis[:] = tilted
 
 
 def add_point_mass(model, body, mass, place):
@@ -99,6 +116,10 @@ EFFECTS = {
     "zero": "joint.zero",
     "payload": "payload",
     "friction": "contact.friction",
+    "length": "link.length",
+    "axis": "joint.axis",
+    "gravcomp": "gravity.compensation",
+    "radius": "geom.radius",
 }
 DOF_FIELDS = {
     "damping": "dof_damping",
