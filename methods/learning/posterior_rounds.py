@@ -17,6 +17,8 @@ _MAX_COMPONENTS = 10
 """Maximum number of principal components of the residuals that the network reads."""
 _POSTERIOR_DRAWS = 1000
 """Number of posterior samples of which the mean is the recommendation."""
+_MIN_INSIDE_SHARE = 0.1
+"""Share of the posterior samples within the bounds below which all samples are used, clipped."""
 _MIN_SINGULAR_VALUE = 1e-9
 """Singular value, relative to the largest one, below which a component is a rounding error."""
 
@@ -119,7 +121,18 @@ class PosteriorRounds:
         zero = self._compute_features(np.zeros((1, len(self._centre))))
         target = torch.as_tensor(zero, dtype=torch.float32)
         self._posterior = self._trainer.build_posterior().set_default_x(target)
-        draws = self._posterior.sample((max(count, _POSTERIOR_DRAWS),)).numpy().astype(np.float64)
-        self.mean = draws.mean(axis=0)
-        drawn_points: Array = np.clip(draws[:count], 0.0, 1.0)
-        return drawn_points
+        drawn_points = self._draw_points(max(round(count / _MIN_INSIDE_SHARE), _POSTERIOR_DRAWS))
+        self.mean = drawn_points.mean(axis=0)
+        return drawn_points[:count]
+
+    def _draw_points(self, count: int) -> Array:
+        """Draw `count` points from the posterior; return those in the bounds (n, dim).
+
+        A posterior network may have nearly all of its mass outside the bounds ("leakage",
+        Greenberg et al. 2019); rejecting until enough points lie inside would then not end. If
+        fewer than a tenth lies inside, all are used, moved to the bounds.
+        """
+        draws = self._posterior.sample((count,), reject_outside_prior=False)
+        points: Array = draws.numpy().astype(np.float64)
+        inside = points[((points >= 0.0) & (points <= 1.0)).all(axis=1)]
+        return inside if len(inside) >= _MIN_INSIDE_SHARE * count else np.clip(points, 0.0, 1.0)
