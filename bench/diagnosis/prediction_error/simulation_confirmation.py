@@ -107,7 +107,8 @@ class Confirmation(Inquiry):
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
             closed=compute_gap_closed(search, model, lack_of_fit),
-            unexplained=is_unexplained(
+            unexplained=not search.leaves_only_creep_of_contacts(model)
+            and is_unexplained(
                 lack_of_fit.has_structure, search.compute_p_value_of_missing_effect(model)
             ),
             missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
