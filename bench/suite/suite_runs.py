@@ -33,6 +33,8 @@ TRAINING_FILE = "training.csv"
 SKIPPED_FILE = "skipped.csv"
 """File of the tuners that could not be used, with the reason."""
 RUN_COLUMNS = ["cell", "tuner", "target", "seed", "simulations", "seconds", "failed"]
+RUN_KEYS = ["cell", "tuner", "target", "seed"]
+"""Columns that identify a run."""
 CELL_COLUMNS = [
     "cell",
     "problem",
@@ -249,7 +251,7 @@ def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
 
 
 def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
-    """Concatenate runs; of several rows for one cell, training or skipped tuner the first stays.
+    """Concatenate runs; of several rows for one run, cell, training or skipped tuner the first stays.
 
     Args:
         parts: Runs of several comparisons; `errors` (runs, simulations + 1) may differ in width.
@@ -266,9 +268,10 @@ def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
     )
     skipped = pd.concat([part.skipped for part in parts]).drop_duplicates("tuner")
     runs = pd.concat([part.runs for part in parts], ignore_index=True)
+    is_first = ~runs.duplicated(RUN_KEYS)
     return SuiteRuns(
-        runs,
-        errors,
+        runs[is_first].reset_index(drop=True),
+        errors[is_first.to_numpy()],
         pd.concat([part.cells for part in parts]).drop_duplicates("cell").reset_index(drop=True),
         pd.concat([part.training for part in parts])
         .drop_duplicates(["cell", "tuner"])

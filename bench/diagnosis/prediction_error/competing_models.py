@@ -398,7 +398,12 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
     likeliest = search.get_best(size)
-    return best if likeliest is None else likeliest
+    if likeliest is None or likeliest is best:
+        return best
+    # A family may replace another one, and a single member of it may be enough.
+    simpler = remove_idle_effects(context, likeliest)
+    is_same = simpler.effects == likeliest.effects
+    return likeliest if is_same else fit_competing_models(context, simpler)
 
 
 def _find_competing_effects(

@@ -14,7 +14,7 @@ from bench.suite.suite_page import (
     build_headline,
     describe_losses,
 )
-from bench.suite.suite_runs import read_suite_runs
+from bench.suite.suite_runs import RUN_KEYS, read_suite_runs
 from bench.suite.suite_statistics import FREE, SuiteTables
 
 FOLDER = Path(__file__).parents[3] / "results" / "reference" / "suite"
@@ -30,6 +30,10 @@ def test_stored_runs_are_of_this_version(tables):
     assert tables.suite.version == experiment.suite
     assert tables.suite.budget == experiment.budget
     assert tables.suite.runs.groupby("cell")["target"].nunique().min() >= 2
+
+
+def test_no_run_is_stored_twice(tables):
+    assert not tables.suite.runs.duplicated(RUN_KEYS).any()
 
 
 def test_tables_follow_from_the_runs(tables):

@@ -5,6 +5,8 @@ import pytest
 
 from bench.suite.suite_runs import (
     CURVES_FILE,
+    RUN_KEYS,
+    concatenate,
     merge_runs,
     read_suite_runs,
     write_suite_runs,
@@ -47,3 +49,13 @@ def test_own_runs_are_joined_by_the_others_on_common_targets():
 def test_runs_on_other_targets_stay_alone():
     own = make_suite({"c": {"mine": CURVE}})
     assert merge_runs(own, make_suite({"a": {"one": CURVE}})).tuners == ["mine"]
+
+
+def test_of_a_run_that_occurs_twice_the_first_stays():
+    first = make_suite({"a": {"one": CURVE, "two": CURVE}})
+    again = make_suite({"a": {"two": CURVE * 2}, "b": {"one": CURVE}})
+    joined = concatenate([first, again])
+    assert not joined.runs.duplicated(RUN_KEYS).any()
+    assert len(joined.errors) == len(joined.runs) == 3 * 4
+    is_second = ((joined.runs["cell"] == "a") & (joined.runs["tuner"] == "two")).to_numpy()
+    assert joined.errors[is_second][0, 1] == CURVE[1]
