@@ -251,7 +251,7 @@ def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
 
 
 def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
-    """Concatenate runs; of several rows for one run, cell, training or skipped tuner the first stays.
+    """Concatenate runs; the first row of each run, cell, training and skipped tuner stays.
 
     Args:
         parts: Runs of several comparisons; `errors` (runs, simulations + 1) may differ in width.
