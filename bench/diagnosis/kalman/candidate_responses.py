@@ -767,6 +767,20 @@ class FollowedRuns:
         best: Array = first_states[np.argmin(squares, axis=0), np.arange(len(self.linear))]
         return best
 
+    def estimate_settled_states(self, theta: Array) -> Array:
+        """Return first states (R, 2 D) with settled contacts for a model with other parameters.
+
+        The depth of contacts and the motion depend on the parameters, so a filter with them
+        estimates the states. If it diverges, those of this filter are returned.
+
+        Args:
+            theta: (P,) parameters of the model of a robot on the ground.
+        """
+        followed = self.follow(self.evaluator, theta, self.noise, max_linearisations=1)
+        if not followed.has_expected_innovations:
+            return self.get_first_states()
+        return followed.improve_first_states(theta, followed.get_first_states())
+
     def improve_first_states(self, theta: Array, states: Array) -> Array:
         """Return first states (R, 2 D) with settled contacts whose simulations are closer.
 

@@ -33,7 +33,7 @@ from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
 EXPLAINED_EXCESS = 0.03
-"""Maximum excess over the noise of a fitted set that explains the data."""
+"""Maximum excess over the noise of a fitted set that explains the data; see `is_at_noise`."""
 NEARLY_EXPLAINED_SHARE = 0.1
 """Maximum excess, as a share of that of the base model, at which effects are only added."""
 NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE = 0.1, 0.005
@@ -189,13 +189,16 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
 def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
     """Return whether a fitted model leaves only noise.
 
+    The residual must pass the tests of noise, and its excess be below `EXPLAINED_EXCESS`, or below
+    `NEGLIGIBLE_EXCESS` for a robot on the ground, whose simulated contacts creep.
+
     Args:
         context: search, filters and regressions of the recording.
         model: the fitted model.
     """
-    return (
-        context.search.is_noise_like(model)
-        and context.search.compute_excess_residual(model) < EXPLAINED_EXCESS
+    is_on_ground = context.filters.base.is_on_ground
+    return context.search.is_noise_like(model) and context.search.compute_excess_residual(model) < (
+        NEGLIGIBLE_EXCESS if is_on_ground else EXPLAINED_EXCESS
     )
 
 

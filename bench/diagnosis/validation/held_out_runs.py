@@ -161,8 +161,10 @@ class HeldOutRuns:
         )
         count = max(int(self.seen.sum()), 1)
         is_far = is_filtered and not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count
-        if is_far and self._is_on_ground:
-            starts = [FitStart((), theta, self._settle_first_states(theta)) for theta in thetas]
+        followed = self.evaluator.filtered_runs
+        if is_far and followed is not None and followed.is_on_ground:
+            settled_states = [followed.estimate_settled_states(theta) for theta in thetas]
+            starts = [FitStart((), *pair) for pair in zip(thetas, settled_states, strict=True)]
             fits = _select_nearer_fits(
                 fits, self._fit_initial_states(starts, FILTERED_HORIZON_STAGES)
             )
@@ -189,28 +191,6 @@ class HeldOutRuns:
         for i, fit in zip(far_indices, refits, strict=True):
             fits[i] = _find_lowest_cost_fit([fits[i], fit])
         return [self._predict_runs(fit) for fit in fits]
-
-    @property
-    def _is_on_ground(self) -> bool:
-        followed = self.evaluator.filtered_runs
-        return followed is not None and followed.is_on_ground
-
-    def _settle_first_states(self, theta: Array) -> Array:
-        """Return initial states (R, s) of a robot on the ground with settled contacts.
-
-        They are those of a filter with the model's own parameters, because the depth of contacts
-        and the motion depend on them. If that filter diverges, the first guess is returned.
-
-        Args:
-            theta: parameters (P,) of the model.
-        """
-        # This import is needed for robots only.
-        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
-
-        followed = FollowedRuns.follow(self.evaluator, theta, self.noise, max_linearisations=1)
-        if not followed.has_expected_innovations:
-            return self.evaluator.initial_state_guesses
-        return followed.improve_first_states(theta, followed.get_first_states())
 
     def _fit_initial_states(
         self, starts: Sequence[FitStart], stages: Sequence[tuple[float, int]]
