@@ -1,0 +1,65 @@
+"""Tests of recordings with wrong geometry, payloads, carried weights, rotors and wheels."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.explain import explain
+from tests.exams.planted.geometry_cases import DRAWS, GeometryQuestion, questions
+from tests.exams.planted.model_cases import ModelExperiment
+from tests.exams.planted.model_files import MODELS
+from tests.exams.planted.planted_motion import Change
+
+
+def test_each_of_seven_kinds_has_twenty_recordings():
+    names = [question.name for question in questions()]
+    assert len(names) == len(set(names)) == 7 * DRAWS == 140
+
+
+def test_a_tilted_axis_makes_the_stated_angle_with_that_of_the_file():
+    model = MODELS["arm-filtered"].compile()
+    before = model.joint("elbow").axis.copy()
+    Change("axis", "elbow", -0.2).apply(model)
+    after = model.joint("elbow").axis
+    assert np.linalg.norm(after) == pytest.approx(1.0)
+    assert np.arccos(before @ after) == pytest.approx(0.2)
+
+
+def test_a_longer_link_moves_the_next_body_away():
+    model = MODELS["arm-filtered"].compile()
+    Change("length", "wrist_link", 0.1).apply(model)
+    assert model.body("wrist_link").pos == pytest.approx([0.275, 0.0, 0.0])
+
+
+def test_a_carried_weight_makes_no_torque():
+    """Of two links, the outer one is carried whole: the elbow holds nothing."""
+    experiment = ModelExperiment("arm-included", 0)
+    bodies = ("arm/elbow_link", "arm/wrist_link", "tool")
+    names = [experiment.model.body(b).name for b in range(experiment.model.nbody)]
+    torques = []
+    for share in (0.0, 1.0):
+        carried = {name: share for name in bodies if name in names}
+        model = experiment.robot.compile(gravcomp=carried)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        dof = model.joint("arm/elbow").dofadr[0]
+        torques.append(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof]))
+    assert abs(torques[0]) > 0.1
+    assert torques[1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("number", "index"),
+    [
+        pytest.param("payload", 3, marks=pytest.mark.slow),
+        pytest.param("gravcomp", 13, marks=pytest.mark.long),
+        pytest.param("radius", 3, marks=pytest.mark.long),
+    ],
+)
+def test_the_wrong_number_is_named_alone(number, index, tmp_path):
+    """Families of masses and of carried weights, and wheels that creep, hid these three."""
+    case = GeometryQuestion(number, index).draw()
+    answer = explain(case.write(tmp_path)).answer
+    assert answer.verdict == "named"
+    assert [cause.effect for cause in answer.causes] == [case.change.effect]
+    assert not answer.causes[0].alternatives
