@@ -295,7 +295,7 @@ class TangentModel:
             if self._at.reads_others:
                 _, readings = self._at.compute_accelerations(acting)
         # A change of the acceleration is equivalent to a force.
-        difference = (accelerations - self.accelerations[self._at.point_steps]) / change
+        difference = (accelerations - self._accelerations_with_mean_forces) / change
         force = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         return Perturbation(
             owner, forces=force, readings=(readings - self._base_accelerations[1]) / change
@@ -330,6 +330,16 @@ class TangentModel:
         difference = self.accelerations[self._at.point_steps] - self._base_accelerations[0]
         forces: Array = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         return forces
+
+    @cached_property
+    def _accelerations_with_mean_forces(self) -> Array:
+        """Accelerations (N, E) of the unperturbed motion with `_mean_acceleration_forces`.
+
+        They are the mean accelerations, except where a joint sticks, whose dry friction absorbs a
+        part of these forces. A difference from the mean accelerations would be a jump there, which
+        does not depend on the change of the model.
+        """
+        return self._at.compute_accelerations(self._at.acting, self._mean_acceleration_forces)[0]
 
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the changes by an effect's force, one for each joint that it acts on.

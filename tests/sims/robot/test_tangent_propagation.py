@@ -52,9 +52,11 @@ SMALL_CHANGES = {
 """Fractions of plausible ranges that are small changes."""
 
 
-def moving(integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elbow", "tau.elbow")):
+def moving(
+    integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elbow", "tau.elbow"), text=ARM
+):
     """Return a simulator of a moving arm with all effects, and its scenario."""
-    kind = kind_of(ARM).with_integrator_settings(IntegratorSettings(step, integrator))
+    kind = kind_of(text).with_integrator_settings(IntegratorSettings(step, integrator))
     effects = list(library.list_effects_for(kind.system).values())
     simulator = kind(observe=list(channels), effects=effects)
     rng = np.random.default_rng(3)
@@ -109,6 +111,19 @@ def test_the_tangent_is_what_each_small_change_makes(integrator):
     names = [added[i][0].name for i in np.flatnonzero(counted)[worst]]
     assert apart.max() < 0.15, (names, apart[worst])
     assert np.median(apart) < 0.01
+
+
+def test_the_response_to_a_mass_is_proportional_where_joints_stick():
+    """Dry friction of a joint at rest absorbs forces, which made a jump of any size."""
+    simulator, scenario = moving(text=ARM.replace('damping="', 'frictionloss="4" damping="'))
+    zeros = np.zeros(len(simulator.parameters))
+    about = RunLinearisation(simulator, zeros, scenario, np.zeros(2), np.zeros(2))
+    assert (np.abs(np.diff(about.observed[:, 0])) < 1e-5).any(), "the shoulder sticks"
+    mass = next(e for e in simulator.effects if e.name == "mass.scale@forearm")
+    sizes = np.array([1e-2, 1e-3])
+    large, small = about.compute_effect_responses([(mass, np.array([c])) for c in sizes])[0]
+    assert np.abs(large).max() > 1e-4
+    np.testing.assert_allclose(large / sizes[0], small / sizes[1], atol=0.02)
 
 
 @pytest.mark.parametrize("name", ["supply.sag@m_elbow", "friction.load@elbow"])
