@@ -295,6 +295,8 @@ FORMS = {
     "joint.zero": [_planted("zero", "angle", lambda model, place: -np.inf)],
     "link.length": [_Form(("ratio",), edit=_link_length)],
     "joint.axis": [_Form(("angle",) * 3, edit=_joint_axis, begin=(0, 0, 0))],
+    "gravity.compensation": [_planted("gravcomp", "ratio", _positive)],
+    "geom.radius": [_planted("radius", "ratio", _ratio)],
     "contact.friction": [_planted("friction", "ratio", _ratio)],
     "inertia.scale": [_Form(("ratio",), edit=_inertia_scale, at_least=_ratio)],
     "actuator.stiffness": [_planted("kp", "ratio", _ratio)],
@@ -320,6 +322,6 @@ FORMS = {
 def _place_kind(effect):
     """Return the kind of place at which an effect acts."""
     kinds = {"actuator": "actuator", "input": "actuator", "sensor": "channel", "gravity": "world"}
-    kinds |= {"contact": "contact", "payload": "body", "link": "body"}
-    is_body = effect.startswith("mass.") or effect == "inertia.scale"
+    kinds |= {"contact": "contact", "geom": "contact", "payload": "body", "link": "body"}
+    is_body = effect.startswith("mass.") or effect in ("inertia.scale", "gravity.compensation")
     return "body" if is_body else kinds.get(effect.partition(".")[0], "joint")

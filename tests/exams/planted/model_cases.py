@@ -198,13 +198,9 @@ class ModelExperiment(Experiment):
             self.sigma = np.concatenate([pose, self.sigma])
 
     def simulator(self, change=None):
-        if change is not None and change.kind == "gravcomp":
-            # MuJoCo decides when it compiles whether any weight is carried.
-            model = self.robot.compile(gravcomp={change.place: change.size})
-        else:
-            model = self.robot.compile()
-            if change is not None:
-                change.apply(model)
+        model = self.robot.compile()
+        if change is not None:
+            change.apply(model)
         return Simulator(model, [] if self.robot.is_touching else self.bodies)
 
 

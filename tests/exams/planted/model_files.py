@@ -78,17 +78,12 @@ class ModelFile:
                     parent.remove(child)
         return ElementTree.tostring(tree, encoding="unicode")
 
-    def compile(self, force_limits=None, gravcomp=None):
-        """Compile the simulated robot with plain MuJoCo.
-
-        Args:
-            force_limits: not used.
-            gravcomp: share of the weight that is carried, by body.
-        """
+    def compile(self, force_limits=None):
+        """Compile the simulated robot with plain MuJoCo, so that weights can be carried later."""
         files = {name: text.encode() for name, text in self.files.items()}
         spec = mujoco.MjSpec.from_string(self.simulated_text, files)
-        for body, share in (gravcomp or {}).items():
-            spec.body(body).gravcomp += share
+        # MuJoCo decides here whether any weight is carried. This share changes no force.
+        spec.bodies[-1].gravcomp = spec.bodies[-1].gravcomp or 1e-200
         return spec.compile()
 
     @cached_property

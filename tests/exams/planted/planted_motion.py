@@ -60,6 +60,8 @@ class Change:
             model.body_pos[model.body(self.place).id] *= 1 + self.size
         elif self.kind == "axis":
             tilt_axis(model, self.place, self.size)
+        elif self.kind == "gravcomp":
+            model.body_gravcomp[model.body(self.place).id] += self.size
         elif self.kind == "radius":
             model.geom(self.place).size[0] *= 1 + self.size
         else:
