@@ -133,6 +133,6 @@ class PosteriorRounds:
         fewer than a tenth lies inside, all are used, moved to the bounds.
         """
         draws = self._posterior.sample((count,), reject_outside_prior=False)
-        points: Array = draws.numpy().astype(np.float64)
+        points: Array = draws.detach().numpy().astype(np.float64)
         inside = points[((points >= 0.0) & (points <= 1.0)).all(axis=1)]
         return inside if len(inside) >= _MIN_INSIDE_SHARE * count else np.clip(points, 0.0, 1.0)

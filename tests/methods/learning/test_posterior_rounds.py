@@ -17,7 +17,8 @@ class Posterior:
     def sample(self, shape, **options):
         assert not any(options.values()), "rejection would not end"
         generator = torch.Generator().manual_seed(0)
-        return self.mean + 0.1 * torch.randn((*shape, 2), generator=generator)
+        draws = self.mean + 0.1 * torch.randn((*shape, 2), generator=generator)
+        return draws.requires_grad_()  # as those of a network
 
 
 def draw_points(mean, count=1000):
