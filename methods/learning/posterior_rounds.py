@@ -19,6 +19,8 @@ _POSTERIOR_DRAWS = 1000
 """Number of posterior samples of which the mean is the recommendation."""
 _MIN_INSIDE_SHARE = 0.1
 """Share of the posterior samples within the bounds below which all samples are used, clipped."""
+_BOUND_MARGIN = 1e-6
+"""Distance from the bounds of points that are moved there."""
 _MIN_SINGULAR_VALUE = 1e-9
 """Singular value, relative to the largest one, below which a component is a rounding error."""
 
@@ -135,4 +137,7 @@ class PosteriorRounds:
         draws = self._posterior.sample((count,), reject_outside_prior=False)
         points: Array = draws.detach().numpy().astype(np.float64)
         inside = points[((points >= 0.0) & (points <= 1.0)).all(axis=1)]
-        return inside if len(inside) >= _MIN_INSIDE_SHARE * count else np.clip(points, 0.0, 1.0)
+        if len(inside) >= _MIN_INSIDE_SHARE * count:
+            return inside
+        # On a bound, sbi counts a point as outside its prior.
+        return np.clip(points, _BOUND_MARGIN, 1.0 - _BOUND_MARGIN)
