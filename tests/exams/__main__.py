@@ -1,8 +1,9 @@
 """Run an exam of `simgap explain`: ``python -m tests.exams EXAM [options]``.
 
 Exams are systems (ball, pendulum, slider), robots, floating (robots with a floating base), planted
-(one number of a packaged model file), contacts (one number of a contact), conventions (of logs) and
-recordings (measured ones). One row an answer is added to items.jsonl of the output folder, so that
+(one number of a packaged model file), models (files as people have them), geometry (wrong lengths,
+payloads, wheels), contacts (one number of a contact), conventions (of logs) and recordings
+(measured ones). One row an answer is added to items.jsonl of the output folder, so that
 an interrupted exam continues where it was; several versions may share a folder. Tables, figures and
 a page are written at the end. ``tests/exams/README.md`` describes the cases and grades.
 """
