@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment
@@ -52,8 +52,12 @@ TRAINING_COLUMNS = ["cell", "tuner", "fit_simulations", "fit_seconds"]
 SKIPPED_COLUMNS = ["tuner", "reason"]
 _STORED_DIGITS = 4
 """Significant digits of stored errors."""
-_ERRORS_COLUMN = "errors"
-"""Column with the list of errors after 0, 1, ... simulations."""
+_SECONDS_DIGITS = 2
+"""Decimals of stored seconds."""
+_ERRORS_COLUMNS = ("lengths", "mantissas", "exponents")
+"""Columns with the errors after 0, 1, ... simulations; see `_encode_errors`."""
+_MISSING, _FAILED = 126, 127
+"""Exponents that stand for NaN and for infinity."""
 
 
 @dataclass(frozen=True)
@@ -320,12 +324,12 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    # Errors of one run hardly change from one simulation to the next, so that one list for each run
-    # takes a tenth of the space of one column for each simulation.
-    values = pa.array(_round_values(suite.errors).reshape(-1))
-    errors = pa.FixedSizeListArray.from_arrays(values, suite.budget + 1)
-    table = pa.Table.from_pandas(suite.runs, preserve_index=False)
-    table = table.append_column(_ERRORS_COLUMN, errors)
+    table = pa.Table.from_pandas(
+        suite.runs.assign(seconds=suite.runs["seconds"].round(_SECONDS_DIGITS)),
+        preserve_index=False,
+    )
+    for name, column in _encode_errors(suite.errors).items():
+        table = table.append_column(name, column)
     with atomic_replacement(folder / CURVES_FILE) as path:
         # Few errors occur twice, so that a dictionary of them takes more space than it saves. Each
         # column is one page, because columns are compressed page by page.
@@ -335,7 +339,6 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
             compression="brotli",
             compression_level=11,
             use_dictionary=False,
-            use_byte_stream_split=["seconds"],
             data_page_size=2**26,
         )
     texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
@@ -344,13 +347,47 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     return [folder / name for name in (CURVES_FILE, *texts)]
 
 
-def _round_values(values: Array) -> NDArray[np.float32]:
-    """Round to `_STORED_DIGITS` significant digits, which compress well."""
+def _encode_errors(errors: Array) -> dict[str, Any]:
+    """Return the columns that store errors (R, K + 1): only where they change, in decimal digits.
+
+    An error hardly changes from one simulation to the next, and few errors of two runs are equal.
+    An error is mantissa * 10 ** (exponent - `_STORED_DIGITS` + 1).
+
+    Returns:
+        Columns of one list for each run: for how many simulations an error holds, its mantissa and
+        its exponent.
+    """
+    import pyarrow as pa
+
     with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.floor(np.log10(np.abs(values)))
-    scale = 10.0 ** (_STORED_DIGITS - 1 - np.where(np.isfinite(size), size, 0.0))
-    rounded = np.where(np.isfinite(values), np.round(values * scale) / scale, values)
-    return rounded.astype(np.float32)
+        exponents = np.floor(np.log10(np.abs(errors)))
+    is_number = np.isfinite(errors) & np.isfinite(exponents)
+    exponents = np.where(is_number, exponents, 0.0)
+    shifted = np.where(is_number, errors, 0.0) * 10.0 ** (_STORED_DIGITS - 1 - exponents)
+    mantissas = np.round(shifted).astype(np.int16)
+    exponents = exponents.astype(np.int8)
+    exponents[np.isnan(errors)], exponents[np.isposinf(errors)] = _MISSING, _FAILED
+    has_changed = np.ones(errors.shape, dtype=bool)
+    has_changed[:, 1:] = (np.diff(mantissas, axis=1) != 0) | (np.diff(exponents, axis=1) != 0)
+    starts = np.flatnonzero(has_changed)
+    lengths = np.diff(starts, append=errors.size).astype(np.int16)
+    offsets = np.concatenate([[0], np.cumsum(has_changed.sum(axis=1))]).astype(np.int32)
+    values = lengths, mantissas[has_changed], exponents[has_changed]
+    return {
+        name: pa.ListArray.from_arrays(pa.array(offsets), pa.array(column))
+        for name, column in zip(_ERRORS_COLUMNS, values, strict=True)
+    }
+
+
+def _decode_errors(table: Any) -> Array:
+    """Return the errors (R, K + 1) of a stored table; see `_encode_errors`."""
+    lengths, mantissas, exponents = (
+        table[name].combine_chunks().flatten().to_numpy() for name in _ERRORS_COLUMNS
+    )
+    values = mantissas * 10.0 ** (exponents.astype(np.float64) - _STORED_DIGITS + 1)
+    values[exponents == _MISSING], values[exponents == _FAILED] = np.nan, np.inf
+    errors: Array = np.repeat(values, lengths).reshape(len(table), -1)
+    return errors
 
 
 def read_suite_runs(folder: Path) -> SuiteRuns:
@@ -368,8 +405,7 @@ def read_suite_runs(folder: Path) -> SuiteRuns:
             pd.read_csv(folder / name, keep_default_na=False)
             for name in (CELLS_FILE, TRAINING_FILE, SKIPPED_FILE)
         )
-        values = table[_ERRORS_COLUMN].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        errors = values.astype(np.float64).reshape(len(frame), -1)
+        errors = _decode_errors(table)
         return SuiteRuns(
             frame,
             errors,
