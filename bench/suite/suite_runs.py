@@ -56,6 +56,8 @@ _SECONDS_DIGITS = 2
 """Decimals of stored seconds."""
 _ERRORS_COLUMNS = ("lengths", "mantissas", "exponents")
 """Columns with the errors after 0, 1, ... simulations; see `_encode_errors`."""
+_MIN_EXPONENT = -100
+"""Smallest stored exponent."""
 _MISSING, _FAILED = 126, 127
 """Exponents that stand for NaN and for infinity."""
 
@@ -362,7 +364,8 @@ def _encode_errors(errors: Array) -> dict[str, Any]:
     with np.errstate(divide="ignore", invalid="ignore"):
         exponents = np.floor(np.log10(np.abs(errors)))
     is_number = np.isfinite(errors) & np.isfinite(exponents)
-    exponents = np.where(is_number, exponents, 0.0)
+    # A smaller error counts as zero.
+    exponents = np.where(is_number, np.maximum(exponents, _MIN_EXPONENT), 0.0)
     shifted = np.where(is_number, errors, 0.0) * 10.0 ** (_STORED_DIGITS - 1 - exponents)
     mantissas = np.round(shifted).astype(np.int16)
     exponents = exponents.astype(np.int8)

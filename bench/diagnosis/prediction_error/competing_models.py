@@ -457,9 +457,9 @@ def _confirm_by_filter(
     """Return a start with a competing model that a filter confirms, else None.
 
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
-    best one, the start is returned at once, as is a payload, in whose place no motion is linear. If
-    not, a filter with the effect in its model decides:
-    it improves the coefficients, and its log-likelihood must come close to that of the best model.
+    best one, the start is returned at once. So is a payload, in whose position the motion is not
+    linear. Otherwise a filter with the effect in its model decides: it improves the coefficients,
+    and its log-likelihood must come close to that of the best model.
 
     Args:
         context: search, filters and regressions of the recording.

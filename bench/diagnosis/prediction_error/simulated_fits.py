@@ -196,10 +196,9 @@ def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
         context: search, filters and regressions of the recording.
         model: the fitted model.
     """
-    is_on_ground = context.filters.base.is_on_ground
-    return context.search.is_noise_like(model) and context.search.compute_excess_residual(model) < (
-        NEGLIGIBLE_EXCESS if is_on_ground else EXPLAINED_EXCESS
-    )
+    limit = NEGLIGIBLE_EXCESS if context.filters.base.is_on_ground else EXPLAINED_EXCESS
+    is_small = context.search.compute_excess_residual(model) < limit
+    return is_small and context.search.is_noise_like(model)
 
 
 def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:

@@ -28,6 +28,17 @@ def test_stored_runs_come_back_with_four_digits(tmp_path):
     assert again.version == "suite 1"
 
 
+def test_missing_failed_and_vanishing_errors_come_back(tmp_path):
+    special = CURVE.copy()
+    special[1:5] = 0.0, 1e-150, 9.99996e-7, 12345.0
+    special[60:] = np.nan
+    write_suite_runs(make_suite({"a": {"one": special}}, targets=1), tmp_path)
+    (again,) = read_suite_runs(tmp_path).errors
+    assert again[1:5] == pytest.approx([0.0, 0.0, 1e-6, 12350.0], rel=1e-3, abs=1e-12)
+    assert np.isnan(again[60:]).all()
+    assert np.isfinite(again[:60]).all()
+
+
 def test_damaged_store_is_one_message(tmp_path):
     (tmp_path / CURVES_FILE).write_bytes(b"nothing")
     with pytest.raises(InputError, match="expected the stored runs of a suite"):
