@@ -8,6 +8,7 @@ from bench.diagnosis.explain import explain
 from tests.exams.planted.geometry_cases import DRAWS, GeometryQuestion, questions
 from tests.exams.planted.model_cases import ModelExperiment
 from tests.exams.planted.model_files import MODELS
+from tests.exams.planted.planted_cases import STANDARD
 from tests.exams.planted.planted_motion import Change
 
 
@@ -55,10 +56,14 @@ def test_a_carried_weight_makes_no_torque():
         pytest.param("radius", 3, marks=pytest.mark.long),
     ],
 )
-def test_the_wrong_number_is_named_alone(number, index, tmp_path):
+def test_the_wrong_number_is_named_alone_or_with_its_equals(number, index, tmp_path):
     """Families of masses and of carried weights, and wheels that creep, hid these three."""
     case = GeometryQuestion(number, index).draw()
     answer = explain(case.write(tmp_path)).answer
-    assert answer.verdict == "named"
-    assert [cause.effect for cause in answer.causes] == [case.change.effect]
-    assert not answer.causes[0].alternatives
+    (cause,) = answer.causes
+    members = {cause.effect, *cause.alternatives}
+    assert answer.verdict == ("named" if len(members) == 1 else "ambiguous")
+    assert case.change.effect in members
+    # Plain MuJoCo with any other member predicts the held-out run as well.
+    ratios = case._held_out_ratios([tuple(members)])
+    assert all(ratio <= STANDARD.equal_below for ratio in ratios.values())
