@@ -2,7 +2,7 @@
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
 # make test      the tests that take a few seconds each (about 6 minutes on two cores)
-# make test-rest the slow ones and those that depend on recordings beside the clone (PART=1/8: an eighth)
+# make test-rest the slow ones and those that depend on recordings beside the clone (PART=1/12: a twelfth)
 # make test-all  all of them, those of minutes too: whole examples, exams and clusters (30 minutes)
 # make check     lint, types, import rules and language
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
