@@ -248,7 +248,8 @@ def render_suite_page(tables: SuiteTables) -> str:
     order = _order_tuners(tables)
     styles = {name: get_mark_style(place) for place, name in enumerate(order)}
     targets = suite.runs.groupby("cell")["target"].nunique()
-    seeds = int(suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique().max())
+    seed_counts = suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique()
+    seeds = int(seed_counts.max())
     trained = suite.training[suite.training["fit_simulations"] > 0]
     ranked = bool(tables.complete_tuners)
     partial_tuners = [t for t in suite.tuners if t not in tables.complete_tuners]
@@ -258,7 +259,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         tuners=suite.tuners,
         problem_count=suite.cells["problem"].nunique(),
         targets=_join_range(targets),
-        seeds=f"{seeds} seed{'' if seeds == 1 else 's'}",
+        seeds=f"{_join_range(seed_counts)} seed{'' if seeds == 1 else 's'}",
         headline=build_headline(tables) if ranked else "No method has results in all cells.",
         tests=list(describe_tests(tables)),
         guide_checkpoints=[k for k in _GUIDE_CHECKPOINTS if k in tables.checkpoints],
