@@ -121,7 +121,7 @@ def is_in_part(path, part):
         path: path of the file.
         part: number of the part from 1, and number of parts, as "1/3"; None for all files.
     """
-    if part is None:
+    if not part:
         return True
     number, count = map(int, part.split("/"))
     return crc32(path.name.encode()) % count == number - 1

@@ -419,5 +419,5 @@ def read_suite_runs(folder: Path) -> SuiteRuns:
     except (OSError, ArrowException, KeyError, ValueError) as error:
         raise InputError(
             f"{folder}: expected the stored runs of a suite ({CURVES_FILE}, {CELLS_FILE}), found "
-            f"{str(error).splitlines()[0]:.200}; run simgap plot {folder} to write them again"
+            f"{str(error).splitlines()[0]:.200}; restore the file or run the suite again"
         ) from None

@@ -779,7 +779,12 @@ class FollowedRuns:
         followed = self.follow(self.evaluator, theta, self.noise, max_linearisations=1)
         if not followed.has_expected_innovations:
             return self.get_first_states()
-        return followed.improve_first_states(theta, followed.get_first_states())
+        return followed.improved_first_states
+
+    @cached_property
+    def improved_first_states(self) -> Array:
+        """First states (R, 2 D) of a robot on the ground, improved for the parameters `theta`."""
+        return self.improve_first_states(self.theta, self.get_first_states())
 
     def improve_first_states(self, theta: Array, states: Array) -> Array:
         """Return first states (R, 2 D) with settled contacts whose simulations are closer.

@@ -298,9 +298,6 @@ FURTHER_STEPS = 4
 """Maximum number of further Gauss-Newton steps of a competing model that has improved much."""
 MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
-MASS_FAMILIES = ("mass.scale@*", "mass.offset@*", "gravity.compensation@*")
-"""Families that a payload of one body resembles."""
-PAYLOAD = "payload@"
 MIN_SAME_JOINT_GAIN_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
 
@@ -400,13 +397,13 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
         refine_single_effects(context, fitted)
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
-    likeliest = search.get_best(size)
-    if likeliest is None or likeliest is best:
+    preferred = search.get_best(size) or best
+    if preferred is best:
         return best
     # A family may replace another one, and a single member of it may be enough.
-    simpler = remove_idle_effects(context, likeliest)
-    is_same = simpler.effects == likeliest.effects
-    return likeliest if is_same else fit_competing_models(context, simpler)
+    simpler = remove_idle_effects(context, preferred)
+    is_same = simpler.effects == preferred.effects
+    return preferred if is_same else fit_competing_models(context, simpler)
 
 
 def _find_competing_effects(
@@ -431,7 +428,6 @@ def _find_competing_effects(
     gains = remaining.compute_net_gains()
     own_gain = remaining.compute_gain(columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
-    is_mass_family = name in MASS_FAMILIES
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
@@ -439,10 +435,8 @@ def _find_competing_effects(
         if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
             continue
         is_near = loss <= compute_comparison_margin(own_gain) and near_count < MAX_COMPETING_EFFECTS
-        # Regression is inaccurate for a large effect, so effects at the same joint are tried, and
-        # a payload, which masses of several bodies imitate.
-        is_alike = effect in same_joint or (is_mass_family and effect.startswith(PAYLOAD))
-        is_promising = is_alike and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
+        # Regression is inaccurate for a large effect, so effects at the same joint are tried.
+        is_promising = effect in same_joint and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
@@ -457,9 +451,8 @@ def _confirm_by_filter(
     """Return a start with a competing model that a filter confirms, else None.
 
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
-    best one, the start is returned at once. So is a payload, in whose position the motion is not
-    linear. Otherwise a filter with the effect in its model decides: it improves the coefficients,
-    and its log-likelihood must come close to that of the best model.
+    best one, the start is returned at once. If not, a filter with the effect in its model decides:
+    it improves the coefficients, and its log-likelihood must come close to that of the best model.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -472,8 +465,7 @@ def _confirm_by_filter(
         The start, with the coefficients of the filter if one was used; None if the competing model
         is far less likely.
     """
-    is_payload = competing_effect.effect.startswith(PAYLOAD)
-    if competing_effect.loss <= COMPETING_MODEL_MARGIN or is_payload:
+    if competing_effect.loss <= COMPETING_MODEL_MARGIN:
         return start
     filters = context.filters
     has_few_coefficients = (

@@ -443,7 +443,7 @@ class ModelFilters:
         )
         if not followed.has_expected_innovations:
             return start
-        states = followed.improve_first_states(start.theta, followed.get_first_states())
+        states = followed.improved_first_states
         refined = SettledSimulations(followed, states).refine(start)
         settled = followed.settle(refined.theta, states, is_other_geometry=True)
         refined_states = followed.improve_first_states(refined.theta, settled)

@@ -160,15 +160,17 @@ class HeldOutRuns:
             initial_starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
         )
         count = max(int(self.seen.sum()), 1)
-        is_far = is_filtered and not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count
+        has_poor_fit = (
+            is_filtered and not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count
+        )
         followed = self.evaluator.filtered_runs
-        if is_far and followed is not None and followed.is_on_ground:
+        if has_poor_fit and followed is not None and followed.is_on_ground:
             settled_states = [followed.estimate_settled_states(theta) for theta in thetas]
             starts = [FitStart((), *pair) for pair in zip(thetas, settled_states, strict=True)]
             fits = _select_nearer_fits(
                 fits, self._fit_initial_states(starts, FILTERED_HORIZON_STAGES)
             )
-        elif is_far:
+        elif has_poor_fit:
             # Runs that amplify differences of the initial state need a fit in stages.
             fits = _select_nearer_fits(
                 fits, self._fit_initial_states(initial_starts, HORIZON_STAGES)

@@ -21,6 +21,7 @@ from tests.exams.planted.planted_motion import (
     Change,
     Run,
     add_point_mass,
+    turn_axis,
 )
 
 STEPS = 12  # Maximum number of steps of a fit.
@@ -219,14 +220,6 @@ def _link_length(model, place, c):
     model.body_pos[model.body(place).id] *= 1 + c[0]
 
 
-def _joint_axis(model, place, c):
-    axis, turned = model.joint(place).axis, np.zeros(3)
-    turn = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, c / max(np.linalg.norm(c), 1e-12), np.linalg.norm(c))
-    mujoco.mju_rotVecQuat(turned, axis.copy(), turn)
-    axis[:] = turned
-
-
 def _gravity_scale(model, _, c):
     model.opt.gravity[:] *= 1 + c[0]
 
@@ -294,7 +287,7 @@ FORMS = {
     ],
     "joint.zero": [_planted("zero", "angle", lambda model, place: -np.inf)],
     "link.length": [_Form(("ratio",), edit=_link_length)],
-    "joint.axis": [_Form(("angle",) * 3, edit=_joint_axis, begin=(0, 0, 0))],
+    "joint.axis": [_Form(("angle",) * 3, edit=turn_axis, begin=(0, 0, 0))],
     "gravity.compensation": [_planted("gravcomp", "ratio", _positive)],
     "geom.radius": [_planted("radius", "ratio", _ratio)],
     "contact.friction": [_planted("friction", "ratio", _ratio)],

@@ -59,7 +59,10 @@ class Change:
         elif self.kind == "length":
             model.body_pos[model.body(self.place).id] *= 1 + self.size
         elif self.kind == "axis":
-            tilt_axis(model, self.place, self.size)
+            # Tilt about the axis of the body's frame that is most across.
+            rotation = np.zeros(3)
+            rotation[np.argmin(np.abs(model.joint(self.place).axis))] = self.size
+            turn_axis(model, self.place, rotation)
         elif self.kind == "gravcomp":
             model.body_gravcomp[model.body(self.place).id] += self.size
         elif self.kind == "radius":
@@ -73,15 +76,14 @@ class Change:
             mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def tilt_axis(model, joint, angle):
-    """Tilt the axis of a joint by an angle (rad) about the axis of its body that is most across."""
+def turn_axis(model, joint, rotation):
+    """Turn the axis of a joint by a rotation vector (3,), rad, in the frame of its body."""
+    angle, turned = np.linalg.norm(rotation), np.zeros(3)
+    turn = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, rotation / max(angle, 1e-12), angle)
     axis = model.joint(joint).axis
-    rotation = np.zeros(3)
-    rotation[np.argmin(np.abs(axis))] = angle
-    turn, tilted = np.zeros(4), np.zeros(3)
-    mujoco.mju_axisAngle2Quat(turn, rotation / abs(angle), abs(angle))
-    mujoco.mju_rotVecQuat(tilted, axis.copy(), turn)
-    axis[:] = tilted
+    mujoco.mju_rotVecQuat(turned, axis.copy(), turn)
+    axis[:] = turned
 
 
 def add_point_mass(model, body, mass, place):
