@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
+MAX_JOINTS_OF_NONLINEAR_FILTER = 8
+"""Maximum number of joints of a robot whose states in contact a cubature filter estimates."""
 CONTACT_SEGMENT_SECONDS = 0.5
 """Duration in seconds of the segments of a robot on the ground."""
 
@@ -76,7 +78,11 @@ class ContactConditions:
         The depth of a contact is smaller than the noise of most encoders, so that a model that is
         linearised about the readings has wrong contact forces. The filter then needs a missing
         force that is larger than all typical forces. A robot on the ground is linearised about a
-        simulated motion instead.
+        simulated motion instead. Another robot with many joints keeps the linear model, with
+        process noise at its contacts: the nonlinear filter, whose time grows with the square of the
+        number of joints, would take hours.
         """
         force_share = float((filtered_runs.force / filtered_runs.typical).max())
-        return self.has_contacts_off_ground and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+        has_few_joints = len(filtered_runs.typical) <= MAX_JOINTS_OF_NONLINEAR_FILTER
+        is_off_ground = self.has_contacts_off_ground and has_few_joints
+        return is_off_ground and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
