@@ -10,7 +10,7 @@ Competing models may be equivalent to the best one, or better.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,11 +47,14 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_nearly_explained,
     make_replacing_start,
     remove_idle_effects,
+    select_lowest_of_each,
     select_more_likely,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
     MAX_IMPROVED_SIZE,
+    MAX_SINGLE_SQUARES_SHARE,
     refine_single_effects,
+    scale_effect,
 )
 from sims.core.simulator import Array
 
@@ -298,6 +301,13 @@ FURTHER_STEPS = 4
 """Maximum number of further Gauss-Newton steps of a competing model that has improved much."""
 MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
+COMPETING_FACTORS = (0.5, 0.8, 1.0, 1.25, 2.0)
+"""Factors of the regression coefficient at which a competing effect is simulated."""
+MAX_REFINED_EXCESS_SHARE = 0.25
+"""Maximum excess residual of a competing fit that is refined, above that of the best model.
+
+It is a share of the excess residual of the base model.
+"""
 MIN_SAME_JOINT_GAIN_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
 
@@ -381,20 +391,14 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
             )
             if frozenset(start.effects) in search.models:
                 continue
-            confirmed = _confirm_by_filter(context, best, competing_effect, start)
+            confirmed = _confirm(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
     if starts:
         search.refit_models(starts, is_racing=False)
     size = len(best.effects)
     # Jumps of the state in the linear model come from drives at their force limits.
     if size == 1 and context.filters.base.runs.jumps.any():
-        # Fits at force limits may stop in local minima.
-        laws = JOINT_MODEL + SERVO_MODEL
-        plain = [name for name in competing_effects if name.partition("@")[0] in laws]
-        fitted = [
-            search.models[frozenset([name])] for name in plain if frozenset([name]) in search.models
-        ]
-        refine_single_effects(context, fitted)
+        _refine_at_force_limits(context, best, competing_effects)
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
     preferred = search.get_best(size) or best
@@ -404,6 +408,33 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     simpler = remove_idle_effects(context, preferred)
     is_same = simpler.effects == preferred.effects
     return preferred if is_same else fit_competing_models(context, simpler)
+
+
+def _refine_at_force_limits(
+    context: SearchContext, best: FittedModel, competing_effects: Collection[str]
+) -> None:
+    """Fit single effects of the joint and servo models further, if they may reach the best model.
+
+    Fits at force limits may stop in local minima. A fit that leaves much of the base model's excess
+    residual where the best model leaves only noise is not such a case.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model, with a single effect.
+        competing_effects: names of the effects that compete with it.
+    """
+    search, laws = context.search, JOINT_MODEL + SERVO_MODEL
+    limit = search.compute_excess_residual(best) + MAX_REFINED_EXCESS_SHARE * (
+        search.compute_excess_residual(search.base_model)
+    )
+    fitted = [
+        search.models[frozenset([name])]
+        for name in competing_effects
+        if name.partition("@")[0] in laws and frozenset([name]) in search.models
+    ]
+    refine_single_effects(
+        context, [model for model in fitted if search.compute_excess_residual(model) < limit]
+    )
 
 
 def _find_competing_effects(
@@ -445,14 +476,14 @@ def _find_competing_effects(
     return list(competing_effects.values())
 
 
-def _confirm_by_filter(
+def _confirm(
     context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
-    """Return a start with a competing model that a filter confirms, else None.
+    """Return a start with a competing model that may be as good as the best one, else None.
 
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
-    best one, the start is returned at once. If not, a filter with the effect in its model decides:
-    it improves the coefficients, and its log-likelihood must come close to that of the best model.
+    best one, the start is returned at once. If not, simulations or a filter decide. Simulations of
+    an effect with one coefficient are faster, and show more if the best model explains the runs.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -462,11 +493,57 @@ def _confirm_by_filter(
         start: the competing model, with the coefficients from the regression.
 
     Returns:
-        The start, with the coefficients of the filter if one was used; None if the competing model
-        is far less likely.
+        The start, with improved coefficients; None if the competing model is far worse.
     """
     if competing_effect.loss <= COMPETING_MODEL_MARGIN:
         return start
+    if competing_effect.c.size == 1 and is_explained(context, best):
+        return _confirm_by_simulation(context, best, competing_effect, start)
+    return _confirm_by_filter(context, best, competing_effect, start)
+
+
+def _confirm_by_simulation(
+    context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
+) -> FitStart | None:
+    """Return a competing model with the best of several simulated coefficients, else None.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model, which explains the runs.
+        competing_effect: the effect that replaces one of its effects.
+        start: the competing model, with the coefficient from the regression.
+
+    Returns:
+        The start with the lowest cost; None if it leaves much of the residual of the base model.
+    """
+    starts = [
+        scale_effect(context, start, competing_effect.effect, factor)
+        for factor in COMPETING_FACTORS
+    ]
+    ((cost, lowest),) = select_lowest_of_each(context, starts)
+    limit = best.fit.cost + MAX_SINGLE_SQUARES_SHARE * context.search.base_model.fit.cost
+    return lowest if cost < limit else None
+
+
+def _confirm_by_filter(
+    context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
+) -> FitStart | None:
+    """Return a start with a competing model that a filter confirms, else None.
+
+    A filter with the effect in its model improves the coefficients, and its log-likelihood must
+    come close to that of the best model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+        competing_effect: the effect that replaces one of its effects, with its loss in the
+            regression.
+        start: the competing model, with the coefficients from the regression.
+
+    Returns:
+        The start, with the coefficients of the filter; None if the competing model is far less
+        likely.
+    """
     filters = context.filters
     has_few_coefficients = (
         len(context.evaluator.get_coefficient_indices(competing_effect.effect)) <= MAX_IMPROVED_SIZE

@@ -203,15 +203,49 @@ class EffectProposals:
         proposals = []
         for name in self._list_effects_at(joint):
             if name not in excluded:
-                places = evaluator.get_coefficient_indices(name)
-                step, gain = self._compute_likelihood_step(followed, name)
-                change = float(step[places[0]])
+                change, gain = self._compute_first_change(followed, name)
+                if name == f"drag.linear@{place}":
+                    change, gain = self._compare_with_servo_damping(followed, joint, change, gain)
                 # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 proposals.append((gain, name, np.array([change])))
         proposals.sort(key=lambda proposal: -proposal[0])
         return [(name, c) for _, name, c in proposals]
+
+    def _compute_first_change(self, followed: FollowedRuns, name: str) -> tuple[float, float]:
+        """Return the first Gauss-Newton change of an effect alone, and its gain."""
+        step, gain = self._compute_likelihood_step(followed, name)
+        return float(step[self.filters.evaluator.get_coefficient_indices(name)[0]]), gain
+
+    def _compare_with_servo_damping(
+        self, followed: FollowedRuns, joint: int, change: float, gain: float
+    ) -> tuple[float, float]:
+        """Return the change and gain of viscous damping, or those of its servo's damping.
+
+        The damping of a servo and that of its joint are the same force unless the servo is at its
+        force limit. If the servo's damping gains much more, the linear response to the joint's is
+        not valid, because the joint chatters at the limit.
+
+        Args:
+            followed: the runs, followed by the filter of the set that is extended.
+            joint: index of the joint.
+            change: first change of the joint's damping, in N·m·s/rad or N·s/m.
+            gain: gain in log-likelihood of that change.
+        """
+        evaluator = self.filters.evaluator
+        assert isinstance(evaluator.simulator, RobotSimulator)
+        servo = get_servo_input(evaluator, joint).removeprefix("u.")
+        name, robot = f"actuator.damping@{servo}", evaluator.simulator.robot
+        if name not in evaluator.library:
+            return change, gain
+        servo_change, servo_gain = self._compute_first_change(followed, name)
+        if servo_gain < gain + self.filters.penalty(name):
+            return change, gain
+        actuator = robot.actuator(servo).id
+        gear = float(robot.compiled.actuator_gear[actuator, 0])
+        damping = -float(robot.compiled.actuator_biasprm[actuator, 2])
+        return gear**2 * damping * servo_change, servo_gain
 
     def compute_largest_gain_of_others(self, friction: str) -> float:
         """Return the largest gain in log-likelihood by another effect where dry friction acts.

@@ -9,7 +9,9 @@ residual of a set is only noise. The order is:
     1. Select effects with few shapes by regression. If the selection leaves a large residual of a
        robot with servos, identify the servos (`servo_identification`), and do nothing of the
        following. Otherwise fit the dry friction among them first, because it is not linear where a
-       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`).
+       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`). If this fails, or
+       before it if servos reach their limits, simulate single effects at several coefficients, and
+       fit the best of them (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
        is missing (`simulated_fits`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
@@ -80,13 +82,14 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
-    select_lowest_of_each,
     select_more_likely,
     select_with_shapes,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
+    fit_likely_effects,
     fit_series_effects,
     fit_single_effects,
+    list_likely_starts,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -98,8 +101,6 @@ from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6
 """Minimum share of the joints of a real arm whose servo or friction the model lacks."""
-MAX_SINGLE_SQUARES_SHARE = 0.3
-"""Maximum share of the squared residual that a single likely effect leaves before any fit."""
 TRIED_SHARES = (1.0, 0.5)
 """Shares of the regression coefficients with which a filter must follow the runs better."""
 
@@ -165,10 +166,10 @@ class PredictionErrorSearch(EffectSearch):
 
         A robot with unknown servos is identified servo by servo, and nothing else is done.
         Otherwise each further method is slower, so it is tried only if the best model does not
-        explain the runs: dry friction alone, the selected set, effects with many shapes, effects
-        that regression missed (singly, then one by one), one effect in place of several, and at
-        last series effects (elastic or slack transmissions). If no effect was accepted, the
-        selected set is fitted whole.
+        explain the runs: likely effects alone, dry friction alone, the selected set, effects with
+        many shapes, effects that regression missed (singly, then one by one), one effect in place
+        of several, and at last series effects (elastic or slack transmissions). If no effect was
+        accepted, the selected set is fitted whole.
 
         The functions named ``check_`` return nothing; they end the search by raising
         `SoftFrictionError` if dry friction is likelier in MuJoCo's soft form.
@@ -186,6 +187,12 @@ class PredictionErrorSearch(EffectSearch):
         selected = context.columns.select()
         if not self.is_form_given:
             check_selection(context, selected)
+        # The linear model jumps where servos reach their limits, so the selection is not reliable.
+        has_jumps = bool(context.filters.base.runs.jumps.any())
+        if has_jumps and not best_single.effects:
+            best_single = fit_likely_effects(context)
+            if is_explained(context, best_single):
+                return best_single
         self.identified = self._identify_servos(selected)
         if self.identified is not None:
             return self.identified.model
@@ -196,6 +203,8 @@ class PredictionErrorSearch(EffectSearch):
             if friction.effects and is_nearly_explained(context, friction):
                 check_fit(context, friction)
             best = select_more_likely(best, fit_quick_selection(context, selected))
+        if self._should_continue(best) and not has_jumps:
+            best = select_more_likely(best, fit_likely_effects(context))
         selected_with_shapes = selected
         if self._should_continue(best):
             selected_with_shapes = select_with_shapes(context, selected)
@@ -254,12 +263,7 @@ class PredictionErrorSearch(EffectSearch):
 
     def _is_single_effect_likely(self) -> bool:
         """Return whether one effect removes most of the residual without being fitted."""
-        context = self._search_context
-        starts = context.proposals.of(context.filters.empty_set)
-        if not starts:
-            return False
-        lowest_cost, _ = select_lowest_of_each(context, starts)[0]
-        return lowest_cost < MAX_SINGLE_SQUARES_SHARE * self.base_model.fit.cost
+        return bool(list_likely_starts(self._search_context))
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

@@ -1,7 +1,8 @@
 """Fit single effects alone by simulation, joint flexibility and backlash included.
 
 A servo at its limit is not linear, so a regression misjudges effects there. The effects that are
-most likely missing are therefore simulated alone, as one batch.
+most likely missing are therefore simulated alone, as one batch: before any selection at several
+coefficients (`fit_likely_effects`), and if the selection fails, each fitted (`fit_single_effects`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit
@@ -33,10 +37,116 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from sims.robot.dynamics.series_joints import is_series_effect
 
+SCANNED_FACTORS = (0.5, 2.0, 4.0)
+"""Factors of a proposed coefficient at which an effect alone is also simulated."""
+CLOSER_FACTORS = ((0.7, 0.84, 1.2, 1.4), (0.92, 0.96, 1.04, 1.09))
+"""Factors of the best scanned coefficient that are simulated next, in two rounds."""
+MAX_SINGLE_SQUARES_SHARE = 0.3
+"""Maximum share of the squared residual that a single likely effect leaves before any fit."""
+MAX_SCANNED_COST = 1.5
+"""Maximum squared residual of a sample, in units of the noise, at which nothing is scanned."""
+MAX_SCANNED_FITS = 2
+"""Maximum number of likely effects that are fitted alone before any selection."""
 MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
 MAX_IMPROVED_SIZE = 3
 """Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
+
+
+def list_likely_starts(context: SearchContext) -> list[FitStart]:
+    """Return the proposed effects that alone remove most of the residual, without any fit.
+
+    Where a servo is at its limit or chatters, the cost is flat at the base model and steep far from
+    it, so that a fit from the coefficient of a regression stays where it is. Each effect is
+    therefore simulated at several factors of its proposed coefficient. This is skipped if one of
+    them explains the runs with the coefficient itself.
+
+    Returns:
+        Starts with one effect each, in ascending order of their costs.
+    """
+    search, filters = context.search, context.filters
+    states = filters.estimate_first_states(filters.base)
+    proposed = [
+        replace(start, initial_states=states) for start in context.proposals.of(filters.empty_set)
+    ]
+    costs = select_lowest_of_each(context, proposed)
+    if not _has_noise_like_cost(context, costs):
+        costs = _scan(context, costs, SCANNED_FACTORS)
+    limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
+    return [start for cost, start in costs if cost < limit]
+
+
+def _has_noise_like_cost(context: SearchContext, costs: Sequence[tuple[float, FitStart]]) -> bool:
+    """Return whether the first cost, of a model without a fit, is nearly that of noise."""
+    sample_count = int(context.filters.base.runs.recorded.sum())
+    return bool(costs) and costs[0][0] < MAX_SCANNED_COST * sample_count
+
+
+def _scan(
+    context: SearchContext, costs: Sequence[tuple[float, FitStart]], factors: Sequence[float]
+) -> list[tuple[float, FitStart]]:
+    """Simulate starts with one coefficient also at factors of it, and keep the best of each effect.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        costs: costs and starts with one effect each.
+        factors: factors of the coefficient.
+
+    Returns:
+        Cost and start of each effect, in ascending order of the cost.
+    """
+    scaled = [
+        scale_effect(context, start, start.effects[0], factor)
+        for _, start in costs
+        if len(context.evaluator.get_coefficient_indices(start.effects[0])) == 1
+        for factor in factors
+    ]
+    lowest = {start.effects: (cost, start) for cost, start in costs}
+    for cost, start in select_lowest_of_each(context, scaled):
+        if cost < lowest[start.effects][0]:
+            lowest[start.effects] = (cost, start)
+    return sorted(lowest.values(), key=lambda pair: pair[0])
+
+
+def scale_effect(context: SearchContext, start: FitStart, name: str, factor: float) -> FitStart:
+    """Return a start with the one coefficient of an effect scaled, within its bounds.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        start: the start; it is not changed.
+        name: name of the effect.
+        factor: factor of its coefficient.
+    """
+    theta = start.theta.copy()
+    (index,) = context.evaluator.get_coefficient_indices(name)
+    ((low, high),) = compute_coefficient_bounds(context.evaluator, name)
+    theta[index] = np.clip(factor * theta[index], low, high)
+    return replace(start, theta=theta)
+
+
+def fit_likely_effects(context: SearchContext) -> FittedModel:
+    """Fit the effects that alone remove most of the residual, before any selection.
+
+    A coefficient far from the linear range is first improved by simulations alone, because the
+    cost has local minima.
+
+    Returns:
+        The best model, which may be the base model.
+    """
+    best = context.search.base_model
+    for likely_start in list_likely_starts(context)[:MAX_SCANNED_FITS]:
+        costs = select_lowest_of_each(context, [likely_start])
+        for factors in CLOSER_FACTORS:
+            if not _has_noise_like_cost(context, costs):
+                costs = _scan(context, costs, factors)
+        fitted = fit_by_simulation(context, costs[0][1])
+        if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
+            fitted = fit_nearby(context, fitted, fitted.effects[0])
+        if np.isfinite(fitted.fit.cost):
+            best = select_more_likely(best, fitted)
+        if is_explained(context, best):
+            return remove_idle_effects(context, best)
+    return best
 
 
 def fit_single_effects(context: SearchContext) -> FittedModel:

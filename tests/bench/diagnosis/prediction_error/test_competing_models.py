@@ -1,10 +1,14 @@
 """Which effects are tried in place of another one."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.prediction_error import competing_models, single_effect_fits
 from bench.diagnosis.prediction_error.filters_with_effects import list_joint_model_effects
 from bench.logs.recording_loading import load_joined
 
@@ -26,3 +30,30 @@ def test_laws_of_the_same_joint_compete_with_an_effect(effect, joint):
     recording, kind = load_joined([EXAMPLE], None, None, ())
     evaluator = RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
     assert list_joint_model_effects(evaluator, effect) == {f"{law}@{joint}" for law in JOINT_LAWS}
+
+
+@pytest.mark.parametrize(("lowest_cost", "expected"), [(250.0, 1.25), (450.0, None)])
+def test_a_competing_effect_is_simulated_at_several_coefficients(
+    monkeypatch, lowest_cost, expected
+):
+    """Its best coefficient is a start, unless it leaves 30 % of the squared residual."""
+
+    def simulate(_context, starts):
+        factors = [float(start.theta[0]) for start in starts]
+        assert factors == [0.5, 0.8, 1.0, 1.25, 2.0]
+        return [(lowest_cost, starts[3])]
+
+    monkeypatch.setattr(competing_models, "is_explained", lambda *_: True)
+    monkeypatch.setattr(competing_models, "select_lowest_of_each", simulate)
+    monkeypatch.setattr(
+        single_effect_fits, "compute_coefficient_bounds", lambda *_: [(-np.inf, np.inf)]
+    )
+    base, best = (SimpleNamespace(fit=SimpleNamespace(cost=cost)) for cost in (1000.0, 100.0))
+    context = SimpleNamespace(
+        search=SimpleNamespace(base_model=base),
+        evaluator=SimpleNamespace(get_coefficient_indices=lambda _: [0]),
+    )
+    competing = competing_models._CompetingEffect("drag.linear@elbow", np.ones(1), 1e6)
+    start = FitStart(("drag.linear@elbow",), np.ones(1), np.zeros((1, 2)))
+    confirmed = competing_models._confirm(context, best, competing, start)
+    assert (None if confirmed is None else confirmed.theta[0]) == expected

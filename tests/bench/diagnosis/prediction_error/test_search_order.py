@@ -94,6 +94,7 @@ def test_friction_that_nearly_explains_is_compared_with_its_soft_form_before_oth
     friction = SimpleNamespace(effects=effects)
     replaced = {
         "fit_dry_friction": lambda *_: friction,
+        "fit_likely_effects": lambda *_: friction,
         "is_explained": lambda *_: False,
         "is_nearly_explained": lambda *_: is_nearly_explained,
         "check_fit": fail_with(_OtherFormIsLikelierError),
@@ -106,7 +107,9 @@ def test_friction_that_nearly_explains_is_compared_with_its_soft_form_before_oth
     search.is_form_given, search.models = True, {frozenset(): friction}
     search.__dict__["_search_context"] = SimpleNamespace(
         columns=SimpleNamespace(select=lambda: None),
-        filters=SimpleNamespace(base=SimpleNamespace(is_on_ground=False)),
+        filters=SimpleNamespace(
+            base=SimpleNamespace(is_on_ground=False, runs=SimpleNamespace(jumps=np.zeros(1)))
+        ),
     )
     with pytest.raises(expected):
         search._search_effects()

@@ -13,14 +13,15 @@ ARM = """
 <joint name="shoulder" axis="0 1 0" armature="{armature}"/>
 <geom type="capsule" size=".06" fromto="0 0 0 .4 0 0" mass="4"/><body pos=".4 0 0">
 <joint name="elbow" axis="0 1 0"/><geom type="capsule" size=".04" fromto="0 0 0 .3 0 0" mass="1.5"/>
-<body pos=".3 0 0"><joint name="wrist" axis="1 0 0" actuatorfrcrange="-{limit} {limit}"/>
+<body pos=".3 0 0">
+<joint name="wrist" axis="1 0 0" damping="{damping}" actuatorfrcrange="-{limit} {limit}"/>
 <geom type="box" size=".05 .08 .05" mass=".6"/></body></body></body></worldbody><actuator>
 <position name="s1" joint="shoulder" kp="2000" kv="100"/>
 <position name="s2" joint="elbow" kp="{kp}" kv="100"/>
 <position name="s3" joint="wrist" kp="2000" kv="100"/></actuator></mujoco>
 """
-STATED = {"armature": 0.1, "kp": 2000.0}
-TRUE = {"armature": 0.6, "kp": 1700.0}
+STATED = {"armature": 0.1, "kp": 2000.0, "damping": 0.0}
+TRUE = {"armature": 0.6, "kp": 1700.0, "damping": 6.0}
 
 
 def log_of(changed, seed):
@@ -77,3 +78,12 @@ def test_a_cause_at_another_joint_is_named(tmp_path, changed, effect, size):
     assert effect in found
     if cause.effect == effect:
         assert cause.coefficients["coefficient"].value == pytest.approx(size, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_cause_at_a_chattering_joint_is_found(tmp_path):
+    """The wrist chatters at its force limit, so that no linear response is valid there."""
+    answer = explained(tmp_path, "damping")
+    (cause,) = answer.causes
+    assert cause.effect == "drag.linear@wrist"
+    assert cause.coefficients["coefficient"].value == pytest.approx(TRUE["damping"], rel=0.02)
