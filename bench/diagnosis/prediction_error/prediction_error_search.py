@@ -166,10 +166,11 @@ class PredictionErrorSearch(EffectSearch):
 
         A robot with unknown servos is identified servo by servo, and nothing else is done.
         Otherwise each further method is slower, so it is tried only if the best model does not
-        explain the runs: likely effects alone, dry friction alone, the selected set, effects with
-        many shapes, effects that regression missed (singly, then one by one), one effect in place
-        of several, and at last series effects (elastic or slack transmissions). If no effect was
-        accepted, the selected set is fitted whole.
+        explain the runs: dry friction alone, the selected set, likely effects alone (first of all
+        if servos reach their limits), effects with many shapes, effects that regression missed
+        (singly, then one by one), one effect in place of several, and at last series effects
+        (elastic or slack transmissions). If no effect was accepted, the selected set is fitted
+        whole.
 
         The functions named ``check_`` return nothing; they end the search by raising
         `SoftFrictionError` if dry friction is likelier in MuJoCo's soft form.

@@ -1,8 +1,8 @@
 """Fit single effects alone by simulation, joint flexibility and backlash included.
 
 A servo at its limit is not linear, so a regression misjudges effects there. The effects that are
-most likely missing are therefore simulated alone, as one batch: before any selection at several
-coefficients (`fit_likely_effects`), and if the selection fails, each fitted (`fit_single_effects`).
+most likely missing are therefore simulated alone, as one batch: first each at several coefficients
+(`fit_likely_effects`), and if none of them explains the runs, each fitted (`fit_single_effects`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ MAX_SINGLE_SQUARES_SHARE = 0.3
 MAX_SCANNED_COST = 1.5
 """Maximum squared residual of a sample, in units of the noise, at which nothing is scanned."""
 MAX_SCANNED_FITS = 2
-"""Maximum number of likely effects that are fitted alone before any selection."""
+"""Maximum number of likely effects that are fitted alone."""
 MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
 MAX_IMPROVED_SIZE = 3
@@ -125,7 +125,7 @@ def scale_effect(context: SearchContext, start: FitStart, name: str, factor: flo
 
 
 def fit_likely_effects(context: SearchContext) -> FittedModel:
-    """Fit the effects that alone remove most of the residual, before any selection.
+    """Fit the effects that alone remove most of the residual.
 
     A coefficient far from the linear range is first improved by simulations alone, because the
     cost has local minima.
