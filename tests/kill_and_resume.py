@@ -87,7 +87,15 @@ def below(top, what):
     processes = {
         c.pid: c for c in everyone if "bench.benchmark.isolation.fork_server" in command_line(c)
     }
-    return [c for c in processes.values() if ISOLATION_PROCESSES[_depth(c, processes)] == what]
+    return [c for c in processes.values() if _kind(c, processes) == what]
+
+
+def _kind(process, processes):
+    """Return the kind of a process; None if it has ended since it was listed."""
+    try:
+        return ISOLATION_PROCESSES[_depth(process, processes)]
+    except psutil.NoSuchProcess:
+        return None
 
 
 def _depth(process, processes):
