@@ -242,8 +242,8 @@ def filter_runs(runs: SimulatedRuns) -> None:
     context = runs.context
     context.search_control.begin_stage("computing prediction errors")
     filtered_runs = runs.nominal_filter
-    is_wrong = runs.contacts.is_linear_model_wrong(filtered_runs)
-    if is_wrong or not filtered_runs.has_expected_innovations:
+    is_nonlinear = runs.contacts.needs_nonlinear_filter(filtered_runs)
+    if is_nonlinear or not filtered_runs.has_expected_innovations:
         if runs.contacts.has_contacts:
             # This import is needed for robots only.
             from bench.diagnosis.kalman.cubature_filter import set_first_states_in_contact

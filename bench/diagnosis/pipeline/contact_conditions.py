@@ -72,8 +72,8 @@ class ContactConditions:
             return options.pieces
         return CONTACT_SEGMENT_SECONDS
 
-    def is_linear_model_wrong(self, filtered_runs: FollowedRuns) -> bool:
-        """Return whether the linear model of a robot fails at the contacts of the recording.
+    def needs_nonlinear_filter(self, filtered_runs: FollowedRuns) -> bool:
+        """Return whether a robot is in contact, and its linear model fails there.
 
         The depth of a contact is smaller than the noise of most encoders, so that a model that is
         linearised about the readings has wrong contact forces. The filter then needs a missing
@@ -84,5 +84,5 @@ class ContactConditions:
         """
         force_share = float((filtered_runs.force / filtered_runs.typical).max())
         has_few_joints = len(filtered_runs.typical) <= MAX_JOINTS_OF_NONLINEAR_FILTER
-        is_off_ground = self.has_contacts_off_ground and has_few_joints
-        return is_off_ground and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+        is_wrong = not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+        return self.has_contacts_off_ground and has_few_joints and is_wrong

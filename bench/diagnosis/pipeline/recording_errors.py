@@ -87,7 +87,7 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     context.search_control.begin_stage("comparing conventions of log and model")
     if contacts.is_on_ground:
         return
-    if contacts.has_contacts and contacts.is_linear_model_wrong(runs.nominal_filter):
+    if contacts.has_contacts and contacts.needs_nonlinear_filter(runs.nominal_filter):
         return
     subject = _make_subject(runs)
     differences = ConventionComparison(subject).differences()

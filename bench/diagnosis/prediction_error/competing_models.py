@@ -505,16 +505,10 @@ def _confirm(
 def _confirm_by_simulation(
     context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
-    """Return a competing model with the best of several simulated coefficients, else None.
+    """Return a competing model with the best of several simulated coefficients.
 
-    Args:
-        context: search, filters and regressions of the recording.
-        best: the best model, which explains the runs.
-        competing_effect: the effect that replaces one of its effects.
-        start: the competing model, with the coefficient from the regression.
-
-    Returns:
-        The start with the lowest cost; None if it leaves much of the residual of the base model.
+    Arguments are those of `_confirm`. None is returned if even the lowest cost leaves much of the
+    residual of the base model.
     """
     starts = [
         scale_effect(context, start, competing_effect.effect, factor)
@@ -531,24 +525,10 @@ def _confirm_by_filter(
     """Return a start with a competing model that a filter confirms, else None.
 
     A filter with the effect in its model improves the coefficients, and its log-likelihood must
-    come close to that of the best model.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        best: the best model.
-        competing_effect: the effect that replaces one of its effects, with its loss in the
-            regression.
-        start: the competing model, with the coefficients from the regression.
-
-    Returns:
-        The start, with the coefficients of the filter; None if the competing model is far less
-        likely.
+    come close to that of the best model. Arguments are those of `_confirm`.
     """
     filters = context.filters
-    has_few_coefficients = (
-        len(context.evaluator.get_coefficient_indices(competing_effect.effect)) <= MAX_IMPROVED_SIZE
-    )
-    steps = GAUSS_NEWTON_STEPS if has_few_coefficients else 0
+    steps = GAUSS_NEWTON_STEPS if competing_effect.c.size <= MAX_IMPROVED_SIZE else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
     if (
         len(start.effects) == 1

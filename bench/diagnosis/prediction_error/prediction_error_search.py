@@ -75,6 +75,7 @@ from bench.diagnosis.prediction_error.servo_identification import (
     identify_servos,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
+    RatedStart,
     fit_by_simulation,
     fit_quick_selection,
     fit_selection,
@@ -191,7 +192,7 @@ class PredictionErrorSearch(EffectSearch):
         # The linear model jumps where servos reach their limits, so the selection is not reliable.
         has_jumps = bool(context.filters.base.runs.jumps.any())
         if has_jumps and not best_single.effects:
-            best_single = fit_likely_effects(context)
+            best_single = fit_likely_effects(context, self._likely_starts)
             if is_explained(context, best_single):
                 return best_single
         self.identified = self._identify_servos(selected)
@@ -205,7 +206,7 @@ class PredictionErrorSearch(EffectSearch):
                 check_fit(context, friction)
             best = select_more_likely(best, fit_quick_selection(context, selected))
         if self._should_continue(best) and not has_jumps:
-            best = select_more_likely(best, fit_likely_effects(context))
+            best = select_more_likely(best, fit_likely_effects(context, self._likely_starts))
         selected_with_shapes = selected
         if self._should_continue(best):
             selected_with_shapes = select_with_shapes(context, selected)
@@ -241,7 +242,7 @@ class PredictionErrorSearch(EffectSearch):
         context = self._search_context
         if not self.compute_excess_residual(self.base_model) > MIN_EXCESS:
             return None
-        if not has_unknown_servos(context) or self._is_single_effect_likely():
+        if not has_unknown_servos(context) or self._likely_starts:
             return None
         best = fit_quick_selection(context, selected)
         excess = self.compute_excess_residual(best)
@@ -262,9 +263,10 @@ class PredictionErrorSearch(EffectSearch):
             return None
         return IdentifiedSet(model, gains, is_residual_tested=False)
 
-    def _is_single_effect_likely(self) -> bool:
-        """Return whether one effect removes most of the residual without being fitted."""
-        return bool(list_likely_starts(self._search_context))
+    @cached_property
+    def _likely_starts(self) -> list[RatedStart]:
+        """Effects that alone remove most of the residual without being fitted."""
+        return list_likely_starts(self._search_context)
 
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.

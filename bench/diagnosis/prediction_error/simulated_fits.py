@@ -53,6 +53,9 @@ MIN_FURTHER_GAIN_SHARE = 0.01
 The model of a real robot is never complete, and long recordings show this with certainty.
 """
 
+RatedStart = tuple[float, FitStart]
+"""Cost of a simulation without a fit (sum of squares in units of the noise), and its start."""
+
 
 def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
     """Fit a set of effects by simulation, with restarts if it does not explain the runs.
@@ -136,9 +139,7 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
     return starts
 
 
-def select_lowest_of_each(
-    context: SearchContext, starts: Sequence[FitStart]
-) -> list[tuple[float, FitStart]]:
+def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) -> list[RatedStart]:
     """Simulate starts, and return the one with the lowest cost for each set of effects.
 
     Simulating all starts once, without a fit, is cheap. Only these best starts are then fitted.
@@ -156,7 +157,7 @@ def select_lowest_of_each(
     costs = compute_start_costs(
         context.evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
     )
-    best_of_each_set: dict[tuple[str, ...], tuple[float, FitStart]] = {}
+    best_of_each_set: dict[tuple[str, ...], RatedStart] = {}
     for i in np.argsort(costs, kind="stable").tolist():
         best_of_each_set.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
     return list(best_of_each_set.values())

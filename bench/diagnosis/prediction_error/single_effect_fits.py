@@ -24,6 +24,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
+    RatedStart,
     fit_by_simulation,
     fit_nearby,
     is_at_noise,
@@ -53,7 +54,7 @@ MAX_IMPROVED_SIZE = 3
 """Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
 
 
-def list_likely_starts(context: SearchContext) -> list[FitStart]:
+def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     """Return the proposed effects that alone remove most of the residual, without any fit.
 
     Where a servo is at its limit or chatters, the cost is flat at the base model and steep far from
@@ -62,7 +63,7 @@ def list_likely_starts(context: SearchContext) -> list[FitStart]:
     them explains the runs with the coefficient itself.
 
     Returns:
-        Starts with one effect each, in ascending order of their costs.
+        Costs and starts with one effect each, in ascending order of the cost.
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
@@ -71,20 +72,20 @@ def list_likely_starts(context: SearchContext) -> list[FitStart]:
     ]
     costs = select_lowest_of_each(context, proposed)
     if not _has_noise_like_cost(context, costs):
-        costs = _scan(context, costs, SCANNED_FACTORS)
+        costs = _try_scaled(context, costs, SCANNED_FACTORS)
     limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
-    return [start for cost, start in costs if cost < limit]
+    return [(cost, start) for cost, start in costs if cost < limit]
 
 
-def _has_noise_like_cost(context: SearchContext, costs: Sequence[tuple[float, FitStart]]) -> bool:
+def _has_noise_like_cost(context: SearchContext, costs: Sequence[RatedStart]) -> bool:
     """Return whether the first cost, of a model without a fit, is nearly that of noise."""
     sample_count = int(context.filters.base.runs.recorded.sum())
     return bool(costs) and costs[0][0] < MAX_SCANNED_COST * sample_count
 
 
-def _scan(
-    context: SearchContext, costs: Sequence[tuple[float, FitStart]], factors: Sequence[float]
-) -> list[tuple[float, FitStart]]:
+def _try_scaled(
+    context: SearchContext, costs: Sequence[RatedStart], factors: Sequence[float]
+) -> list[RatedStart]:
     """Simulate starts with one coefficient also at factors of it, and keep the best of each effect.
 
     Args:
@@ -124,21 +125,25 @@ def scale_effect(context: SearchContext, start: FitStart, name: str, factor: flo
     return replace(start, theta=theta)
 
 
-def fit_likely_effects(context: SearchContext) -> FittedModel:
+def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStart]) -> FittedModel:
     """Fit the effects that alone remove most of the residual.
 
     A coefficient far from the linear range is first improved by simulations alone, because the
     cost has local minima.
 
+    Args:
+        context: search, filters and regressions of the recording.
+        likely_starts: result of `list_likely_starts`.
+
     Returns:
         The best model, which may be the base model.
     """
     best = context.search.base_model
-    for likely_start in list_likely_starts(context)[:MAX_SCANNED_FITS]:
-        costs = select_lowest_of_each(context, [likely_start])
+    for likely_start in likely_starts[:MAX_SCANNED_FITS]:
+        costs = [likely_start]
         for factors in CLOSER_FACTORS:
             if not _has_noise_like_cost(context, costs):
-                costs = _scan(context, costs, factors)
+                costs = _try_scaled(context, costs, factors)
         fitted = fit_by_simulation(context, costs[0][1])
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
             fitted = fit_nearby(context, fitted, fitted.effects[0])

@@ -24,7 +24,7 @@ from bench.diagnosis.pipeline.contact_conditions import (
         ((), False, 3, 2.0, False),
     ],
 )
-def test_a_linear_model_is_wrong_where_contacts_need_a_large_force(
+def test_contacts_that_need_a_large_force_need_a_nonlinear_filter(
     contacts, is_on_ground, joints, force_share, expected
 ):
     robot = SimpleNamespace(contacts=contacts, is_on_ground=is_on_ground)
@@ -32,4 +32,4 @@ def test_a_linear_model_is_wrong_where_contacts_need_a_large_force(
     force[-1] = force_share
     filtered_runs = SimpleNamespace(force=force, typical=np.ones(joints))
     conditions = ContactConditions(SimpleNamespace(has_model=True, robot=robot))
-    assert conditions.is_linear_model_wrong(filtered_runs) == expected
+    assert conditions.needs_nonlinear_filter(filtered_runs) == expected

@@ -94,6 +94,7 @@ def test_friction_that_nearly_explains_is_compared_with_its_soft_form_before_oth
     friction = SimpleNamespace(effects=effects)
     replaced = {
         "fit_dry_friction": lambda *_: friction,
+        "list_likely_starts": lambda *_: [],
         "fit_likely_effects": lambda *_: friction,
         "is_explained": lambda *_: False,
         "is_nearly_explained": lambda *_: is_nearly_explained,
