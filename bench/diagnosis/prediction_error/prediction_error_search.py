@@ -427,6 +427,20 @@ class PredictionErrorSearch(EffectSearch):
         rng = self.make_rng("library", model.effects)
         return score_by_regression(regression, set(self._list_addable_effects(model)), rng)
 
+    @property
+    def base_scores(self) -> CandidateScores | None:
+        """Scores of all effects about the base model; None if no regression was made.
+
+        If the search did not need the scores, those of the regression that selected effects are
+        returned.
+        """
+        scores, regression = super().base_scores, self._search_context.columns.known_base_regression
+        if scores is not None or regression is None:
+            return scores
+        return score_by_regression(
+            regression, set(self.evaluator.library), self.make_rng("library", ())
+        )
+
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on.
 

@@ -87,6 +87,11 @@ class LibraryColumns:
         return self._base_regression[1]
 
     @property
+    def known_base_regression(self) -> Regression | None:
+        """The last regression of the innovations of the base model; None if there was none."""
+        return self._base_regression[1] if self._base_regression else None
+
+    @property
     def hats(self) -> Columns:
         """Forces of any shape as candidates, by the labels of their families."""
         if self._hats is None:
