@@ -39,7 +39,11 @@ from bench.diagnosis.kalman.filter_and_smoother import (
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
-from sims.robot.dynamics.contact_states import settle_contacts
+from sims.robot.dynamics.contact_states import (
+    ContactModel,
+    KnownJacobians,
+    settle_contacts,
+)
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_about_recording import (
@@ -851,7 +855,13 @@ class FollowedRuns:
         result: Array = np.where(np.isfinite(squares), squares, np.inf)
         return result
 
-    def settle(self, theta: Array, states: Array, is_other_geometry: bool = False) -> Array:
+    def settle(
+        self,
+        theta: Array,
+        states: Array,
+        is_other_geometry: bool = False,
+        known_jacobians: Sequence[KnownJacobians] | None = None,
+    ) -> Array:
         """Return first states (R, 2 D) near given ones at which the contacts are in equilibrium.
 
         Otherwise a simulated robot would jump at the first step, because noise of its pose makes
@@ -862,6 +872,7 @@ class FollowedRuns:
             states: (R, 2 D) positions and velocities of D coordinates in R runs.
             is_other_geometry: whether the states may be those of another geometry, so that contacts
                 farther away may be closed.
+            known_jacobians: derivatives of contacts for each run, see `settle_contacts`.
         """
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
@@ -870,14 +881,13 @@ class FollowedRuns:
         factor = MEASURED_PRIOR if is_other_geometry else 1.0
         noise = _get_noise_of_states(self.evaluator, self.noise)
         deviations = factor * noise[0], factor * noise[1]
-        settled = []
-        for run_data, state, weights in zip(
-            self.evaluator.prepared_runs, states, self.first_state_factors.r, strict=True
-        ):
+        model, settled = ContactModel(simulator, theta), []
+        for run, state in enumerate(states):
+            scenario = self.evaluator.prepared_runs[run].scenario
             x, v = np.split(state, 2)
-            start = settle_contacts(
-                simulator, theta, run_data.scenario, (x, v), deviations, weights
-            )
+            weights = self.first_state_factors.r[run]
+            known = known_jacobians[run] if known_jacobians is not None else None
+            start = settle_contacts(model, scenario, (x, v), deviations, weights, known)
             settled.append(np.concatenate(start))
         return np.array(settled)
 
@@ -1053,7 +1063,8 @@ def _linearise_run(
             start[0][joint], start[1][joint] = states[0, :2]
         measured = None
         deviations = _get_noise_of_states(evaluator, noise)
-        start = settle_contacts(robot, theta, scenario, start, deviations, weights)
+        model = ContactModel(robot, theta)
+        start = settle_contacts(model, scenario, start, deviations, weights)
     return MeasuredLinear(
         *(robot, theta, scenario, start, trajectory, measured, neighbour),
         *(reuses_jacobians and not is_simulated, reuses_loads),

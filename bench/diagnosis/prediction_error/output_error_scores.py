@@ -121,7 +121,7 @@ class OutputErrorScores:
         projected = self.simulations.project(
             np.concatenate([followed.scale_by_noise(responses), target[..., None]], axis=3)
         )
-        products = np.einsum("rnk,rnl->rkl", projected, projected)
+        products = projected.transpose(0, 2, 1) @ projected
         contains = {
             name: effect.contains for name, effect in context.evaluator.available_effects.items()
         }

@@ -10,6 +10,7 @@ doi:10.1088/0266-5611/19/2/201), with Q of `FirstStateFactors`:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
+from sims.robot.dynamics.contact_states import KnownJacobians
 
 DIFFERENCE_SHARE = 0.02
 """Finite change of a coefficient, as a share of its plausible range."""
@@ -37,6 +39,14 @@ class SettledSimulations:
 
     followed: FollowedRuns
     states: Array
+
+    @cached_property
+    def _known_jacobians(self) -> list[KnownJacobians]:
+        """Derivatives of the contacts at the first states, for each piece.
+
+        A small change of the model leaves them nearly as they are.
+        """
+        return [{} for _ in self.states]
 
     def refine(self, start: FitStart) -> FitStart:
         """Return a start with coefficients that minimise the projected residual (1).
@@ -104,7 +114,7 @@ class SettledSimulations:
 
     def _settle(self, theta: Array) -> Array:
         """Return the first states (R, 2 D), settled for a model that may have another geometry."""
-        return self.followed.settle(theta, self.states, is_other_geometry=True)
+        return self.followed.settle(theta, self.states, True, self._known_jacobians)
 
     def project(self, values: Array) -> Array:
         """Return P v of (1), (R, n, K), for values v (R, T, C, K) in units of the noise."""

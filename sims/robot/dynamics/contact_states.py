@@ -23,7 +23,7 @@ al., Robotics: Science and Systems VIII, 2012, doi:10.15607/RSS.2012.VIII.003).
 from __future__ import annotations
 
 from copy import copy
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -80,46 +80,54 @@ class _Contact(NamedTuple):
     normal: Array
 
 
-class _ContactModel:
-    """A robot at the first instant of a run, whose contacts are evaluated at given states."""
+class ContactModel:
+    """A robot at the first instant of a run, whose contacts are evaluated at given states.
 
-    def __init__(
-        self, simulator: RobotSimulator, theta: Array, scenario: Scenario, x: Array, v: Array
-    ) -> None:
-        """Prepare MuJoCo's model and data with the effects and the inputs of the run's beginning.
+    Args:
+        simulator: simulator of the robot.
+        theta: (P,) parameters, of which effects have their coefficients.
+    """
+
+    def __init__(self, simulator: RobotSimulator, theta: Array) -> None:
+        import mujoco
+
+        self._simulator = simulator
+        self._acting = simulator.get_active_effects(theta[None])
+        mujoco_batch = simulator.make_linearisation_batch(self._acting)
+        mujoco_batch.write_effects(
+            tuple(
+                (effect, np.repeat(c, mujoco_batch.count, axis=1))
+                for effect, c in select_model_field_effects(self._acting)
+            )
+        )
+        self._model = copy(mujoco_batch.batch.get_model(0))
+        self._model.geom_gap[:] = SEARCH_GAP
+        self._data = mujoco.MjData(self._model)
+        self._map_forces = mujoco_batch.map_forces
+        self._joints = mujoco_batch.file_joints
+        self._bodies: list[int] = self._model.geom_bodyid.tolist()
+
+    def begin_run(self, scenario: Scenario, x: Array, v: Array) -> None:
+        """Set the inputs of the beginning of a run.
 
         The contacts that MuJoCo then finds in the initial pose are those of the run. A large gap
         (`SEARCH_GAP`) makes it report geoms that only nearly touch, too.
 
         Args:
-            simulator: simulator of the robot.
-            theta: (P,) parameters, of which effects have their coefficients.
             scenario: scenario of the run, whose first commands act.
             x: (D,) initial positions of the joints.
             v: (D,) initial velocities.
         """
         import mujoco
 
-        acting = simulator.get_active_effects(theta[None])
-        commands = simulator.run_inputs(scenario)
-        inputs = simulator.compute_controls(
-            RobotRunBatch(scenario, commands, acting, x[None], v[None]), 1
+        commands = self._simulator.run_inputs(scenario)
+        inputs = self._simulator.compute_controls(
+            RobotRunBatch(scenario, commands, self._acting, x[None], v[None]), 1
         )
-        mujoco_batch = simulator.make_linearisation_batch(acting)
-        mujoco_batch.write_effects(
-            tuple(
-                (effect, np.repeat(c, mujoco_batch.count, axis=1))
-                for effect, c in select_model_field_effects(acting)
-            )
-        )
-        self._model = copy(mujoco_batch.batch.get_model(0))
-        self._model.geom_gap[:] = SEARCH_GAP
-        self._data = mujoco.MjData(self._model)
+        mujoco.mj_resetData(self._model, self._data)
         self._data.ctrl[:] = inputs.controls[0, 0]
-        self._data.qfrc_applied[:] = mujoco_batch.map_forces(inputs.forces[0, 0])
+        self._data.qfrc_applied[:] = self._map_forces(inputs.forces[0, 0])
         self._data.act[:] = inputs.activations[0]
-        self._joints = mujoco_batch.file_joints
-        self._bodies: list[int] = self._model.geom_bodyid.tolist()
 
     def evaluate(self, state: Array) -> dict[_Key, _Contact]:
         """Return all contacts at a state (2 D,): positions, then velocities of the D joints.
@@ -177,13 +185,20 @@ class _ContactModel:
         return contacts
 
 
+KnownJacobians: TypeAlias = dict[tuple[tuple[_Key, bool], ...], Array]
+"""Derivatives (m, 2 D) of the residual of contact equilibrium by the state.
+
+The key is the contacts that count, and whether each one is closed: they determine the rows.
+"""
+
+
 def settle_contacts(
-    simulator: RobotSimulator,
-    theta: Array,
+    model: ContactModel,
     scenario: Scenario,
     start: tuple[Array, Array],
     sigma: tuple[Array, Array],
     weights: Array | None = None,
+    known_jacobians: KnownJacobians | None = None,
 ) -> tuple[Array, Array]:
     """Return the likeliest first state of a run at which the contacts are in equilibrium.
 
@@ -194,14 +209,16 @@ def settle_contacts(
     halves it until the sum decreases.
 
     Args:
-        simulator: simulator of the robot.
-        theta: (P,) parameters.
+        model: the robot.
         scenario: scenario of the run, whose first commands act.
         start: (D,) measured or smoothed positions and velocities.
         sigma: (D,) standard deviations of a measurement of them.
         weights: (2 D, 2 D) W of (2), invertible; None if the errors of the start are independent
             with the standard deviations `sigma`. The readings of a whole run determine a velocity
             better than two of them do.
+        known_jacobians: derivatives of nearly the same contacts, by their layout. They are used in
+            place of finite differences while the steps decrease the sum (chord method), and new
+            ones are added. By default, each iteration makes its own.
 
     Returns:
         (D,) positions and velocities; the measured ones if no contact may be closed.
@@ -209,9 +226,9 @@ def settle_contacts(
     measured = np.concatenate(start)
     if weights is None:
         weights = np.diag(1.0 / np.concatenate(sigma))
-    differences = np.repeat(DIFFERENCES, start[0].size)
+    known = {} if known_jacobians is None else known_jacobians
     with capture_mujoco_warnings():
-        model = _ContactModel(simulator, theta, scenario, *start)
+        model.begin_run(scenario, *start)
         state, present = measured, model.evaluate(measured)
         keys = [
             key
@@ -226,13 +243,12 @@ def settle_contacts(
             # The contacts are already in equilibrium.
             if cost <= SETTLED_COST * len(keys):
                 break
+            layout = tuple((key, present[key].is_closed) for key in keys)
+            is_known = layout in known
+            jacobian = known[layout] if is_known else _differentiate(model, state, present, keys)
+            if known_jacobians is not None:
+                known[layout] = jacobian
             residual = _compute_residual(present, present, keys)
-            jacobian = np.empty((residual.size, state.size))
-            for i, difference in enumerate(differences):
-                moved = state.copy()
-                moved[i] += difference
-                changed = _compute_residual(model.evaluate(moved), present, keys)
-                jacobian[:, i] = (changed - residual) / difference
             step = _solve(jacobian, residual, weights @ (state - measured), weights)
             for _ in range(MAX_HALVINGS):
                 contacts = model.evaluate(state + step)
@@ -242,13 +258,37 @@ def settle_contacts(
                     break
                 step = step / 2.0
             else:  # No step decreases the cost.
-                break
+                if not is_known:
+                    break
+                del known[layout]
+                continue
             has_converged = cost - new_cost < MIN_DECREASE * cost
             state, present, cost = state + step, contacts, new_cost
             if has_converged:
                 break
     positions, velocities = np.split(state, 2)
     return positions, velocities
+
+
+def _differentiate(
+    model: ContactModel, state: Array, present: dict[_Key, _Contact], keys: list[_Key]
+) -> Array:
+    """Return finite differences (m, 2 D) of the residual of contact equilibrium by the state.
+
+    Args:
+        model: the robot.
+        state: (2 D,) positions and velocities.
+        present: contacts at this state.
+        keys: contacts that count.
+    """
+    residual = _compute_residual(present, present, keys)
+    jacobian = np.empty((residual.size, state.size))
+    for i, difference in enumerate(np.repeat(DIFFERENCES, state.size // 2).tolist()):
+        moved = state.copy()
+        moved[i] += difference
+        changed = _compute_residual(model.evaluate(moved), present, keys)
+        jacobian[:, i] = (changed - residual) / difference
+    return jacobian
 
 
 def _solve(jacobian: Array, residual: Array, offset: Array, weights: Array) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.contact_states import settle_contacts
+from sims.robot.dynamics.contact_states import ContactModel, settle_contacts
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
@@ -46,6 +46,11 @@ def simulator(tmp_path: Path):
     return kind(observe=["q.x", "q.z", "q.spin"])
 
 
+def settle(simulator, scenario, measured, **options):
+    model = ContactModel(simulator, np.zeros(0))
+    return settle_contacts(model, scenario, measured, SIGMA, **options)
+
+
 def make_scenario(torque: float = 0.0):
     times = np.arange(21) / 100.0
     return Scenario(times, {}, {"u.drive": np.full(times.size, torque)})
@@ -54,7 +59,7 @@ def make_scenario(torque: float = 0.0):
 @pytest.mark.parametrize("height", [2e-3, 1e-6, -2e-3])
 def test_a_wheel_at_rest_gets_the_depth_of_its_weight(simulator, height):
     measured = np.array([0.3, height, 0.5]), np.array([0.0, 0.02, 0.0])
-    x, v = settle_contacts(simulator, np.zeros(0), make_scenario(), measured, SIGMA)
+    x, v = settle(simulator, make_scenario(), measured)
     assert x[1] == pytest.approx(-DEPTH, rel=0.03)
     np.testing.assert_allclose(x[[0, 2]], measured[0][[0, 2]], atol=1e-6)
     np.testing.assert_allclose(v, 0.0, atol=1e-4)
@@ -62,7 +67,7 @@ def test_a_wheel_at_rest_gets_the_depth_of_its_weight(simulator, height):
 
 def test_a_settled_wheel_does_not_jump(simulator):
     scenario, measured = make_scenario(), (np.array([0.0, 1e-3, 0.0]), np.zeros(3))
-    starts = [measured, settle_contacts(simulator, np.zeros(0), scenario, measured, SIGMA)]
+    starts = [measured, settle(simulator, scenario, measured)]
     raw, settled = (
         simulator.simulate(np.zeros((1, 0)), Scenario(scenario.times, {
             **dict(zip(("q.x", "q.z", "q.spin"), x, strict=True)),
@@ -78,7 +83,7 @@ def test_a_driven_wheel_creeps_as_its_friction_needs(simulator):
     """A torque T needs the force F = T R m / (I + m R^2) at the floor, and so the creep F / b."""
     torque, speed = 0.8, 1.0
     measured = np.array([0.0, 0.0, 0.0]), np.array([speed, 0.0, speed / RADIUS])
-    x, v = settle_contacts(simulator, np.zeros(0), make_scenario(torque), measured, SIGMA)
+    x, v = settle(simulator, make_scenario(torque), measured)
     force = torque * RADIUS * MASS / (INERTIA + MASS * RADIUS**2)
     # The contact point is in the middle of the overlap.
     slip = (RADIUS - DEPTH / 2) * v[2] - v[0]
@@ -89,8 +94,42 @@ def test_a_driven_wheel_creeps_as_its_friction_needs(simulator):
 
 def test_a_wheel_in_the_air_stays_where_it_was_measured(simulator):
     measured = np.array([0.0, 0.01, 0.2]), np.array([0.1, -0.5, 3.0])
-    settled = settle_contacts(simulator, np.zeros(0), make_scenario(), measured, SIGMA)
+    settled = settle(simulator, make_scenario(), measured)
     np.testing.assert_array_equal(np.concatenate(settled), np.concatenate(measured))
+
+
+def test_known_jacobians_of_contacts_save_evaluations(simulator, monkeypatch):
+    """Derivatives of one first state serve for another one, and the results hardly differ."""
+    evaluate, calls = ContactModel.evaluate, list[int]()
+
+    def count(self, state):
+        calls.append(1)
+        return evaluate(self, state)
+
+    monkeypatch.setattr(ContactModel, "evaluate", count)
+    scenario, known = make_scenario(0.8), {}
+    speed = np.array([1.0, 0.0, 1.0 / RADIUS])
+    settle(simulator, scenario, (np.array([0.0, -1e-5, 0.0]), speed), known_jacobians=known)
+    assert known
+    measured = np.array([0.0, -2e-5, 0.0]), 1.01 * speed
+    calls.clear()
+    with_known = settle(simulator, scenario, measured, known_jacobians=known)
+    few = len(calls)
+    calls.clear()
+    own = settle(simulator, scenario, measured)
+    assert 2 * few < len(calls)
+    # The depth is 1e-4 m, and the speeds are 1 m/s and 10 rad/s.
+    np.testing.assert_allclose(with_known[0], own[0], atol=2e-6)
+    np.testing.assert_allclose(with_known[1], own[1], atol=2e-3)
+
+
+def test_wrong_known_jacobians_are_replaced(simulator):
+    scenario, measured = make_scenario(), (np.array([0.3, -1e-6, 0.5]), np.array([0.0, 0.02, 0.0]))
+    known = {}
+    settle(simulator, scenario, measured, known_jacobians=known)
+    wrong = {layout: -jacobian for layout, jacobian in known.items()}
+    x, _ = settle(simulator, scenario, measured, known_jacobians=wrong)
+    assert x[1] == pytest.approx(-DEPTH, rel=0.03)
 
 
 def test_the_response_to_a_first_state_is_right_where_a_contact_begins(simulator):
