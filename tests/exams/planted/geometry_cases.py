@@ -27,6 +27,8 @@ SYSTEMS_BY_NUMBER = {
 }
 """Models in which each kind of number is wrong in turn."""
 DRAWS = 20  # Recordings of each kind of number.
+# A stiff servo hides a wrong length, axis or zero in the position; the torque shows it.
+TORQUE_NUMBERS = ("length", "axis", "zero")
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,11 @@ class GeometryQuestion(Question):
     def effect(self):
         return EFFECTS[self.number]
 
+    @property
+    def with_torques(self):
+        """True if the torques of driven joints are recorded."""
+        return self.number in TORQUE_NUMBERS
+
     def draw(self, seed=0):
         """Draw the case; another seed gives another exam."""
         try:
@@ -66,6 +73,10 @@ class GeometryQuestion(Question):
 @dataclass(frozen=True)
 class GeometryCase(ModelCase):
     """One recording with a wrong number of the geometry."""
+
+    @property
+    def with_torques(self):
+        return self.kind in TORQUE_NUMBERS
 
     def mark(self, outcome):
         # The coefficients of a tilt are those components that the motion shows, not its angle.

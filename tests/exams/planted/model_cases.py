@@ -45,6 +45,7 @@ from tests.exams.robot_files import signal_unit, write_robot_recording
 
 QUATERNION_NOISE = 5e-4  # Standard deviation of each entry of a recorded quaternion.
 MIN_GAP = 5.0  # Smallest discrepancy, in multiples of the noise.
+MIN_GAP_WITH_TORQUES = 3.0  # The same over twice as many channels.
 SWINGS = (1.0, 0.6, 0.35)  # Factors of the amplitude; the first one whose motion is free is used.
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 # A flight without its controller is unstable, so the discrepancy does not determine the size.
@@ -52,6 +53,8 @@ FLIGHT_SHARES = 0.1, 0.3  # Sizes at a drone, as shares of the largest one.
 TRIALS = 5  # Places at which a kind of number is tried.
 PLACES = 3  # Wrong numbers of each model.
 WHEELS = ("left_tyre", "right_tyre")
+TORQUE_NOISE = 0.005  # Standard deviation of a recorded torque as a share of its RMS.
+MIN_TORQUE_NOISE = 1e-3  # N m or N.
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class ModelQuestion(Question):
         return f"{self.system}/{'clean' if self.index < 0 else self.index}"
 
     effect = ""
+    with_torques = False
 
     @property
     def numbers(self):
@@ -108,9 +112,11 @@ def questions(seed=0):
 class ModelCase(PlantedCase):
     """One recording of a model file of `MODELS`; `place` is empty if nothing is wrong."""
 
+    with_torques = False  # Whether the torques of driven joints are channels.
+
     @cached_property
     def experiment(self):
-        return ModelExperiment(self.robot, self.seed, self.swing)
+        return ModelExperiment(self.robot, self.seed, self.swing, self.with_torques)
 
     def write(self, folder):
         experiment, file = self.experiment, MODELS[self.robot]
@@ -127,6 +133,7 @@ class ModelCase(PlantedCase):
                 unit = "m"
             else:
                 unit = position_unit(model.joint(name.partition(".")[2]))
+                unit = signal_unit(name, unit)
             channels[name] = unit, sigma
         times, (runs, _) = np.arange(SAMPLES) / RATE, self.performance
         tables = {
@@ -167,10 +174,12 @@ class ModelExperiment(Experiment):
         name: name of the model.
         seed: seed of the motion.
         swing: factor of the amplitude.
+        with_torques: whether the torques of driven joints are channels.
     """
 
-    def __init__(self, name, seed, swing=1.0):
+    def __init__(self, name, seed, swing=1.0, with_torques=False):
         self.robot, self.force_limits, self.with_velocities = MODELS[name], {}, False
+        self.with_torques = with_torques
         model = self.model = self.robot.compile()
         self.pose = self.robot.about(model)
         self.is_flight = self.robot.drive == "rotors"
@@ -196,12 +205,29 @@ class ModelExperiment(Experiment):
             self.columns = [*range(7), *self.columns]
             pose = np.repeat([self.robot.noise, QUATERNION_NOISE], [3, 4])
             self.sigma = np.concatenate([pose, self.sigma])
+        if with_torques:
+            self._add_torques()
+
+    def _add_torques(self):
+        """Add the torques of the joints with a drive to the channels."""
+        model = self.model
+        joints = [model.joint(j) for j in np.unique(model.actuator_trnid[:, 0])]
+        columns = [model.nq + model.nv + int(joint.dofadr[0]) for joint in joints]
+        self.channel_names += [f"tau.{joint.name}" for joint in joints]
+        self.columns += columns
+        _, states = self.performed(None)
+        torques = np.concatenate([states[run][:, columns] for run in RUNS])
+        noise = np.maximum(TORQUE_NOISE * np.sqrt(np.mean(torques**2, axis=0)), MIN_TORQUE_NOISE)
+        rounded = [float(f"{sigma:.3g}") for sigma in noise]
+        self.sigma = np.concatenate([self.sigma, rounded])
 
     def simulator(self, change=None):
         model = self.robot.compile()
         if change is not None:
             change.apply(model)
-        return Simulator(model, [] if self.robot.is_touching else self.bodies)
+        simulator = Simulator(model, [] if self.robot.is_touching else self.bodies)
+        simulator.records_torques = self.with_torques
+        return simulator
 
 
 class _Drives(Operator):
@@ -275,7 +301,8 @@ def draw_model_case(question, seed):
     name = f"models/{question.name}/{seed}"
     rng = _make_generator(name)
     motion = int(rng.integers(2**31))
-    wanted = float(np.exp(rng.uniform(*np.log([1.2 * MIN_GAP, GAP[1]]))))
+    min_gap = MIN_GAP_WITH_TORQUES if question.with_torques else MIN_GAP
+    wanted = float(np.exp(rng.uniform(*np.log([1.2 * min_gap, GAP[1]]))))
     noise = MODELS[question.system].noise
 
     def make(swing, number, place, size, gap, plain):
@@ -285,8 +312,8 @@ def draw_model_case(question, seed):
         )  # fmt: skip
 
     for swing in SWINGS:
-        experiment = ModelExperiment(question.system, motion, swing)
         try:
+            experiment = ModelExperiment(question.system, motion, swing, question.with_torques)
             experiment.performed(None)
         except ObstructedMotionError:
             continue
@@ -301,14 +328,14 @@ def draw_model_case(question, seed):
                         share = rng.uniform(*FLIGHT_SHARES)
                         size = float(f"{sign * largest * share:.3g}")
                         sized = (size, *experiment.gaps(Change(number, str(place), size)))
-                        sized = sized if size and sized[1] > MIN_GAP else None
+                        sized = sized if size and sized[1] > min_gap else None
                     else:
                         sized = find_size(
-                            experiment, number, str(place), sign * largest, wanted, MIN_GAP
+                            experiment, number, str(place), sign * largest, wanted, min_gap
                         )
                     if sized is not None:
                         return make(swing, number, str(place), *sized)
-    raise UndrawableError(f"{question.name}: no place shows a gap of {MIN_GAP:g} noises")
+    raise UndrawableError(f"{question.name}: no place shows a gap of {min_gap:g} noises")
 
 
 def list_places(experiment, number):

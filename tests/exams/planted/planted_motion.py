@@ -197,6 +197,7 @@ class Simulator:
         self.joints = np.isin(model.jnt_bodyid, watched)
         self.steps = round(1 / RATE / model.opt.timestep)
         self.touches = False  # Whether a contact or a joint limit was active since `start`.
+        self.records_torques = False  # Whether `simulate` appends the drives' torques to states.
         self.before_step = None  # Function that is called before each step, or None.
         if not np.isclose(self.steps * model.opt.timestep, 1 / RATE):
             raise ValueError(f"timestep {model.opt.timestep} s does not divide 1/{RATE} s")
@@ -226,12 +227,20 @@ class Simulator:
         self.touches |= bool(self.joints[self.data.efc_id[limited]].any())
 
     def simulate(self, run):
-        """Return positions and velocities (SAMPLES, nq + nv) of a run."""
+        """Return positions and velocities (SAMPLES, nq + nv) of a run, and the torques if recorded.
+
+        The torques (SAMPLES, nv) are those of the drives at each joint, at the time of the sample
+        and with its command.
+        """
         self.start(run.positions, run.velocities)
         self.settle_filters(run.commands[0])
         states = []
         for command in run.commands:
             states.append(np.concatenate([self.data.qpos, self.data.qvel]))
+            if self.records_torques:
+                self.data.ctrl[:] = command
+                mujoco.mj_forward(self.model, self.data)
+                states[-1] = np.concatenate([states[-1], self.data.qfrc_actuator])
             if len(states) < len(run.commands):
                 self.advance(command)
         return np.array(states)

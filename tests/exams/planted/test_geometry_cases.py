@@ -48,6 +48,23 @@ def test_a_carried_weight_makes_no_torque():
     assert torques[1] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_recorded_torques_are_those_of_the_servos_at_the_samples():
+    """A servo's torque is kp (u - q) - kv dq/dt with the command of the same row."""
+    experiment = ModelExperiment("arm-inheritrange", 0, 1.0, with_torques=True)
+    model = experiment.model
+    runs, states = experiment.performed(None)
+    count = len(experiment.joints)
+    assert experiment.channel_names[count:] == [f"tau.{joint}" for joint in experiment.joints]
+    for name, run in runs.items():
+        torques = experiment.channels(states[name])[:, count:]
+        positions, velocities, _ = np.split(states[name], [model.nq, model.nq + model.nv], axis=1)
+        kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+        expected = kp * (run.commands - positions) - kv * velocities
+        limits = model.actuator_forcerange.T if model.actuator_forcelimited.all() else (None, None)
+        np.testing.assert_allclose(torques, np.clip(expected, *limits), atol=1e-9)
+    assert (experiment.sigma[count:] >= 1e-3).all()
+
+
 @pytest.mark.parametrize(
     ("number", "index"),
     [
