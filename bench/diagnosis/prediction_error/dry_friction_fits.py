@@ -22,6 +22,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     drop_surplus_effects,
     fit_by_simulation,
     is_explained,
+    is_nearly_explained,
     remove_idle_effects,
 )
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
@@ -32,7 +33,7 @@ FIRST_ITERATIONS = 5
 
 
 MIN_LEAD_SHARE = 0.1
-"""Minimum lead in log-likelihood of soft dry friction over a selection that is far less likely.
+"""Minimum lead in log-likelihood of soft dry friction over a model that does not explain the runs.
 
 It is a share of the gain over the base model.
 """
@@ -189,7 +190,9 @@ def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
 def check_fit(context: SearchContext, model: FittedModel) -> None:
     """Raise `SoftFrictionError` if a fitted model is likelier with soft dry friction.
 
-    It is refitted with the same effects in the soft form.
+    It is refitted with the same effects in the soft form. A model that leaves more than noise
+    changes its likelihood a lot with any law, so the soft form must also gain a share of what the
+    model gains over the base model.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -198,7 +201,11 @@ def check_fit(context: SearchContext, model: FittedModel) -> None:
     Raises:
         SoftFrictionError: the soft form is likelier.
     """
-    if is_likelier_soft(context.search, model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO):
+    margin = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    if not is_nearly_explained(context, model):
+        gain = model.likelihood.value - context.search.base_model.likelihood.value
+        margin = max(margin, MIN_LEAD_SHARE * gain)
+    if is_likelier_soft(context.search, model, margin):
         raise SoftFrictionError
 
 
