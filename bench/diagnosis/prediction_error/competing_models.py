@@ -39,9 +39,11 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
     list_at_coupled_joints,
     list_joint_model_effects,
 )
+from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     MIN_FURTHER_GAIN_SHARE,
+    fit_by_simulation,
     fit_filtered,
     is_explained,
     is_nearly_explained,
@@ -368,7 +370,8 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
 
     Each effect of the best model is replaced in turn by the effects that a regression, and a filter
     if the regression is not certain, finds nearly as good. The effects are also moved to other
-    joints of their kinematic loop. Models that remain close to the best are fitted to convergence.
+    joints of their kinematic loop, and payloads to neighbouring bodies. Models that remain close to
+    the best are fitted to convergence.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -393,13 +396,17 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
                 continue
             confirmed = _confirm(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
-    if starts:
+    if starts and context.filters.base.is_on_ground:
+        # First states with settled contacts depend on the effects.
+        for start in starts:
+            fit_by_simulation(context, start)
+    elif starts:
         search.refit_models(starts, is_racing=False)
     size = len(best.effects)
     # Jumps of the state in the linear model come from drives at their force limits.
     if size == 1 and context.filters.base.runs.jumps.any():
         _refine_at_force_limits(context, best, competing_effects)
-    _fit_at_coupled_joints(context, size)
+    _fit_at_related_places(context, size)
     _refine_near(context, size)
     preferred = search.get_best(size) or best
     if preferred is best:
@@ -482,7 +489,8 @@ def _confirm(
     """Return a start with a competing model that may be as good as the best one, else None.
 
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
-    best one, the start is returned at once. If not, simulations or a filter decide. Simulations of
+    best one, the start is returned at once. So is a payload, whose response is far from linear in
+    its place. If not, simulations or a filter decide. Simulations of
     an effect with one coefficient are faster, and show more if the best model explains the runs.
 
     Args:
@@ -495,7 +503,8 @@ def _confirm(
     Returns:
         The start, with improved coefficients; None if the competing model is far worse.
     """
-    if competing_effect.loss <= COMPETING_MODEL_MARGIN:
+    is_payload = competing_effect.effect.startswith("payload@")
+    if competing_effect.loss <= COMPETING_MODEL_MARGIN or is_payload:
         return start
     if competing_effect.c.size == 1 and is_explained(context, best):
         return _confirm_by_simulation(context, best, competing_effect, start)
@@ -549,11 +558,12 @@ def _confirm_by_filter(
     )
 
 
-def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
-    """Fit the best models of a size with effects moved to the other joints of their kinematic loop.
+def _fit_at_related_places(context: SearchContext, size: int) -> None:
+    """Fit the best models of a size with effects moved to places where they may act alike.
 
     Joints of a closed loop move together, so the data may not show at which of them an effect acts.
-    The fitted models are added to `search.models`.
+    The same holds for a payload and the bodies of a joint. The fitted models are added to
+    `search.models`.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -564,8 +574,9 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
     for model in _list_models_near_the_best(context, size):
         for name in model.effects:
             c = model.fit.theta[evaluator.coefficient_slices[name]]
-            for other in list_at_coupled_joints(evaluator, name):
-                start = make_replacing_start(evaluator, model, [name], other, c)
+            moved = [(other, c) for other in list_at_coupled_joints(evaluator, name)]
+            for other, coefficients in moved + list_moved_payloads(evaluator, name, c):
+                start = make_replacing_start(evaluator, model, [name], other, coefficients)
                 key = frozenset(start.effects)
                 if other not in model.effects and key not in search.models:
                     starts[key] = start

@@ -1,0 +1,46 @@
+"""Tests of payloads that are moved to the bodies at the joints of their body."""
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
+from bench.logs.recording_loading import load_recording
+from tests.bench.diagnosis.arm_model import ARM
+
+ELBOW = 0.7
+"""Angle of the elbow at the beginning of each run in rad."""
+
+
+@pytest.fixture
+def evaluator(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(ARM)
+    rows = [f"{run},{0.01 * k:.2f},0.2,{ELBOW},0.2,{ELBOW}" for run in (1, 2) for k in range(50)]
+    header = "run,t,q.shoulder,q.elbow,u.m_shoulder,u.m_elbow"
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows]) + "\n")
+    names = '[channels."q.shoulder"]', '[channels."q.elbow"]', '[inputs."u.m_shoulder"]'
+    tables = [f'{name}\nunit = "rad"\n' for name in (*names, '[inputs."u.m_elbow"]')]
+    (tmp_path / "log.toml").write_text('model = "arm.xml"\n' + "".join(tables))
+    recording, kind = load_recording(tmp_path / "log.csv")
+    return RunEvaluator(kind, recording, recording.runs, None)
+
+
+def test_a_moved_payload_stays_where_it_is_in_space(evaluator):
+    """The elbow is 0.4 m below the shoulder and turns about y; centres of mass are on z."""
+    place = np.array([0.05, 0.0, -0.1])
+    ((name, c),) = list_moved_payloads(evaluator, "payload@upper", np.array([0.3, *place]))
+    assert name == "payload@fore"
+    x, z = place[0], place[2] - 0.2 + 0.4
+    turned = [
+        np.cos(ELBOW) * x - np.sin(ELBOW) * z,
+        np.cos(ELBOW) * z + np.sin(ELBOW) * x,
+    ]
+    np.testing.assert_allclose(c, [0.3, turned[0], 0.0, turned[1] + 0.1], atol=1e-9)
+    ((back, same),) = list_moved_payloads(evaluator, "payload@fore", c)
+    assert back == "payload@upper"
+    np.testing.assert_allclose(same, [0.3, *place], atol=1e-9)
+
+
+def test_other_effects_are_not_moved(evaluator):
+    assert list_moved_payloads(evaluator, "mass.scale@upper", np.array([0.3])) == []
