@@ -46,18 +46,18 @@ MAX_FITTED = 3
 """Maximum number of effects that are fitted by simulation."""
 
 
-def fit_best_scored(context: SearchContext) -> FittedModel:
+def fit_best_scored(scores: OutputErrorScores) -> FittedModel:
     """Fit the single effects that explain most of the simulation residual.
 
     Args:
-        context: context of the search, of a robot on the ground.
+        scores: scores of the effects of a robot on the ground.
 
     Returns:
         The best model, or the base model.
     """
+    context = scores.context
     best = context.search.base_model
     search_control = context.evaluator.search_control
-    scores = OutputErrorScores(context)
     # Refining costs a tenth of a fit, and a better order saves whole fits.
     simulations = scores.simulations
     starts = [simulations.refine(start) for start in scores.list_starts()[:MAX_REFINED]]
@@ -107,6 +107,11 @@ class OutputErrorScores:
         costs = [self.simulations.compute_cost(start.theta) for start in starts.values()]
         ordered = list(starts.values())
         return [ordered[i] for i in np.argsort(costs, kind="stable").tolist()]
+
+    @property
+    def known_regression(self) -> Regression | None:
+        """The regression if it was computed."""
+        return self.__dict__.get("regression")
 
     @cached_property
     def regression(self) -> Regression:

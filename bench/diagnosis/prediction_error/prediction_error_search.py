@@ -62,7 +62,7 @@ from bench.diagnosis.prediction_error.identification_without_simulation import (
     identify_incomplete,
     simulate_identified,
 )
-from bench.diagnosis.prediction_error.output_error_scores import fit_best_scored
+from bench.diagnosis.prediction_error.output_error_scores import OutputErrorScores, fit_best_scored
 from bench.diagnosis.prediction_error.regression_columns import build_regression_about
 from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
@@ -125,6 +125,11 @@ class PredictionErrorSearch(EffectSearch):
     def _search_context(self) -> SearchContext:
         return SearchContext.of(self)
 
+    @cached_property
+    def _output_error_scores(self) -> OutputErrorScores:
+        """Scores of effects of a robot on the ground."""
+        return OutputErrorScores(self._search_context)
+
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show.
 
@@ -183,7 +188,7 @@ class PredictionErrorSearch(EffectSearch):
         context = self._search_context
         best_single = self.base_model
         if context.filters.base.is_on_ground:
-            best_single = fit_best_scored(context)
+            best_single = fit_best_scored(self._output_error_scores)
             if is_explained(context, best_single):
                 return best_single
         selected = context.columns.select()
@@ -432,9 +437,13 @@ class PredictionErrorSearch(EffectSearch):
         """Scores of all effects about the base model; None if no regression was made.
 
         If the search did not need the scores, those of the regression that selected effects are
-        returned.
+        returned. For a robot on the ground, it is the regression of simulation residuals.
         """
-        scores, regression = super().base_scores, self._search_context.columns.known_base_regression
+        scores = super().base_scores
+        regression = (
+            self._output_error_scores.known_regression
+            or self._search_context.columns.known_base_regression
+        )
         if scores is not None or regression is None:
             return scores
         return score_by_regression(
