@@ -9,6 +9,8 @@ from math import floor, isfinite, log10
 
 from sims.core.plain_values import SUPERSCRIPT_DIGITS
 
+_MIN_EXPONENT = -300
+"""Smallest exponent of ten of which the power is computed directly."""
 _MIN_FIXED_POINT = 1e-3
 """Magnitude below which numbers are written with a power of ten."""
 _MAX_FIXED_POINT = 1e5
@@ -74,7 +76,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
     rounded = float(f"{value:.{digits - 1}e}")
     exponent = _get_exponent(abs(rounded))
     decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
-    text = f"{rounded / 10.0**exponent:.{decimals}f}"
+    text = f"{_divide_by_power(rounded, exponent):.{decimals}f}"
     # Zeros before the decimal point are digits, trailing zeros after it are not needed.
     if "." in text:
         text = text.rstrip("0").rstrip(".")
@@ -100,7 +102,7 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
     decimals = min(max(0, (half % 1 < _LOG_MAX_TWO_DIGIT_MANTISSA) - floor(half)), 9)
     texts = []
     for x in (value, low, high):
-        digits = f"{x / 10.0**exponent:.{decimals}f}"
+        digits = f"{_divide_by_power(x, exponent):.{decimals}f}"
         texts.append(_format_sign(digits) + _format_power(exponent))
     middle, left, right = texts
     return f"{middle} ({left} to {right})"
@@ -124,6 +126,13 @@ def format_p_value(p: float | None) -> str:
     if p < _MIN_WRITTEN_P_VALUE:
         return f"p < {format_number(_MIN_WRITTEN_P_VALUE, 1)}"
     return f"p = {format_number(p, 2)}"
+
+
+def _divide_by_power(value: float, exponent: int) -> float:
+    """Return a number divided by a power of ten, which may be smaller than any float."""
+    if exponent > _MIN_EXPONENT:
+        return value / 10.0**exponent
+    return value * 10.0**-_MIN_EXPONENT / 10.0 ** (exponent - _MIN_EXPONENT)
 
 
 def _get_exponent(size: float) -> int:

@@ -43,7 +43,6 @@ from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     MIN_FURTHER_GAIN_SHARE,
-    fit_by_simulation,
     fit_filtered,
     is_explained,
     is_nearly_explained,
@@ -396,11 +395,7 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
                 continue
             confirmed = _confirm(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
-    if starts and context.filters.base.is_on_ground:
-        # First states with settled contacts depend on the effects.
-        for start in starts:
-            fit_by_simulation(context, start)
-    elif starts:
+    if starts:
         search.refit_models(starts, is_racing=False)
     size = len(best.effects)
     # Jumps of the state in the linear model come from drives at their force limits.

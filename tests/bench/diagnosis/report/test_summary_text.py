@@ -239,6 +239,9 @@ def test_numbers_read_well():
         "0", "0.0333", "2.2×10⁻⁴", "1230", "1.5×10⁹", "−0.5", "–", "–"
     ]  # fmt: skip
     assert format_number(0.00099996) == "0.001"
+    # The smallest float; no power of ten is as small.
+    assert format_number(5e-324) == "4.94×10⁻³²⁴"
+    assert format_estimate(1e-320, 0.0, 2e-320) == "1.0×10⁻³²⁰ (0.0×10⁻³²⁰ to 2.0×10⁻³²⁰)"
     assert [format_percent(v) for v in (0.9, 0.034, 0.998, 1.0, -0.2, None)] == [
         "90 %",
         "3.4 %",
