@@ -270,11 +270,11 @@ class RecordingTable:
                 )
         for name in header:
             if name not in self.wanted:
-                declared_names = (
-                    f"{self.path.with_suffix('.toml').name} declares {_join_names(self.wanted[2:])}"
-                )
+                description = self.path.with_suffix(".toml").name
                 raise InputError(
-                    f"{self.path}: column {format_value(name)} is not declared; {declared_names}"
+                    f"{self.path}: column {format_value(name)} is not declared; {description} "
+                    f"declares {_join_names(self.wanted[2:])}; add it with its unit under "
+                    "[inputs], [channels] or, if nothing reads it, [extra]"
                 )
         return header
 

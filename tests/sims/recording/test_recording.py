@@ -125,7 +125,8 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
         (CSV.replace("run,t,x,u", "run,t,x,"), "row 1: column 4 has no name"),
         (
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
-            "column 'v' is not declared; log.toml declares u, x",
+            "column 'v' is not declared; log.toml declares u, x; add it with its unit under "
+            r"\[inputs\], \[channels\] or, if nothing reads it, \[extra\]",
         ),
         (CSV + "1,2,3,4\n", "row 7, column run: run '1' continues after another run began"),
         (CSV + ",2,3,4\n,3,3,4\n", "row 7, column run: expected the name of a run, found none"),
