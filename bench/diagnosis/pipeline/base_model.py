@@ -134,13 +134,16 @@ class BaseModel:
     def correct_step_errors(self) -> BaseModel:
         """Return the base model without the discretisation error of the engine's steps.
 
-        The error is corrected if the recording shows it, or if no filter could decide.
+        The error is corrected if the recording shows it, or if no filter could decide. If a force
+        is missing, such as that of a mass, it may imitate this error, so that the search decides
+        later, with the force in the model.
         """
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         evaluator = self.runs.fitting
-        if evaluator.filtered_runs is not None and not shows_step_errors(evaluator.filtered_runs):
+        followed = evaluator.filtered_runs
+        if followed is not None and (followed.has_missing_force or not shows_step_errors(followed)):
             return self
         return replace(self, fit=correct_discretisation(evaluator, self.runs.noise, self.fit))
 

@@ -485,8 +485,8 @@ def _confirm(
 
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
     best one, the start is returned at once. So is a payload, whose response is far from linear in
-    its place. If not, simulations or a filter decide. Simulations of
-    an effect with one coefficient are faster, and show more if the best model explains the runs.
+    its place. If not, simulations or a filter decide. Simulations of an effect with one coefficient
+    are faster, and show more if the best model explains the runs.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -68,6 +68,7 @@ from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
     compute_p_value_of_gain,
     score_by_regression,
+    shows_step_errors,
 )
 from bench.diagnosis.prediction_error.servo_identification import (
     MIN_EXCESS,
@@ -152,8 +153,24 @@ class PredictionErrorSearch(EffectSearch):
             return self.identified.model
         if best is None or not is_explained(context, best):
             best = self._search_effects()
+        best = self._correct_shown_step_errors(best)
         self.best_supported_model = best
         return best
+
+    def _correct_shown_step_errors(self, model: FittedModel) -> FittedModel:
+        """Correct the errors of the integrator's steps if the filter with a model shows them.
+
+        Without the effects of the model, the missing force could imitate these errors.
+        """
+        if (
+            self.evaluator.discretisation_correction is not None
+            or not model.effects
+            or not np.isfinite(model.fit.cost)
+            or has_series(self.evaluator, model.effects)
+            or not shows_step_errors(self._search_context.filters.get_filter(model))
+        ):
+            return model
+        return self.correct_step_errors(model)
 
     def _make_identified_start(self) -> FitStart | None:
         """Return a start with the effects that were identified with the base parameters, if any."""
