@@ -121,7 +121,8 @@ class EffectSearch(ModelMoves):
         """Correct the discretisation error about a model, and refit its close competing models.
 
         A coarse time step of a robot's simulator causes an error that an effect may imitate. After
-        the correction, another model may be better, possibly a simpler one; it is returned.
+        the correction, another model may be better, possibly a simpler one; it is returned. The
+        correction is undone if the best of these models is likelier without it.
 
         Returns:
             The best model of the same size after the correction, which may be a simpler one.
@@ -133,6 +134,7 @@ class EffectSearch(ModelMoves):
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
+        correction_before, models_before = self.evaluator.discretisation_correction, {**self.models}
         correct_discretisation(
             self.evaluator, self.noise, model.fit.theta, model.fit.initial_states
         )
@@ -145,7 +147,11 @@ class EffectSearch(ModelMoves):
             > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
         ]
         self.refit_models([m.fit.make_start() for m in close_models], is_racing=False)
-        return select_by_size(self, effect_count)[0]
+        best = select_by_size(self, effect_count)[0]
+        # A fit is replaced only by a likelier one.
+        if models_before.get(frozenset(best.effects)) is best:
+            self.evaluator.discretisation_correction = correction_before
+        return best
 
     def get_best_so_far(self) -> FittedModel:
         """Return the best supported model of a search that has to end now, without any simulation.

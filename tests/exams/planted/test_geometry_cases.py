@@ -69,14 +69,16 @@ def test_recorded_torques_are_those_of_the_servos_at_the_samples():
     ("number", "index"),
     [
         pytest.param("payload", 3, marks=pytest.mark.slow),
+        pytest.param("payload", 2, marks=pytest.mark.slow),
         pytest.param("payload", 10, marks=pytest.mark.slow),
         pytest.param("payload", 17, marks=pytest.mark.slow),
+        pytest.param("payload", 19, marks=pytest.mark.slow),
         pytest.param("gravcomp", 13, marks=pytest.mark.long),
         pytest.param("radius", 3, marks=pytest.mark.long),
     ],
 )
 def test_the_wrong_number_is_named_alone_or_with_its_equals(number, index, tmp_path):
-    """Families, neighbouring bodies and wheels that creep hid these."""
+    """Families, neighbouring bodies, corrected step errors and wheels that creep hid these."""
     case = GeometryQuestion(number, index).draw()
     answer = explain(case.write(tmp_path)).answer
     (cause,) = answer.causes
