@@ -39,11 +39,7 @@ from bench.diagnosis.kalman.filter_and_smoother import (
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
-from sims.robot.dynamics.contact_states import (
-    ContactModel,
-    KnownJacobians,
-    settle_contacts,
-)
+from sims.robot.dynamics.contact_states import ContactModel, KnownJacobians, settle_contacts
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_about_recording import (

@@ -456,16 +456,15 @@ class PredictionErrorSearch(EffectSearch):
         If the search did not need the scores, those of the regression that selected effects are
         returned. For a robot on the ground, it is the regression of simulation residuals.
         """
-        scores = super().base_scores
         regression = (
             self._output_error_scores.known_regression
             or self._search_context.columns.known_base_regression
         )
-        if scores is not None or regression is None:
-            return scores
-        return score_by_regression(
-            regression, set(self.evaluator.library), self.make_rng("library", ())
-        )
+        scores = super().base_scores
+        if regression and not scores:
+            rng = self.make_rng("library", ())
+            scores = score_by_regression(regression, set(self.evaluator.library), rng)
+        return scores
 
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on.

@@ -134,7 +134,8 @@ class EffectSearch(ModelMoves):
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-        correction_before, models_before = self.evaluator.discretisation_correction, {**self.models}
+        correction_before = self.evaluator.discretisation_correction
+        models_before = dict(self.models)
         correct_discretisation(
             self.evaluator, self.noise, model.fit.theta, model.fit.initial_states
         )

@@ -83,6 +83,8 @@ class _Contact(NamedTuple):
 class ContactModel:
     """A robot at the first instant of a run, whose contacts are evaluated at given states.
 
+    A large gap (`SEARCH_GAP`) makes MuJoCo report geoms that only nearly touch, too.
+
     Args:
         simulator: simulator of the robot.
         theta: (P,) parameters, of which effects have their coefficients.
@@ -110,8 +112,7 @@ class ContactModel:
     def begin_run(self, scenario: Scenario, x: Array, v: Array) -> None:
         """Set the inputs of the beginning of a run.
 
-        The contacts that MuJoCo then finds in the initial pose are those of the run. A large gap
-        (`SEARCH_GAP`) makes it report geoms that only nearly touch, too.
+        The contacts that MuJoCo then finds in the initial pose are those of the run.
 
         Args:
             scenario: scenario of the run, whose first commands act.
@@ -226,7 +227,6 @@ def settle_contacts(
     measured = np.concatenate(start)
     if weights is None:
         weights = np.diag(1.0 / np.concatenate(sigma))
-    known = {} if known_jacobians is None else known_jacobians
     with capture_mujoco_warnings():
         model.begin_run(scenario, *start)
         state, present = measured, model.evaluate(measured)
@@ -244,11 +244,13 @@ def settle_contacts(
             if cost <= SETTLED_COST * len(keys):
                 break
             layout = tuple((key, present[key].is_closed) for key in keys)
-            is_known = layout in known
-            jacobian = known[layout] if is_known else _differentiate(model, state, present, keys)
-            if known_jacobians is not None:
-                known[layout] = jacobian
             residual = _compute_residual(present, present, keys)
+            # Without known derivatives, each iteration makes its own.
+            reused = {} if known_jacobians is None else known_jacobians
+            is_known = layout in reused
+            if not is_known:
+                reused[layout] = _differentiate(model, state, present, residual, keys)
+            jacobian = reused[layout]
             step = _solve(jacobian, residual, weights @ (state - measured), weights)
             for _ in range(MAX_HALVINGS):
                 contacts = model.evaluate(state + step)
@@ -260,7 +262,7 @@ def settle_contacts(
             else:  # No step decreases the cost.
                 if not is_known:
                     break
-                del known[layout]
+                del reused[layout]
                 continue
             has_converged = cost - new_cost < MIN_DECREASE * cost
             state, present, cost = state + step, contacts, new_cost
@@ -271,7 +273,11 @@ def settle_contacts(
 
 
 def _differentiate(
-    model: ContactModel, state: Array, present: dict[_Key, _Contact], keys: list[_Key]
+    model: ContactModel,
+    state: Array,
+    present: dict[_Key, _Contact],
+    residual: Array,
+    keys: list[_Key],
 ) -> Array:
     """Return finite differences (m, 2 D) of the residual of contact equilibrium by the state.
 
@@ -279,9 +285,9 @@ def _differentiate(
         model: the robot.
         state: (2 D,) positions and velocities.
         present: contacts at this state.
+        residual: (m,) residual at this state.
         keys: contacts that count.
     """
-    residual = _compute_residual(present, present, keys)
     jacobian = np.empty((residual.size, state.size))
     for i, difference in enumerate(np.repeat(DIFFERENCES, state.size // 2).tolist()):
         moved = state.copy()

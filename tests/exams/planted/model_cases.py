@@ -45,7 +45,7 @@ from tests.exams.robot_files import signal_unit, write_robot_recording
 
 QUATERNION_NOISE = 5e-4  # Standard deviation of each entry of a recorded quaternion.
 MIN_GAP = 5.0  # Smallest discrepancy, in multiples of the noise.
-MIN_GAP_WITH_TORQUES = 3.0  # The same over twice as many channels.
+MIN_GAP_WITH_TORQUES = 3.0  # The same if torques double the number of channels.
 SWINGS = (1.0, 0.6, 0.35)  # Factors of the amplitude; the first one whose motion is free is used.
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 # A flight without its controller is unstable, so the discrepancy does not determine the size.
@@ -132,8 +132,7 @@ class ModelCase(PlantedCase):
             elif file.base == "recorded" and entry in POSE_NAMES:
                 unit = "m"
             else:
-                unit = position_unit(model.joint(name.partition(".")[2]))
-                unit = signal_unit(name, unit)
+                unit = signal_unit(name, position_unit(model.joint(name.partition(".")[2])))
             channels[name] = unit, sigma
         times, (runs, _) = np.arange(SAMPLES) / RATE, self.performance
         tables = {
