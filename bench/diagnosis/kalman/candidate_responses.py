@@ -561,10 +561,14 @@ class FollowedRuns:
         inputs = self.runs.inputs.astype(np.float32)
         whitened = self._propagate_through_filter(columns.pushed, columns.readings, inputs)
         sizes: SingleArray = columns.sizes.astype(np.float32)
-        with np.errstate(all="ignore"):
-            result: SingleArray = whitened[..., columns.places] / sizes
-        # A candidate with a divergent motion gets a response of zero.
-        result[~(np.abs(result) < MAX_MAGNITUDE)] = 0.0
+        result = np.empty((*whitened.shape[:3], sizes.size), dtype=np.float32)
+        # The arrays of all runs together exceed the CPU cache.
+        for run, values in enumerate(result):
+            np.take(whitened[run], columns.places, axis=2, out=values, mode="clip")
+            with np.errstate(all="ignore"):
+                values /= sizes
+                # A candidate with a divergent motion gets a response of zero.
+                values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
         return result
 
     def compute_state_sensitivities(self) -> Array:

@@ -185,7 +185,7 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
     names = [name for name in evaluator.library if not has_many_shapes(name)]
     evaluator.search_control.begin_stage(f"testing {len(names)} effects with the base parameters")
     columns = followed.columns(list_probes(evaluator, (), names))
-    regression = regress(followed, columns)
+    regression = regress(followed, [columns])
     gains = regression.compute_net_gains()
     best_gain = best.log_likelihood - followed.log_likelihood
     starts, tried = list[_Start](), set[str]()

@@ -44,8 +44,10 @@ from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     MIN_FURTHER_GAIN_SHARE,
     fit_filtered,
+    has_noise_like_cost,
     is_explained,
     is_nearly_explained,
+    make_filtered_start,
     make_replacing_start,
     remove_idle_effects,
     select_lowest_of_each,
@@ -143,7 +145,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     # All servos together.
     if friction is None and not is_explained(context, best) and not search_control.is_over():
         check_filter(context, larger_sets[0].followed.log_likelihood)
-        best = select_more_likely(best, _fit_all_servos(context))
+        best = select_more_likely(best, _fit_all_servos(context, larger_sets[0]))
     # Two effects together may explain what neither explains alone.
     if larger_sets and not is_explained(context, best) and not search_control.is_over():
         best = select_more_likely(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
@@ -157,7 +159,8 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
 def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add one effect after another to a set, each time the one with the largest likelihood.
 
-    It stops if no effect is worth its penalty, or if the filter lacks no force any more.
+    It stops if no effect is worth its penalty, if the filter lacks no force any more, or if a
+    simulation with the coefficients of the filter leaves little more than noise.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -170,6 +173,8 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
         if not larger:
             break
         current = larger[0]
+        if has_noise_like_cost(context, make_filtered_start(context, current)):
+            break
     return current
 
 
@@ -283,14 +288,19 @@ def _compute_criterion(context: SearchContext, current: FilteredSet) -> float:
     return penalty - 2.0 * current.followed.log_likelihood
 
 
-def _fit_all_servos(context: SearchContext) -> FittedModel:
+def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedModel:
     """Fit stiffness and damping of all servos together, if forces are missing at several joints.
 
-    Another effect may gain more than the stiffness or the damping alone.
+    Another effect may gain more than the stiffness or the damping alone. If that effect leaves a
+    force missing at one joint only, the servos of the other joints are right.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        likeliest: the likeliest set with one effect.
     """
     names = [f"{effect}@*" for effect in SERVO_MODEL]
     filters = context.filters
-    several = filters.base.missing_forces.sum() > 1
+    several = min(f.missing_forces.sum() for f in (filters.base, likeliest.followed)) > 1
     if not several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
     return fit_filtered(
@@ -335,13 +345,14 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
 
     Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
     few. If a model with several effects explains the runs, or nearly, the likeliest single effect
-    of the filters is fitted too, with its competitors. The model with the higher penalised
-    log-likelihood is returned.
+    of those that were fitted alone, or else of the filters, is fitted too, with its competitors.
+    The model with the higher penalised log-likelihood is returned.
 
     Args:
         context: search, filters and regressions of the recording.
         best: the best model so far.
     """
+    search, filters = context.search, context.filters
     may_imitate = len(best.effects) > 1 and is_nearly_explained(context, best)
     if (
         not may_imitate
@@ -349,19 +360,28 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         or context.evaluator.search_control.is_over()
     ):
         return best
-    filters = context.filters
-    single_sets = try_one_more_effect(context, filters.empty_set)
-    if not single_sets:
-        return best
-    (name,) = single_sets[0].names
-    penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
-    loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
-    # Fewer effects save penalty; the single one is not fitted if it loses far more likelihood.
-    if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
-        return best
-    return select_more_likely(
-        fit_competing_models(context, fit_filtered(context, single_sets[0])), best
-    )
+    proposed = [frozenset(start.effects) for start in context.proposals.of(filters.empty_set)]
+    if proposed and all(effects in search.models for effects in proposed):
+        # Proposed effects that were fitted alone show how good a single effect can be.
+        single = max(
+            (search.models[effects] for effects in proposed),
+            key=lambda model: model.penalised_log_likelihood,
+        )
+        loss = best.penalised_log_likelihood - single.penalised_log_likelihood
+        if 2.0 * loss > COMPETING_MODEL_MARGIN:
+            return best
+    else:
+        single_sets = try_one_more_effect(context, filters.empty_set)
+        if not single_sets:
+            return best
+        (name,) = single_sets[0].names
+        penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
+        loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
+        # Fewer effects save penalty; the single one is not fitted if it loses far more likelihood.
+        if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
+            return best
+        single = fit_filtered(context, single_sets[0])
+    return select_more_likely(fit_competing_models(context, single), best)
 
 
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:

@@ -123,7 +123,9 @@ class EffectProposals:
         largest, and all but a few families (effects at every place, ``@*``), are left out.
         """
         if current.names:
-            regression, _ = build_regression_about(current, self.columns.library, current.followed)
+            regression, _ = build_regression_about(
+                current, [self.columns.library], current.followed
+            )
         else:
             regression = self.columns.base_regression
         gains = regression.compute_net_gains()

@@ -318,7 +318,7 @@ def _add_next_effect(
         left-out runs better.
     """
     evaluator = context.evaluator
-    regression, _ = build_regression_about(current, columns, current.followed)
+    regression, _ = build_regression_about(current, [columns], current.followed)
     gains = regression.compute_net_gains()
     for i, group in enumerate(regression.groups):
         gains[i] *= group.effect not in current.names

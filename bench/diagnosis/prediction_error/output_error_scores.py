@@ -25,6 +25,7 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.regression_selection import Regression, group_probes
+from bench.diagnosis.prediction_error.response_products import GramMatrices
 from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
@@ -132,9 +133,7 @@ class OutputErrorScores:
         }
         return Regression(
             group_probes(library.probes),
-            products[:, :-1, :-1],
-            products[:, :-1, -1],
-            products[:, -1, -1],
+            GramMatrices(products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]),
             int(followed.runs.recorded.sum()),
             contains,
         )

@@ -481,7 +481,7 @@ class PredictionErrorSearch(EffectSearch):
             regression, _ = columns.regression(model)
         else:
             current = FilteredSet(filters.get_filter(model), model.effects)
-            regression, _ = build_regression_about(current, columns.hats, filters.base)
+            regression, _ = build_regression_about(current, [columns.hats], filters.base)
         labels = {probe.effect for probe in columns.hats.probes}
         scores = score_by_regression(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""

@@ -83,7 +83,7 @@ class LibraryColumns:
         """Regression of the innovations of the base model on the candidates of the library."""
         library = self.library
         if self._base_regression is None or self._base_regression[0] is not library:
-            self._base_regression = library, regress(self.filters.base, library)
+            self._base_regression = library, regress(self.filters.base, [library])
         return self._base_regression[1]
 
     @property
@@ -159,8 +159,7 @@ class LibraryColumns:
             if (np.abs(theta - known) <= RELATIVE_DIFFERENCE * np.abs(known)).all():
                 return regression
         current = FilteredSet(self.filters.get_filter(model), names)
-        columns = self.library.joined(self.hats)
-        regression = build_regression_about(current, columns, self.filters.base)
+        regression = build_regression_about(current, [self.library, self.hats], self.filters.base)
         self._regressions[names] = theta, regression
         return regression
 
@@ -245,7 +244,7 @@ def group_coefficients(
 
 
 def build_regression_about(
-    current: FilteredSet, columns: Columns, followed: FollowedRuns
+    current: FilteredSet, columns: Sequence[Columns], followed: FollowedRuns
 ) -> ModelRegression:
     """Set up the regression of innovations on candidates, with effects in the filter's model.
 
@@ -255,20 +254,20 @@ def build_regression_about(
 
     Args:
         current: the runs, filtered with these effects.
-        columns: inputs of the candidates.
+        columns: inputs of the candidates, in one or more parts.
         followed: filtered runs about whose motion the effects are linearised.
     """
     own_columns: dict[str, list[int]] = {}
     probes: list[CandidateDirection] = []
-    count = len(columns.probes)
+    count = sum(len(part.probes) for part in columns)
     for name in current.names:
         tangents = _make_tangent_probes(followed.evaluator, name, current.followed.theta)
         first_column = count + len(probes)
         own_columns[name] = list(range(first_column, first_column + len(tangents)))
         probes += tangents
-    joined = columns.joined(followed.columns(probes)) if probes else columns
-    always = range(count, len(joined.probes))
-    return ModelRegression(regress(current.followed, joined, always=always), own_columns)
+    parts = [*columns, followed.columns(probes)] if probes else columns
+    always = range(count, count + len(probes))
+    return ModelRegression(regress(current.followed, parts, always=always), own_columns)
 
 
 def _make_tangent_probes(

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ from numpy.typing import NDArray
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.prediction_error.response_products import InnerProducts, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
     CandidateScores,
@@ -70,29 +72,31 @@ class Regression:
 
     Attributes:
         groups: columns that act together; a set has at most one group of each effect.
-        grams: G (R, K, K) of each run.
-        crosses: h (R, K) of each run.
-        totals: eᵀ e (R,) of each run.
+        products: G, h and eᵀ e of each run.
         count: N.
         contains: effects that each effect contains, by name.
         always: columns that are part of every set and belong to no effect.
     """
 
     groups: Sequence[DirectionGroup]
-    grams: Array
-    crosses: Array
-    totals: Array
+    products: InnerProducts
     count: int
     contains: Mapping[str, Sequence[str]] = field(default_factory=dict)
     always: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Sum the products of eq. (1) over all runs, and group the columns by effect."""
-        self.gram, self.cross = self.grams.sum(axis=0), self.crosses.sum(axis=0)
-        self.total = float(self.totals.sum())
+        self._squares = self.products.squares.sum(axis=0)
+        self._cross = self.products.crosses.sum(axis=0)
+        self.total = float(self.products.totals.sum())
         self._batches = batch_groups(self.groups)
         self.effects = list(dict.fromkeys(group.effect for group in self.groups))
         self._nuisance = DirectionGroup("", self.always, (False,) * len(self.always))
+
+    @cached_property
+    def _products_within_groups(self) -> list[Array]:
+        """Products (n, k, k) within the n groups of each batch."""
+        return [self.products.sum_within(batch.columns) for batch in self._batches]
 
     def nuisance(self, chosen: Sequence[DirectionGroup]) -> float:
         """Return the coefficient of the first column of `always`, fitted together with a set."""
@@ -108,9 +112,7 @@ class Regression:
         """
         whole, always = own_columns[0], tuple(c for c in self.always if c not in own_columns)
         # Innovations without the effect: e + w of its whole change.
-        crosses = self.crosses + self.grams[:, :, whole]
-        totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
-        return replace(self, crosses=crosses, totals=totals, always=always)
+        return replace(self, products=self.products.add_to_innovations(whole), always=always)
 
     def compute_gain(self, own: Sequence[int]) -> float:
         """Return the gain of columns in twice the log-likelihood, with any signs."""
@@ -137,10 +139,7 @@ class Regression:
         return rss, parts[:-1]
 
     def _fit_groups(
-        self,
-        chosen: Sequence[DirectionGroup],
-        gram: Array | None = None,
-        cross: Array | None = None,
+        self, chosen: Sequence[DirectionGroup], left_out: int | None = None
     ) -> tuple[float, list[Array]]:
         """Fit a set of groups by least squares, with some coefficients that must be nonnegative.
 
@@ -149,31 +148,30 @@ class Regression:
 
         Args:
             chosen: the groups.
-            gram: (K, K) G of eq. (1), for instance without one run; None for that of all runs.
-            cross: (K,) h of eq. (1); None for that of all runs.
+            left_out: run that is not fitted; None to fit all runs.
 
         Returns:
             The residual sum of squares, and the coefficients of each group.
         """
-        gram = self.gram if gram is None else gram
-        cross = self.cross if cross is None else cross
         columns = list_columns(chosen)
         positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
+        fitted_runs = [r for r in range(len(self.products.totals)) if r != left_out]
+        gram = self.products.select(columns)[fitted_runs].sum(axis=0)
+        cross = self.products.crosses[fitted_runs].sum(axis=0)[columns]
         active = np.ones(columns.size, dtype=bool)
         solution = np.zeros(columns.size)
         while active.any():
-            active_columns = columns[active]
-            normal, scale = _normalise_gram(gram, active_columns)
-            scaled_solution = np.linalg.solve(normal, cross[active_columns] / scale)
+            normal, scale = _normalise_gram(gram[np.ix_(active, active)])
+            scaled_solution = np.linalg.solve(normal, cross[active] / scale)
             solution[:] = 0.0
             solution[active] = scaled_solution / scale
             negative = np.flatnonzero(active & positive & (solution < 0))
             if not negative.size:
                 break
-            sizes = solution[negative] * np.sqrt(np.diagonal(gram)[columns[negative]])
+            sizes = solution[negative] * np.sqrt(np.diagonal(gram)[negative])
             active[negative[np.argmin(sizes)]] = False
             solution[:] = 0.0
-        explained_squares = float(solution @ cross[columns])
+        explained_squares = float(solution @ cross)
         # The formula also holds for a solution with some coefficients fixed at zero.
         rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
         parts, begin = [], 0
@@ -212,24 +210,29 @@ class Regression:
         """
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
-        gram, cross, rss = self.gram, self.cross, self.total
+        squares, cross, rss = self._squares, self._cross, self.total
+        rows = np.zeros((columns.size, squares.size))
+        solved = np.zeros((columns.size, squares.size + 1))
         if columns.size:
-            normal, scale = _normalise_gram(gram, columns)
-            rows = gram[columns] / scale[:, None]
+            rows = self.products.select_rows(columns)
+            normal, scale = _normalise_gram(rows[:, columns])
+            rows = rows / scale[:, None]
             solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
-            gram = gram - rows.T @ solved[:, :-1]
+            squares = squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
             cross = cross - rows.T @ solved[:, -1]
             rss, _ = self.solve(chosen)
         # Almost nothing of a collinear column remains after the projection.
-        is_collinear = np.diagonal(gram) <= COLLINEARITY_TOLERANCE * np.diagonal(self.gram)
+        remains = squares > COLLINEARITY_TOLERANCE * self._squares
         contained_effects = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
-        gram = np.where(is_collinear[:, None] | is_collinear[None], 0.0, gram)
-        cross = np.where(is_collinear, 0.0, cross)
-        for batch in self._batches:
-            blocks = gram[batch.columns[:, :, None], batch.columns[:, None, :]]
+        cross = np.where(remains, cross, 0.0)
+        for batch, products in zip(self._batches, self._products_within_groups, strict=True):
+            projected = np.einsum("cgi,cgj->gij", rows[:, batch.columns], solved[:, batch.columns])
+            kept = remains[batch.columns]
             explained, _ = compute_explained_squares(
-                blocks, cross[batch.columns][..., None], batch.positive
+                np.where(kept[:, :, None] & kept[:, None, :], products - projected, 0.0),
+                cross[batch.columns][..., None],
+                batch.positive,
             )
             remaining = np.maximum(rss - explained[:, 0], SMALLEST_RSS * self.total)
             result[batch.group_indices] = self.count * np.log(rss / remaining)
@@ -288,7 +291,7 @@ class Regression:
             smaller: the smaller set.
             larger: the larger set.
         """
-        if len(self.totals) < 2:
+        if len(self.products.totals) < 2:
             return True
         before, after = self._compute_left_out_rss(smaller), self._compute_left_out_rss(larger)
         return bool(after.sum() < before.sum() and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
@@ -303,15 +306,14 @@ class Regression:
         residual_squares = []
         groups = [*chosen, self._nuisance]
         columns = list_columns(groups)
-        for run, total in enumerate(self.totals):
-            gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
-            _, parts = self._fit_groups(groups, gram, cross)
+        grams = self.products.select(columns)
+        for run, total in enumerate(self.products.totals):
+            _, parts = self._fit_groups(groups, left_out=run)
             coefficients = np.concatenate(parts) if parts else np.zeros(0)
-            block = self.grams[run][np.ix_(columns, columns)]
             residual_squares.append(
                 total
-                - 2.0 * coefficients @ self.crosses[run][columns]
-                + coefficients @ block @ coefficients
+                - 2.0 * coefficients @ self.products.crosses[run][columns]
+                + coefficients @ grams[run] @ coefficients
             )
         return np.array(residual_squares)
 
@@ -337,21 +339,20 @@ class Regression:
         return remaining
 
 
-def _normalise_gram(gram: Array, columns: IndexArray) -> tuple[Array, Array]:
+def _normalise_gram(gram: Array) -> tuple[Array, Array]:
     """Return the scaled normal matrix of some regression columns, and their lengths.
 
     Columns of effects differ by many orders of magnitude. Scaling them to unit length, and adding
     a small ridge to the diagonal, keeps the normal equations well conditioned.
 
     Args:
-        gram: (K, K) inner products of all regression columns, G = Wᵀ W of the module's eq. (1).
-        columns: (k,) indices of the columns to use.
+        gram: (k, k) inner products of the columns, G = Wᵀ W of the module's eq. (1).
 
     Returns:
         Matrix (k, k), and lengths (k,).
     """
-    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
-    normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
+    scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+    normal = gram / scale / scale[:, None]
     normal[np.diag_indices_from(normal)] += RIDGE
     return normal, scale
 
@@ -484,7 +485,7 @@ def shows_step_errors(followed: FollowedRuns) -> bool:
 
     They do if the recorded motion is one of continuous time, and do not if the engine generated it.
     """
-    return regress(followed, followed.columns([])).shows_nuisance([])
+    return regress(followed, [followed.columns([])]).shows_nuisance([])
 
 
 def identify(followed: FollowedRuns, columns: Columns, first: Regression | None = None) -> Selected:
@@ -507,7 +508,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     result: Selected | None = None
     numerics = 0.0
     for _ in range(MAX_REGRESSIONS):
-        regression = first or regress(refitted, columns, selected_before, coefficients, numerics)
+        regression = first or regress(refitted, [columns], selected_before, coefficients, numerics)
         first = None
         # Drop effects that are not needed any more, and add others.
         selected = regression.prune(selected_before) if selected_before else []
@@ -538,7 +539,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
 
 def regress(
     followed: FollowedRuns,
-    columns: Columns,
+    columns: Sequence[Columns],
     chosen: Sequence[DirectionGroup] = (),
     coefficients: Sequence[Array] = (),
     numerics: float = 0.0,
@@ -553,34 +554,36 @@ def regress(
 
     Args:
         followed: the runs, filtered with the chosen effects in the linear model.
-        columns: inputs of the candidates.
+        columns: inputs of the candidates, in one or more parts.
         chosen: the effects in the linear model.
         coefficients: coefficients of these effects.
         numerics: share of the integrator's step errors that is in the linear model.
         always: indices of probes that are part of every set, and are not candidates.
     """
     # Shapes: R runs, T samples, C channels, K candidates; the arrays of a run have rows T C.
-    candidate_responses = followed.responses(columns)
-    run_count, _, _, count = candidate_responses.shape
-    step_error_responses = followed.step_error_response()
-    own_columns = list_columns(chosen)
-    weights = np.concatenate([*coefficients, np.zeros(0)])
-    grams = np.zeros((run_count, count + 1, count + 1))
-    crosses, totals = np.zeros((run_count, count + 1)), np.zeros(run_count)
-    for run in range(run_count):
-        innovations = followed.filtered.whitened[run].reshape(-1)
-        rows = candidate_responses[run].reshape(innovations.size, count).astype(np.float64)
-        rows = np.concatenate([rows, step_error_responses[run].reshape(-1, 1)], axis=1)
-        innovations = innovations + rows[:, own_columns] @ weights + numerics * rows[:, -1]
-        grams[run] = rows.T @ rows
-        crosses[run] = rows.T @ innovations
-        totals[run] = innovations @ innovations
+    responses = np.concatenate(
+        [
+            *(followed.responses(part) for part in columns),
+            followed.step_error_response()[..., None].astype(np.float32),
+        ],
+        axis=3,
+    )
+    run_count, _, _, count = responses.shape
+    rows = responses.reshape(run_count, -1, count)
+    weights = np.zeros(count)
+    weights[list_columns(chosen)] = np.concatenate([*coefficients, np.zeros(0)])
+    weights[-1] = numerics
+    in_use = np.flatnonzero(weights)
+    innovations = followed.filtered.whitened.reshape(run_count, -1)
+    innovations = innovations + rows[:, :, in_use].astype(np.float64) @ weights[in_use]
     contains = {
         name: effect.contains for name, effect in followed.evaluator.available_effects.items()
     }
-    groups = [g for g in group_probes(columns.probes) if not set(g.column_indices) & set(always)]
+    probes = [probe for part in columns for probe in part.probes]
+    groups = [g for g in group_probes(probes) if not set(g.column_indices) & set(always)]
     samples = int(followed.runs.recorded.sum())
-    return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))
+    products = ResponseProducts(list(rows), list(innovations))
+    return Regression(groups, products, samples, contains, (count - 1, *always))
 
 
 def follow_linear_with_effects(

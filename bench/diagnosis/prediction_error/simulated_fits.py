@@ -53,20 +53,27 @@ MIN_FURTHER_GAIN_SHARE = 0.01
 The model of a real robot is never complete, and long recordings show this with certainty.
 """
 
+MAX_NOISE_LIKE_COST = 1.5
+"""Maximum mean squared residual, in units of the noise, at which no better start is searched."""
+
 RatedStart = tuple[float, FitStart]
 """Cost of a simulation without a fit (sum of squares in units of the noise), and its start."""
 
 
-def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
+def fit_by_simulation(
+    context: SearchContext, start: FitStart, is_incomplete: bool = False
+) -> FittedModel:
     """Fit a set of effects by simulation, with restarts if it does not explain the runs.
 
     If the residual is large, the fit is repeated with derivatives by the first states about the
     simulated motion, because those about the measured motion may be invalid. Dry friction is then
-    fitted again from nearby coefficients, because its fit may stop in a local minimum.
+    fitted again from nearby coefficients, because its fit may stop in a local minimum. An
+    incomplete set that leaves much of the discrepancy is not fitted again.
 
     Args:
         context: search, filters and regressions of the recording.
         start: the effects, with first parameters and initial states.
+        is_incomplete: whether a filter shows that a force is missing in addition to the effects.
 
     Returns:
         The fitted model, even if it does not explain the runs; its cost is infinite if simulation
@@ -77,6 +84,8 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
         start = context.filters.estimate_start(start)
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
+        return fitted
+    if is_incomplete and not is_nearly_explained(context, fitted):
         return fitted
     derivatives_before = evaluator.state_derivatives
     compute_state_jacobian(
@@ -92,6 +101,17 @@ def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
     return fitted
 
 
+def make_filtered_start(context: SearchContext, current: FilteredSet) -> FitStart:
+    """Return the start of a fit with the coefficients of a filter.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set, with its filter.
+    """
+    states = context.filters.estimate_first_states(current.followed)
+    return FitStart(current.names, current.followed.theta, states)
+
+
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Fit a set by simulation, starting from the coefficients of its filter.
 
@@ -99,8 +119,8 @@ def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
         context: search, filters and regressions of the recording.
         current: the set.
     """
-    states = context.filters.estimate_first_states(current.followed)
-    return fit_by_simulation(context, FitStart(current.names, current.followed.theta, states))
+    start = make_filtered_start(context, current)
+    return fit_by_simulation(context, start, current.followed.has_missing_force)
 
 
 def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedModel:
@@ -161,6 +181,17 @@ def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) ->
     for i in np.argsort(costs, kind="stable").tolist():
         best_of_each_set.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
     return list(best_of_each_set.values())
+
+
+def has_noise_like_cost(context: SearchContext, start: FitStart) -> bool:
+    """Return whether a start leaves little more than noise without any fit.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        start: the start.
+    """
+    ((cost, _),) = select_lowest_of_each(context, [start])
+    return cost < MAX_NOISE_LIKE_COST * int(context.filters.base.runs.recorded.sum())
 
 
 def is_explained(context: SearchContext, model: FittedModel) -> bool:
@@ -335,7 +366,8 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
     states = context.filters.estimate_first_states(selected.followed)
-    fitted = fit_by_simulation(context, replace(start, initial_states=states))
+    start = replace(start, initial_states=states)
+    fitted = fit_by_simulation(context, start, selected.followed.has_missing_force)
     if not np.isfinite(fitted.fit.cost):
         return base
     fitted = remove_idle_effects(context, fitted)

@@ -24,6 +24,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
+    MAX_NOISE_LIKE_COST,
     RatedStart,
     fit_by_simulation,
     fit_nearby,
@@ -44,8 +45,6 @@ CLOSER_FACTORS = ((0.7, 0.84, 1.2, 1.4), (0.92, 0.96, 1.04, 1.09))
 """Factors of the best scanned coefficient that are simulated next, in two rounds."""
 MAX_SINGLE_SQUARES_SHARE = 0.3
 """Maximum share of the squared residual that a single likely effect leaves before any fit."""
-MAX_SCANNED_COST = 1.5
-"""Maximum squared residual of a sample, in units of the noise, at which nothing is scanned."""
 MAX_SCANNED_FITS = 2
 """Maximum number of likely effects that are fitted alone."""
 MAX_REFINED = 3
@@ -71,16 +70,16 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
         replace(start, initial_states=states) for start in context.proposals.of(filters.empty_set)
     ]
     costs = select_lowest_of_each(context, proposed)
-    if not _has_noise_like_cost(context, costs):
+    if not _is_first_noise_like(context, costs):
         costs = _try_scaled(context, costs, SCANNED_FACTORS)
     limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
     return [(cost, start) for cost, start in costs if cost < limit]
 
 
-def _has_noise_like_cost(context: SearchContext, costs: Sequence[RatedStart]) -> bool:
+def _is_first_noise_like(context: SearchContext, costs: Sequence[RatedStart]) -> bool:
     """Return whether the first cost, of a model without a fit, is nearly that of noise."""
     sample_count = int(context.filters.base.runs.recorded.sum())
-    return bool(costs) and costs[0][0] < MAX_SCANNED_COST * sample_count
+    return bool(costs) and costs[0][0] < MAX_NOISE_LIKE_COST * sample_count
 
 
 def _try_scaled(
@@ -142,7 +141,7 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
     for likely_start in likely_starts[:MAX_SCANNED_FITS]:
         costs = [likely_start]
         for factors in CLOSER_FACTORS:
-            if not _has_noise_like_cost(context, costs):
+            if not _is_first_noise_like(context, costs):
                 costs = _try_scaled(context, costs, factors)
         fitted = fit_by_simulation(context, costs[0][1])
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):

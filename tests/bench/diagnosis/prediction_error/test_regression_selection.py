@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from bench.diagnosis.prediction_error.regression_selection import Regression
+from bench.diagnosis.prediction_error.response_products import ResponseProducts
 from bench.diagnosis.search.score_test import DirectionGroup
 
 RUNS, SAMPLES, COLUMNS = 4, 80, 6
@@ -12,10 +13,7 @@ RUNS, SAMPLES, COLUMNS = 4, 80, 6
 
 def regression_of(rows, target, groups, **more):
     """Return the regression of a target (R, n) on rows (R, n, K)."""
-    grams = np.einsum("rnk,rnl->rkl", rows, rows)
-    crosses = np.einsum("rnk,rn->rk", rows, target)
-    totals = np.square(target).sum(axis=1)
-    return Regression(groups, grams, crosses, totals, target.size, **more)
+    return Regression(groups, ResponseProducts(list(rows), list(target)), target.size, **more)
 
 
 @pytest.fixture
