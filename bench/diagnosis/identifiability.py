@@ -21,10 +21,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
@@ -55,6 +56,8 @@ for it to be detectable.
 """
 CONFOUNDING_CORRELATION = 0.95
 """Minimum correlation of two parameters that are reported as confounded."""
+CANDIDATES_PER_BLOCK = 256
+"""Number of candidates that are projected together, which limits the memory."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
 
@@ -109,6 +112,20 @@ def assess_identifiability(
         ]
         direction_set = compute_directions(evaluator, fit, names)
     return _IdentifiabilityAssessment(evaluator, noise, fit, direction_set).numbers()
+
+
+class _Direction(NamedTuple):
+    """The most sensitive direction of a coefficient.
+
+    Attributes:
+        probe: the candidate.
+        norm: information on the coefficient, in units of the noise.
+        unit_column: (N,) whitened response without states and parameters, scaled to length one.
+    """
+
+    probe: CandidateDirection
+    norm: float
+    unit_column: Array
 
 
 class _IdentifiabilityAssessment:
@@ -167,6 +184,19 @@ class _IdentifiabilityAssessment:
         projected: Array = columns - np.matmul(state_jacobian, coefficients)
         runs, samples, count = projected.shape
         return projected.reshape(runs * samples, count)
+
+    def _project_out_parameters(self, candidates: Sequence[int], basis: Array) -> Array:
+        """Return responses (N, k), in units of the noise, without initial states and parameters.
+
+        Args:
+            candidates: indices of k candidates.
+            basis: (N, q) orthonormal basis of the derivatives by the free parameters.
+        """
+        responses = np.where(self.seen[..., None], self.found.responses[..., candidates], 0.0)
+        responses = responses / self.noise.sigma[:, None]
+        columns = self._project_out_states(responses.reshape(len(responses), -1, len(candidates)))
+        projected: Array = columns - basis @ (basis.T @ columns)
+        return projected
 
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance (D'D)^-1, eq. (1).
@@ -251,52 +281,50 @@ class _IdentifiabilityAssessment:
         Effects that act at all places are represented by their members at single places.
         """
         evaluator = self.evaluator
-        probes = [
-            p
-            for p in self.found.candidates
-            if evaluator.available_effects[p.effect].place != ALL_PLACES
+        numbers = [
+            k
+            for k, probe in enumerate(self.found.candidates)
+            if evaluator.available_effects[probe.effect].place != ALL_PLACES
         ]
-        is_at_one_place = [
-            evaluator.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
-        ]
-        responses = self.found.responses[..., is_at_one_place]
-        scaled_responses = np.where(self.seen[..., None], responses, 0.0)
-        scaled_responses /= self.noise.sigma[:, None]
-        # 1. Information on each direction.
-        runs, _, _, count = scaled_responses.shape
-        columns = self._project_out_states(scaled_responses.reshape(runs, -1, count))
-        if self.parameters.shape[1]:
-            basis, _ = np.linalg.qr(self.parameters)
-            columns -= basis @ (basis.T @ columns)
-        norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-        # 2. A coefficient with several shapes is represented by the most sensitive one.
-        most_sensitive: dict[tuple[str, int], int] = {}
-        switching_effects = {probe.effect for probe in probes if probe.is_single_size}
-        for k, probe in enumerate(probes):
-            if probe.effect in switching_effects and not probe.is_single_size:
-                continue
-            key = probe.effect, probe.coefficient_index
-            if key not in most_sensitive or norms[k] > norms[most_sensitive[key]]:
-                most_sensitive[key] = k
+        basis, _ = np.linalg.qr(self.parameters)
+        switching_effects = {
+            self.found.candidates[k].effect
+            for k in numbers
+            if self.found.candidates[k].is_single_size
+        }
+        most_sensitive: dict[tuple[str, int], _Direction] = {}
+        for begin in range(0, len(numbers), CANDIDATES_PER_BLOCK):
+            block = numbers[begin : begin + CANDIDATES_PER_BLOCK]
+            # 1. Information on each direction.
+            columns = self._project_out_parameters(block, basis)
+            norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
+            # 2. A coefficient with several shapes is represented by the most sensitive one.
+            for column, norm, k in zip(columns.T, norms.tolist(), block, strict=True):
+                probe = self.found.candidates[k]
+                if probe.effect in switching_effects and not probe.is_single_size:
+                    continue
+                key = probe.effect, probe.coefficient_index
+                if key not in most_sensitive or norm > most_sensitive[key].norm:
+                    most_sensitive[key] = _Direction(probe, norm, column / max(norm, 1e-300))
         # 3. Intervals and correlations.
-        selected_columns = list(most_sensitive.values())
-        unit_columns = columns[:, selected_columns] / np.maximum(norms[selected_columns], 1e-300)
-        correlations = np.abs(unit_columns.T @ unit_columns)
+        selected = list(most_sensitive.values())
+        unit_columns = np.array([direction.unit_column for direction in selected])
+        correlations = np.abs(unit_columns @ unit_columns.T)
         assessments = []
-        for row, ((name, coefficient_index), k) in zip(
+        for row, ((name, coefficient_index), direction) in zip(
             correlations, most_sensitive.items(), strict=True
         ):
             parameter = evaluator.parameters[
                 evaluator.get_coefficient_indices(name)[coefficient_index]
             ]
-            probe = probes[k]
-            half_width = Z95 / norms[k] if norms[k] > 0 else np.inf
+            probe, norm = direction.probe, direction.norm
+            half_width = Z95 / norm if norm > 0 else np.inf
             confounders = [
                 (other_effect, float(correlation))
-                for (other_effect, _), other_column, correlation in zip(
-                    most_sensitive, selected_columns, row, strict=True
+                for (other_effect, _), other, correlation in zip(
+                    most_sensitive, selected, row, strict=True
                 )
-                if other_effect != name and norms[other_column] > 0
+                if other_effect != name and other.norm > 0
             ]
             is_single_coefficient = sum(1 for effect, _ in most_sensitive if effect == name) == 1
             label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
@@ -312,9 +340,7 @@ class _IdentifiabilityAssessment:
                     confounders=confounders,
                 )
                 assessments.append(
-                    replace(
-                        identifiability, half=np.nan, word=_rate_switching_effect(float(norms[k]))
-                    )
+                    replace(identifiability, half=np.nan, word=_rate_switching_effect(norm))
                 )
                 continue
             assessments.append(

@@ -610,19 +610,35 @@ class FollowedRuns:
         changes = segments._propagate_without_gain(errors) / self.noise.sigma[:, None]
         return float(np.abs(changes).max(initial=0.0))
 
-    def sensitivities(self, columns: Columns) -> Array:
+    def sensitivities(self, columns: Columns, dtype: type[np.floating] = np.float64) -> Array:
         """Return the derivatives (R, T, C, K) of simulated readings by K candidate effects.
 
         A column is the response to an effect with a finite coefficient; divided by that coefficient
         (`columns.sizes`), it is the response to a unit. Simulated runs are not corrected by
         readings, so the gain of the filter is zero. Shapes: R runs, T samples, C channels.
+
+        Args:
+            columns: inputs of the candidates.
+            dtype: type of the result.
         """
         number, _, _, count = columns.readings.shape
-        changes = self._propagate_without_gain(
-            np.zeros((number, self.runs.prior.size, count)), columns
-        )
-        with np.errstate(all="ignore"):
-            return changes[..., columns.places] / columns.sizes
+        result = np.zeros((*columns.readings.shape[:3], len(columns.probes)), dtype)
+        for begin in range(0, count, COLUMNS_PER_BATCH):
+            batch = slice(begin, min(begin + COLUMNS_PER_BATCH, count))
+            changes = self._propagate_without_gain(
+                np.zeros((number, self.runs.prior.size, batch.stop - begin)),
+                replace(
+                    columns,
+                    pushed=columns.pushed[..., batch],
+                    readings=columns.readings[..., batch],
+                ),
+            )
+            chosen = np.flatnonzero((columns.places >= begin) & (columns.places < batch.stop))
+            with np.errstate(all="ignore"):
+                result[..., chosen] = (
+                    changes[..., columns.places[chosen] - begin] / columns.sizes[chosen]
+                )
+        return result
 
     def _propagate_without_gain(self, s: Array, columns: Columns | None = None) -> Array:
         """Propagate changes of the first states, and optional columns, through the linear model.

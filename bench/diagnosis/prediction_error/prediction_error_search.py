@@ -518,5 +518,5 @@ class PredictionErrorSearch(EffectSearch):
         They are linearised about the measured motion.
         """
         library = self._search_context.columns.library
-        values = self._search_context.filters.base.sensitivities(library)
+        values = self._search_context.filters.base.sensitivities(library, np.float32)
         return self.base_model.fit, DirectionSet(library.probes, values)

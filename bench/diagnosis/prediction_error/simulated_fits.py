@@ -339,13 +339,25 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     Returns:
         The fitted model, or the base model if simulation is slow and a force is still missing.
     """
-    useful_selection = drop_surplus_effects(context, selected)
-    is_slow = len(useful_selection.groups) > MAX_SLOW_EFFECTS and is_slow_to_simulate(
-        context, useful_selection.effects
-    )
-    if is_slow and selected.followed.has_missing_force:
+    useful_selection = drop_surplus_effects(context, selected, is_simulated=True)
+    if _is_too_slow(context, selected, len(useful_selection.groups)):
         return context.search.base_model
     return fit_selection(context, useful_selection)
+
+
+def _is_too_slow(context: SearchContext, selected: Selected, count: int) -> bool:
+    """Return whether simulation is slow, although the selection lacks a force.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        selected: the selection.
+        count: number of its effects that are simulated.
+    """
+    return (
+        count > MAX_SLOW_EFFECTS
+        and is_slow_to_simulate(context, selected.effects[:count])
+        and selected.followed.has_missing_force
+    )
 
 
 def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
@@ -376,7 +388,9 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
     return select_more_likely(fitted, base)
 
 
-def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected:
+def drop_surplus_effects(
+    context: SearchContext, selected: Selected, is_simulated: bool = False
+) -> Selected:
     """Drop the last effects of a selection that gain little with the set in a filter's model.
 
     Far from the base model, the linear regression is wrong. So the first one, two, three, ...
@@ -386,13 +400,16 @@ def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected
     Args:
         context: search, filters and regressions of the recording.
         selected: the selection.
+        is_simulated: whether the set is kept for a simulation, so that the trials also end when it
+            is too slow to simulate.
     """
     filters = context.filters
     base_log_likelihood = filters.base.log_likelihood
     best_net_gain, kept_count, best_gain = 0.0, 0, 0.0
     best_coefficients: list[Array] = []
     for count in range(1, len(selected.groups) + 1):
-        if count > kept_count + MAX_SURPLUS:
+        is_slow = is_simulated and _is_too_slow(context, selected, kept_count)
+        if is_slow or count > kept_count + MAX_SURPLUS:
             break
         groups = selected.groups[:count]
         coefficients = selected.regression.solve(groups)[1]

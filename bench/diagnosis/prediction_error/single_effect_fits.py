@@ -47,6 +47,8 @@ MAX_SINGLE_SQUARES_SHARE = 0.3
 """Maximum share of the squared residual that a single likely effect leaves before any fit."""
 MAX_SCANNED_FITS = 2
 """Maximum number of likely effects that are fitted alone."""
+MAX_NEARBY = 5
+"""Maximum number of effects that are simulated at nearby coefficients, those that fit best."""
 MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
 MAX_IMPROVED_SIZE = 3
@@ -199,10 +201,16 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         The best model, or the base model if that is likelier.
     """
     starts: list[FitStart] = []
-    for model in fitted:
-        (name,) = model.effects
-        if len(context.evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
-            starts += [model.fit.make_start(), *list_nearby_starts(context, model, name)]
+    improved = [
+        model
+        for model in sorted(fitted, key=lambda model: model.fit.cost)
+        if len(context.evaluator.get_coefficient_indices(model.effects[0])) <= MAX_IMPROVED_SIZE
+    ]
+    for model in improved[:MAX_NEARBY]:
+        starts += [
+            model.fit.make_start(),
+            *list_nearby_starts(context, model, model.effects[0]),
+        ]
     best = context.search.base_model
     for _, start in select_lowest_of_each(context, starts)[:MAX_REFINED]:
         refined = fit_by_simulation(context, start)
