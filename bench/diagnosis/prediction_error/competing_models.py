@@ -112,8 +112,9 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     """Add effects one after another to dry friction, or to the base model, and fit the best sets.
 
     Filters with one more effect in the model are compared first, since they are fast. The sets that
-    are nearly as likely as the best are then fitted by simulation. If none explains the runs, all
-    servos are fitted together, and then the likeliest set is extended by further effects.
+    are nearly as likely as the best are then fitted by simulation, if they act at all joints where
+    forces are missing. If none explains the runs, all servos are fitted together, and then the
+    likeliest set is extended by further effects.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -139,6 +140,8 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         return base
     best = base if larger_sets else fit_filtered(context, current)
     for trial in _select_nearly_as_likely(context, larger_sets):
+        if not filters.act_where_forces_are_missing(trial.names):
+            continue
         best = select_more_likely(best, fit_filtered(context, trial))
         if search_control.is_over():
             break
@@ -360,8 +363,14 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         or context.evaluator.search_control.is_over()
     ):
         return best
-    proposed = [frozenset(start.effects) for start in context.proposals.of(filters.empty_set)]
-    if proposed and all(effects in search.models for effects in proposed):
+    proposed = [
+        frozenset(start.effects)
+        for start in context.proposals.of(filters.empty_set)
+        if filters.act_where_forces_are_missing(start.effects)
+    ]
+    if not proposed:
+        return best
+    if all(effects in search.models for effects in proposed):
         # Proposed effects that were fitted alone show how good a single effect can be.
         single = max(
             (search.models[effects] for effects in proposed),

@@ -49,6 +49,14 @@ MANY_SHAPES = frozenset(
     }
 )
 """Effects with many candidate shapes, tried only if simpler effects leave a force missing."""
+EFFECTS_AT_SEVERAL_JOINTS = frozenset({"joint.axis", "joint.coupling", "joint.zero"})
+"""Effects at a joint that change the forces at other joints as well."""
+MIN_MISSING_FORCE_SHARE = 0.05
+"""Minimum loss without the process noise of a joint at which a force is missing there.
+
+It is a share of the largest loss of all joints. If one effect is wrong at one joint, the losses at
+the others are below 0.001 of it.
+"""
 OFFSET_THRESHOLD = 10.0
 """Minimum difference of positions, as a multiple of the noise, that is an encoder offset."""
 
@@ -87,6 +95,38 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
         member.coordinate in joints or member.signal.partition(".")[2] in names
         for member in members_of(evaluator.available_effects[name])
     )
+
+
+def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
+    """Return the joint at which alone an effect changes the generalised force.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect.
+
+    Returns:
+        Index of the joint; None for effects at bodies and sensors, and of families, series joints
+        and joints of a kinematic loop, which change the forces at other joints as well.
+    """
+    member, *others = members_of(evaluator.available_effects[name])
+    if (
+        others
+        or member.coordinate is None
+        or member.hook == "sensor"
+        or member.of in EFFECTS_AT_SEVERAL_JOINTS
+        or is_series_effect(member)
+        or any(member.coordinate in group for group in _list_coupled_joints(evaluator))
+    ):
+        return None
+    joint: int = member.coordinate
+    return joint
+
+
+def _list_coupled_joints(evaluator: RunEvaluator) -> list[set[int]]:
+    """Return the groups of joints of a robot that constraints of its model couple."""
+    assert isinstance(evaluator.simulator, RobotSimulator)
+    velocities = evaluator.simulator.addresses.velocities.tolist()
+    return coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
 
 
 def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
@@ -148,9 +188,7 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     joints = {get_joint_name(evaluator, joint): joint for joint in range(count)}
     if place not in joints:
         return []
-    assert isinstance(evaluator.simulator, RobotSimulator)
-    velocities = evaluator.simulator.addresses.velocities.tolist()
-    groups = coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
+    groups = _list_coupled_joints(evaluator)
     others = {joint for group in groups if joints[place] in group for joint in group}
     names = [
         f"{law}@{get_joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})
@@ -299,6 +337,36 @@ class ModelFilters:
     def base(self) -> FollowedRuns:
         """The runs, followed with the base model."""
         return FollowedRuns.get_or_follow(self.evaluator, self.reference, self.noise)
+
+    @cached_property
+    def _joints_missing_force(self) -> set[int]:
+        """Joints at which the base model misses a force for certain.
+
+        It is empty if not all joints are measured, if the base moves or touches the ground, and if
+        servos reach their limits, where the linear model jumps.
+        """
+        base, evaluator = self.base, self.evaluator
+        joints = evaluator.simulator.system.coordinates
+        if (
+            base.force.size != len(joints)
+            or not set(joints) <= set(evaluator.channels)
+            or base.runs.jumps.any()
+        ):
+            return set()
+        losses = base.losses_without_force
+        is_missing = base.missing_forces & (losses > MIN_MISSING_FORCE_SHARE * losses.max())
+        return set(np.flatnonzero(is_missing).tolist())
+
+    def act_where_forces_are_missing(self, names: Iterable[str]) -> bool:
+        """Return whether effects act at all joints at which the base model misses a force.
+
+        If a force is missing at two joints, friction at one of them explains nothing alone.
+
+        Args:
+            names: names of the effects.
+        """
+        joints = [get_only_joint(self.evaluator, name) for name in names]
+        return None in joints or self._joints_missing_force <= set(joints)
 
     @property
     def empty_set(self) -> FilteredSet:

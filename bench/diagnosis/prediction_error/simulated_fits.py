@@ -67,8 +67,9 @@ def fit_by_simulation(
 
     If the residual is large, the fit is repeated with derivatives by the first states about the
     simulated motion, because those about the measured motion may be invalid. Dry friction is then
-    fitted again from nearby coefficients, because its fit may stop in a local minimum. An
-    incomplete set that leaves much of the discrepancy is not fitted again.
+    fitted again from nearby coefficients, because its fit may stop in a local minimum. A set that
+    leaves much of the discrepancy is not fitted again if it is incomplete, or if a force is missing
+    at a joint where none of its effects acts.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -85,6 +86,7 @@ def fit_by_simulation(
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
+    is_incomplete = is_incomplete or not context.filters.act_where_forces_are_missing(start.effects)
     if is_incomplete and not is_nearly_explained(context, fitted):
         return fitted
     derivatives_before = evaluator.state_derivatives

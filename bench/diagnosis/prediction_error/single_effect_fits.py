@@ -61,7 +61,8 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     Where a servo is at its limit or chatters, the cost is flat at the base model and steep far from
     it, so that a fit from the coefficient of a regression stays where it is. Each effect is
     therefore simulated at several factors of its proposed coefficient. This is skipped if one of
-    them explains the runs with the coefficient itself.
+    them explains the runs with the coefficient itself. Effects at one joint are left out if a force
+    is missing at another joint.
 
     Returns:
         Costs and starts with one effect each, in ascending order of the cost.
@@ -69,7 +70,9 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
     proposed = [
-        replace(start, initial_states=states) for start in context.proposals.of(filters.empty_set)
+        replace(start, initial_states=states)
+        for start in context.proposals.of(filters.empty_set)
+        if filters.act_where_forces_are_missing(start.effects)
     ]
     costs = select_lowest_of_each(context, proposed)
     if not _is_first_noise_like(context, costs):
@@ -159,7 +162,8 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """Fit each of the proposed effects alone, by simulation.
 
     A regression misjudges effects where a servo is at its limit, so the effects that are most
-    likely missing are fitted in one batch, and the best of them to convergence.
+    likely missing are fitted in one batch, and the best of them to convergence. Effects at one
+    joint are left out if a force is missing at another joint.
 
     Returns:
         The best model without effects that do not pay, or the base model if none explains the runs.
@@ -169,7 +173,13 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
+    starts = [
+        start
+        for start in context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
+        if filters.act_where_forces_are_missing(start.effects)
+    ]
+    if not starts:
+        return search.base_model
     fitted, best = list[FittedModel](), search.base_model
     for is_slow in (False, True):
         # Slow effects are fitted only if no other effect explains the runs.
