@@ -69,6 +69,11 @@ SETTLED_SHARE = 0.1
 """Minimum distance of a trial that is not improved, as a share of the gain of the best one."""
 MAX_FIRST_EFFECTS = 2
 """Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
+MAX_REMAINING_FORCE_SHARE = 0.7
+"""Maximum share of the missing force of some joint that an added effect leaves.
+
+The right second effect leaves 0.1 or less, and effects that imitate an unknown one 0.75 to 1.1.
+"""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
 
@@ -162,21 +167,24 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
 def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add one effect after another to a set, each time the one with the largest likelihood.
 
-    It stops if no effect is worth its penalty, if the filter lacks no force any more, or if a
-    simulation with the coefficients of the filter leaves little more than noise.
+    It stops if no effect is worth its penalty, if the filter lacks no force any more, if the last
+    effect replaces no missing force, or if a simulation with the coefficients of the filter leaves
+    little more than noise.
 
     Args:
         context: search, filters and regressions of the recording.
         current: the set to begin with; it may be empty.
     """
     for _ in range(MAX_STEPS - 1):
-        larger = (
-            _list_larger_that_pay(context, current) if current.followed.has_missing_force else []
-        )
+        missing = current.followed.missing_forces
+        larger = _list_larger_that_pay(context, current) if missing.any() else []
         if not larger:
             break
+        remaining = larger[0].followed.force[missing] / current.followed.force[missing]
         current = larger[0]
-        if has_noise_like_cost(context, make_filtered_start(context, current)):
+        # Effects that replace little of a force only imitate one that the library lacks.
+        is_imitation = remaining.min() > MAX_REMAINING_FORCE_SHARE
+        if is_imitation or has_noise_like_cost(context, make_filtered_start(context, current)):
             break
     return current
 
