@@ -5,6 +5,7 @@ Both have a limit of processor time and measure time and memory.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -80,6 +81,7 @@ class ExplainCall:
         from bench.diagnosis.explain import explain
 
         # Processor time beyond the limit kills this worker, which the runner notices.
+        _reset_peak_memory()
         before, begin = time.process_time(), time.perf_counter()
         _, hard = resource.getrlimit(resource.RLIMIT_CPU)
         resource.setrlimit(resource.RLIMIT_CPU, (int(before + self.cpu_limit) + 1, hard))
@@ -90,7 +92,7 @@ class ExplainCall:
             output = traceback.format_exc(limit=-4)
         finally:
             resource.setrlimit(resource.RLIMIT_CPU, (hard, hard))
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        memory = _read_peak_memory()
         seconds = time.process_time() - before, time.perf_counter() - begin
         return Outcome(verdict, 1 if output else 0, *seconds, memory, output)
 
@@ -130,6 +132,20 @@ class ExplainCall:
             max(used, usage.ru_utime + usage.ru_stime), wall,
             max(peak, usage.ru_maxrss / 1024), output,
         )  # fmt: skip
+
+
+def _reset_peak_memory():
+    """Reset the peak memory of this process, which answers one question after another (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _read_peak_memory():
+    """Return the peak memory of this process in MB; on other systems that of all questions."""
+    with contextlib.suppress(OSError):
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _without_candidates(document):

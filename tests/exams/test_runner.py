@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 from pkgutil import resolve_name
 
 import pandas as pd
@@ -38,6 +39,15 @@ def test_a_call_measures_the_time_of_all_processes(tmp_path):
     assert outcome.wall > 0.3
     # A child also counts the memory pages of its parent until it executes the command.
     assert outcome.memory > 5
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux counts the peak")
+def test_a_question_does_not_count_the_memory_of_the_one_before():
+    block = bytearray(200_000_000)
+    before = explain_calls._read_peak_memory()
+    del block
+    explain_calls._reset_peak_memory()
+    assert explain_calls._read_peak_memory() < before - 100.0
 
 
 def test_a_call_ends_at_the_limit_with_its_children(tmp_path):

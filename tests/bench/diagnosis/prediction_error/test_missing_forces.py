@@ -1,0 +1,159 @@
+"""The joints at which forces are missing decide which effects are fitted."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.explain import explain
+from bench.diagnosis.explain_options import ExplainOptions
+from bench.diagnosis.prediction_error import competing_models
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, get_only_joint
+from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+from bench.logs.recording_loading import load_joined
+
+EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
+ARM = """<mujoco model="arm">
+<option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body name="upper">
+  <joint name="shoulder" axis="0 1 0" damping="{shoulder}" armature="0.01"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.8"/>
+  <body name="lower" pos="0 0 -0.3">
+    <joint name="elbow" axis="0 1 0" damping="{elbow}" armature="0.01"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.5"/>
+  </body>
+</body></worldbody>
+<actuator>
+  <position name="m_shoulder" joint="shoulder" kp="40"/>
+  <position name="m_elbow" joint="elbow" kp="30"/>
+</actuator>
+</mujoco>"""
+DAMPING = {"shoulder": 0.1, "elbow": 0.1}
+"""Damping of the model file, N m s/rad."""
+
+
+def write_recording(folder, **damping):
+    """Record three runs in plain MuJoCo, with another damping than that of the model file."""
+    (folder / "arm.xml").write_text(ARM.format(**DAMPING))
+    model = mujoco.MjModel.from_xml_string(ARM.format(**DAMPING | damping))
+    rng = np.random.default_rng(8)
+    lines = ["run,t,u.m_shoulder,u.m_elbow,q.shoulder,q.elbow"]
+    for run in range(3):
+        data = mujoco.MjData(model)
+        phases = rng.uniform(0.0, 6.0, 4)
+        for sample in range(200):
+            t = 0.01 * sample
+            command = [
+                0.7 * np.sin(2.0 * t + phases[0]) + 0.2 * np.sin(5.1 * t + phases[1]),
+                0.8 * np.sin(2.7 * t + phases[2]) + 0.2 * np.sin(4.3 * t + phases[3]),
+            ]
+            if sample == 0:
+                data.qpos[:] = command
+            numbers = [*command, *(data.qpos + rng.normal(0.0, 1e-3, 2))]
+            lines.append(f"{run},{t:.2f}," + ",".join(f"{number:.8g}" for number in numbers))
+            data.ctrl[:] = command
+            for _ in range(5):
+                mujoco.mj_step(model, data)
+    path = folder / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    (folder / "log.toml").write_text(
+        'model = "arm.xml"\n'
+        + "".join(
+            f'[channels."q.{joint}"]\nunit = "rad"\nnoise = 0.001\n'
+            f'[inputs."u.m_{joint}"]\nunit = "rad"\n'
+            for joint in DAMPING
+        )
+    )
+    return path
+
+
+class _FiltersError(Exception):
+    """Carries the filters of a search out of `explain`."""
+
+
+def make_filters(monkeypatch, path):
+    """Return the filters of the search of a recording."""
+
+    def fail(search):
+        raise _FiltersError(search._search_context.filters)
+
+    monkeypatch.setattr(PredictionErrorSearch, "_search_effects", fail)
+    with pytest.raises(_FiltersError) as raised:
+        explain([path], ExplainOptions())
+    return raised.value.args[0]
+
+
+def test_effects_at_one_of_two_joints_do_not_act_where_forces_are_missing(monkeypatch, tmp_path):
+    filters = make_filters(monkeypatch, write_recording(tmp_path, shoulder=0.9, elbow=0.5))
+    act = filters.act_where_forces_are_missing
+    assert not act(["drag.linear@shoulder"])
+    assert not act(["drag.linear@elbow"])
+    assert not act(["friction.coulomb@elbow", "actuator.stiffness@m_elbow"])
+    assert act(["drag.linear@elbow", "actuator.stiffness@m_shoulder"])
+    assert act(["drag.linear@*"])
+    assert act(["mass.scale@lower"])
+
+
+def test_an_effect_at_the_joint_of_the_only_missing_force_acts_there(monkeypatch, tmp_path):
+    filters = make_filters(monkeypatch, write_recording(tmp_path, elbow=0.5))
+    assert filters.act_where_forces_are_missing(["drag.linear@elbow"])
+    assert not filters.act_where_forces_are_missing(["drag.linear@shoulder"])
+
+
+def test_wrong_dampings_of_two_joints_are_found(tmp_path):
+    path = write_recording(tmp_path, shoulder=0.9, elbow=0.3)
+    (cause,) = explain([path], ExplainOptions()).answer.causes
+    assert cause.effect == "drag.linear@*"
+    numbers = {name: number.value for name, number in cause.coefficients.items()}
+    assert numbers["coefficient@shoulder"] == pytest.approx(0.8, rel=0.02)
+    assert numbers["coefficient@elbow"] == pytest.approx(0.2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("effect", "joint"),
+    [
+        ("drag.linear@elbow", 1),
+        ("input.gain@m_shoulder", 0),
+        ("friction.hysteresis@shoulder", 0),
+        # They change the force at the other joint as well.
+        ("drag.linear@*", None),
+        ("joint.zero@elbow", None),
+        ("joint.flexibility@elbow", None),
+        ("mass.scale@forearm", None),
+        ("sensor.bias@q.elbow", None),
+        ("gravity.scale", None),
+    ],
+)
+def test_most_effects_at_a_joint_act_there_alone(effect, joint):
+    recording, kind = load_joined([EXAMPLE], None, None, ())
+    evaluator = RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
+    assert get_only_joint(evaluator, effect) == joint
+
+
+@pytest.mark.parametrize(
+    ("remaining_forces", "expected_size"),
+    [
+        # The second effect replaces the force at one of two joints, the third at the other.
+        ([[1.0, 0.05], [0.02, 0.05], [0.01, 0.05]], 4),
+        # The second effect replaces nothing, so no third one is added.
+        ([[0.9, 0.8], [0.1, 0.1], [0.1, 0.1]], 2),
+    ],
+)
+def test_a_set_grows_while_effects_replace_missing_forces(
+    monkeypatch, remaining_forces, expected_size
+):
+    missing = np.ones(2, dtype=bool)
+    forces = [np.ones(2), *(np.array(force) for force in remaining_forces)]
+    sets = [
+        FilteredSet(SimpleNamespace(force=force, missing_forces=missing), tuple("abcd"[: i + 1]))
+        for i, force in enumerate(forces)
+    ]
+    monkeypatch.setattr(
+        competing_models, "_list_larger_that_pay", lambda _, current: [sets[len(current.names)]]
+    )
+    monkeypatch.setattr(competing_models, "make_filtered_start", lambda *_: None)
+    monkeypatch.setattr(competing_models, "has_noise_like_cost", lambda *_: False)
+    assert len(competing_models._grow_set(None, sets[0]).names) == expected_size
