@@ -20,7 +20,7 @@ import numpy as np
 
 from sims.core.files import require_file
 from sims.core.plain_values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
-from sims.core.simulator import Array, InputError, make_read_only
+from sims.core.simulator import Array, InputError, make_read_only, similar
 from sims.core.toml_validation import format_value
 
 MIN_FAST_PARSE_BYTES = 1 << 20
@@ -265,8 +265,10 @@ class RecordingTable:
                 raise InputError(f"{self.path}, row 1: column {format_value(name)} is given twice")
         for name in self.wanted:
             if name not in header:
+                hint = similar(name, [n for n in header if n not in self.wanted])
                 raise InputError(
                     f"{self.path}: expected column '{name}', found columns {_join_names(header)}"
+                    f"{hint}"
                 )
         for name in header:
             if name not in self.wanted:

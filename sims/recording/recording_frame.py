@@ -238,6 +238,7 @@ class _FrameTable(RecordingTable):
                     raise InputError(
                         f"{self.path}: expected column '{column}', found columns "
                         f"{', '.join(map(str, frame.columns))}"
+                        f"{similar(column, map(str, frame.columns))}"
                     )
             columns[name] = source.combine(partial(self._get_values, name, frame))
         if sources.second != 1.0:

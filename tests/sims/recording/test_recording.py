@@ -446,6 +446,15 @@ def test_extra_columns_are_kept_with_their_units_and_gaps(tmp_path):
     np.testing.assert_array_equal(again.runs[0].extra["v_px"], [7.5, np.nan, np.nan])
 
 
+def test_a_misspelt_column_is_answered_with_the_nearest_name(tmp_path):
+    rows = [f"{row},0" for row in CSV.replace("run,t,x,u", "run,t,x,u,v_pz").splitlines()]
+    rows[0] = rows[0].removesuffix(",0")
+    path = written(tmp_path, csv="\n".join(rows) + "\n", toml=TOML + '[extra.v_px]\nunit = "px"\n')
+    message = r"expected column 'v_px', found columns run, t, x, u, v_pz; did you mean v_pz\?"
+    with pytest.raises(InputError, match=message):
+        read_recording(path, Cart)
+
+
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
