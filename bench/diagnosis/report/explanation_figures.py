@@ -85,6 +85,8 @@ SIGNIFICANCE_LEVEL = 0.05
 """Maximum p-value of a significant score. A candidate above it has a white bar without its p-value,
 and a note explains that.
 """
+MIN_SIMULATED_SHARE = 0.5
+"""Minimum share of candidates that were simulated on held-out runs for a panel of their own."""
 LOWEST_SHARE = -0.5
 """Lower limit of a share in the figure; for a failed model the exact value has no meaning."""
 POINTER = "▸ "
@@ -114,24 +116,29 @@ _ROW = 0.13
 _LINE = 0.145
 _BAR = 0.16
 _NAME_SIZE = 9
+_TEXT_SIZE = 8
+"""Size of the texts next to marks and bars, in points."""
 
 
 def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     """Draw the candidates, the highest score first.
 
     The left panel shows the share of the held-out gap that each closes alone, with its 95 %
-    interval, if any candidate was simulated on held-out runs. The right panel shows the score on
-    the fitted runs.
+    interval, if at least half of the candidates were simulated on held-out runs. The right panel
+    shows the score on the fitted runs; without a left panel, the shares are written next to it.
     """
     candidates = select_shown_candidates(report)
     names = [_format_candidate_name(report, candidate) for candidate in candidates]
-    has_shares = any(candidate.heldout_gain is not None for candidate in candidates)
+    simulated_count = sum(candidate.heldout_gain is not None for candidate in candidates)
+    has_shares = simulated_count >= MIN_SIMULATED_SHARE * len(candidates) > 0
 
     # Names of causes are bold, which is a little wider.
     left_margin = _EDGE + 0.12 + measure_text_width(names, _NAME_SIZE, "bold")
     shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
+    texts = [_format_score(report, candidate, not has_shares) for candidate in candidates]
+    texts_width = max(_SCORE_TEXTS_WIDTH, measure_text_width(texts, _TEXT_SIZE, "normal") + 0.1)
     # Width in inches; a title needs at least 7.
-    width = max(left_margin + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
+    width = max(left_margin + shares_width + _SCORES_WIDTH + texts_width + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
     row_height = _ROW + _LINE * count_max_lines(names)
     handles, labels = _make_legend(report)
@@ -144,7 +151,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     bottom, size = _BOTTOM / height, row_height * len(candidates) / height
     scores = axes[0, -1]
     scores.set_position(((left_margin + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
-    _draw_scores(scores, report, candidates, thickness=_BAR / row_height)
+    _draw_scores(scores, report, candidates, texts, _BAR / row_height)
     if has_shares:
         shares = axes[0, 0]
         shares.set_position((left_margin / width, bottom, _SHARES_WIDTH / width, size))
@@ -185,10 +192,16 @@ def _format_candidate_name(report: DiagnosisReportData, candidate: Candidate) ->
         text = POINTER + text
     if len(text) <= LINE_LENGTH:
         return text
-    # The place has its own lines.
     effect, separator, place = text.rpartition(" at ")
-    lines = textwrap.wrap(effect if separator else text, LINE_LENGTH)
-    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if separator else lines)
+    if not separator:
+        return "\n".join(textwrap.wrap(text, LINE_LENGTH))
+    lines = textwrap.wrap(effect, LINE_LENGTH)
+    place = f"at {place}"
+    # The place is not broken, and has its own line unless it follows a short last one.
+    if len(lines) > 1 and len(lines[-1]) + 1 + len(place) <= LINE_LENGTH:
+        lines[-1] += f" {place}"
+        return "\n".join(lines)
+    return "\n".join([*lines, break_name(place, LONGEST_LINE)])
 
 
 def _label_rows(
@@ -230,26 +243,24 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
             continue
         # Very negative shares are drawn at the edge; the text has the value.
         position = max(share, LOWEST_SHARE)
-        text = format_percent(share)
         interval = report.share_intervals.get(candidate.effect)
         if interval is not None:
             low, high = (max(end, LOWEST_SHARE) for end in interval)
             axis.plot([low, high], [row, row], color=NEUTRAL_MARK, linewidth=1.4, zorder=2)
             lowest = min(lowest, low)
-            text += f" ({' to '.join(format_percent(end)[:-2] for end in interval)})"
         lowest = min(lowest, position)
         marker_style = _DOTS[get_candidate_status(report, candidate.effect)]
         axis.plot(
             position, row, markeredgecolor=NEUTRAL_MARK, linestyle="", zorder=3, **marker_style
         )
         axis.annotate(
-            text,
+            _format_share(report, candidate, share),
             (1.0, row),
             (8, 0),
             xycoords=("axes fraction", "data"),
             textcoords="offset points",
             va="center",
-            fontsize=8,
+            fontsize=_TEXT_SIZE,
         )
     axis.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.6)
     axis.axvline(1.0, color=ZERO_LINE_GREY, linewidth=0.6, linestyle=":")
@@ -261,8 +272,43 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
     axis.set_title("Share of the gap closed, 95 % interval", fontsize=9.5, loc="left")
 
 
+def _format_share(report: DiagnosisReportData, candidate: Candidate, share: float) -> str:
+    """Format the share of the gap that a candidate closes, with its interval if there is one.
+
+    Args:
+        report: content of the report, with the intervals.
+        candidate: effect of the library.
+        share: its share of the held-out gap.
+    """
+    interval = report.share_intervals.get(candidate.effect)
+    if interval is None:
+        return format_percent(share)
+    ends = " to ".join(format_percent(end)[:-2] for end in interval)
+    return f"{format_percent(share)} ({ends})"
+
+
+def _format_score(report: DiagnosisReportData, candidate: Candidate, has_share: bool) -> str:
+    """Format the score of a candidate, with a p-value that is neither tiny nor insignificant.
+
+    Args:
+        report: content of the report.
+        candidate: effect of the library.
+        has_share: whether to add the share of the gap that it closes, if it was simulated.
+    """
+    text = format_number(candidate.score)
+    if MAX_UNPRINTED_P_VALUE < candidate.p_value <= SIGNIFICANCE_LEVEL:
+        text += f"  ({_format_p_value(candidate.p_value)})"
+    if has_share and candidate.heldout_gain is not None:
+        text += f", closes {_format_share(report, candidate, candidate.heldout_gain)} of the gap"
+    return text
+
+
 def _draw_scores(
-    axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], thickness: float
+    axis: Axes,
+    report: DiagnosisReportData,
+    candidates: Sequence[Candidate],
+    texts: Sequence[str],
+    thickness: float,
 ) -> None:
     """Draw the score of each candidate as a bar, which is twice the gain in log-likelihood.
 
@@ -272,11 +318,12 @@ def _draw_scores(
         axis: axes to draw on.
         report: content of the report.
         candidates: candidates that the figure shows, the first at the top.
+        texts: text next to the bar of each candidate.
         thickness: height of a bar in rows.
     """
     other_places = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
     longest_bar = 1e-9
-    for row, candidate in enumerate(candidates):
+    for row, (candidate, text) in enumerate(zip(candidates, texts, strict=True)):
         size = max(candidate.score, 0.0)
         bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
         if _is_insignificant(report, candidate):
@@ -292,16 +339,13 @@ def _draw_scores(
             markeredgewidth=1.0,
         )
         longest_bar = max(longest_bar, size, *other_scores)
-        text = format_number(candidate.score)
-        if MAX_UNPRINTED_P_VALUE < candidate.p_value <= SIGNIFICANCE_LEVEL:
-            text += f"  ({_format_p_value(candidate.p_value)})"
         axis.annotate(
             text,
             (max([size, *other_scores]), row),
             (5, 0),
             textcoords="offset points",
             va="center",
-            fontsize=8,
+            fontsize=_TEXT_SIZE,
             annotation_clip=False,
         )
     axis.set_xlim(0.0, longest_bar)
@@ -362,7 +406,7 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
     notes.append(f"{p_value_note}.")
     unsimulated_count = sum(candidate.heldout_gain is None for candidate in candidates)
     if 0 < unsimulated_count < len(candidates):
-        notes[1] += f" Without a mark: not simulated on {report.validation_runs}."
+        notes[1] += f" Without a share of the gap: not simulated on {report.validation_runs}."
     return notes
 
 

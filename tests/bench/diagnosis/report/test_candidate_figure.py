@@ -114,6 +114,18 @@ def test_each_candidate_says_how_much_it_closes_with_the_interval():
     assert any("held out: 2 runs, 800 samples of 2 channels" in text for text in texts)
 
 
+def test_few_shares_are_written_next_to_the_scores():
+    others = [row(f"my.effect_{i}", 40.0 - i) for i in range(3)]
+    drawn = draw_candidates_figure(
+        report_of(row("drag.linear", 300.0, share=0.93), *others, intervals=DRAG)
+    )
+    assert len(drawn.axes) == 1, "most rows of a panel of shares would be empty"
+    texts = words(drawn)
+    assert "300, closes 93 % (85 to 97) of the gap" in texts
+    assert any("Without a share of the gap: not simulated" in text for text in texts)
+    assert unreadable(drawn) == []
+
+
 def test_a_cause_stands_out_without_colour():
     drawn = draw_candidates_figure(report_of(row("drag.linear", 300.0), row("wind", 3.0)))
     cause, other = drawn.axes[0].get_yticklabels()
