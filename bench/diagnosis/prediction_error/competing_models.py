@@ -74,6 +74,8 @@ MAX_REMAINING_FORCE_SHARE = 0.7
 
 The right second effect leaves 0.1 or less, and effects that imitate an unknown one 0.75 to 1.1.
 """
+MAX_IMITATIONS = 2
+"""Number of effects in a row that replace no missing force after which no other is added."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
 
@@ -168,13 +170,14 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add one effect after another to a set, each time the one with the largest likelihood.
 
     It stops if no effect is worth its penalty, if the filter lacks no force any more, if the last
-    effect replaces no missing force, or if a simulation with the coefficients of the filter leaves
-    little more than noise.
+    two effects replace no missing force, or if a simulation with the coefficients of the filter
+    leaves little more than noise.
 
     Args:
         context: search, filters and regressions of the recording.
         current: the set to begin with; it may be empty.
     """
+    imitations = 0
     for _ in range(MAX_STEPS - 1):
         missing = current.followed.missing_forces
         larger = _list_larger_that_pay(context, current) if missing.any() else []
@@ -182,9 +185,13 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
             break
         remaining = larger[0].followed.force[missing] / current.followed.force[missing]
         current = larger[0]
-        # Effects that replace little of a force only imitate one that the library lacks.
+        # An effect that replaces little of a force imitates another one. The next may be the right
+        # one; if it is not, the library lacks it.
         is_imitation = remaining.min() > MAX_REMAINING_FORCE_SHARE
-        if is_imitation or has_noise_like_cost(context, make_filtered_start(context, current)):
+        imitations = imitations + 1 if is_imitation else 0
+        if imitations == MAX_IMITATIONS or has_noise_like_cost(
+            context, make_filtered_start(context, current)
+        ):
             break
     return current
 

@@ -58,6 +58,8 @@ COLLINEARITY_TOLERANCE = 1e-7
 """Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
 MIN_BETTER_RUN_SHARE = 0.5
 """Minimum share of the left-out runs that a larger set must predict better."""
+MIN_LEFT_OUT_GAIN = 1.0
+"""Minimum gain in left-out runs, in twice the log-likelihood, of a set that predicts better."""
 MIN_VISIBLE_GAIN = 7.0
 """Minimum gain of a column in twice the log-likelihood to be visible in the data."""
 RIDGE = 1e-10
@@ -294,7 +296,10 @@ class Regression:
         if len(self.products.totals) < 2:
             return True
         before, after = self._compute_left_out_rss(smaller), self._compute_left_out_rss(larger)
-        return bool(after.sum() < before.sum() and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
+        # An effect that acts in one run only predicts nothing in it from the others.
+        remaining = max(float(after.sum()), SMALLEST_RSS * self.total)
+        gain = self.compute_log_ratio(float(before.sum()), remaining)
+        return bool(gain > MIN_LEFT_OUT_GAIN and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
 
     def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs.

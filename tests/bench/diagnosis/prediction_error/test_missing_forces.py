@@ -138,8 +138,10 @@ def test_most_effects_at_a_joint_act_there_alone(effect, joint):
     [
         # The second effect replaces the force at one of two joints, the third at the other.
         ([[1.0, 0.05], [0.02, 0.05], [0.01, 0.05]], 4),
-        # The second effect replaces nothing, so no third one is added.
-        ([[0.9, 0.8], [0.1, 0.1], [0.1, 0.1]], 2),
+        # The second effect replaces nothing, but the third one does.
+        ([[0.9, 0.8], [0.9, 0.1], [0.1, 0.1]], 4),
+        # The second and the third effect replace nothing, so no fourth one is added.
+        ([[0.9, 0.8], [0.8, 0.7], [0.1, 0.1]], 3),
     ],
 )
 def test_a_set_grows_while_effects_replace_missing_forces(

@@ -75,6 +75,20 @@ def test_noise_selects_nothing_in_most_draws(rows):
     assert alarms <= 2
 
 
+def test_what_acts_in_one_run_alone_is_not_selected(rows):
+    rows[:3, :, 2] = 0.0
+    # Columns that do not overlap: the effect of one run changes no other coefficient.
+    rows[3, :, 1] = 0.0
+    target = rows @ np.array([0.0, 0.6, 3.0, 0.0, 0.0, 0.0]) + noise()
+    groups = singles()
+    regression = regression_of(rows, target, groups)
+    assert regression.gains([])[2] > 100.0
+    before = regression._compute_left_out_rss([groups[1]])
+    after = regression._compute_left_out_rss([groups[1], groups[2]])
+    np.testing.assert_allclose(after, before, rtol=1e-12)
+    assert not regression.generalises([groups[1]], [groups[1], groups[2]])
+
+
 def test_what_helps_one_run_alone_is_not_selected(rows):
     target = noise()
     target[0] += 3.0 * rows[0, :, 2]
