@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import fit_coefficients
+from tests.exams.coefficient_fit import fit_coefficients
 from tests.exams.planted.equivalent_causes import (
     FORMS,
     held_out_ratios,

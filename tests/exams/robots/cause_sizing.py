@@ -14,8 +14,8 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     compute_orthonormal_basis,
     compute_rms,
     find_strength_for_size,
-    fit_coefficients,
 )
+from tests.exams.coefficient_fit import fit_coefficients
 from tests.exams.robots import planted_effects
 from tests.exams.robots.reference_world import COARSE, World
 from tests.exams.robots.robot_signals import observed
