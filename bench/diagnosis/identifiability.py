@@ -280,27 +280,23 @@ class _IdentifiabilityAssessment:
 
         Effects that act at all places are represented by their members at single places.
         """
-        evaluator = self.evaluator
-        numbers = [
+        evaluator, candidates = self.evaluator, self.found.candidates
+        indices = [
             k
-            for k, probe in enumerate(self.found.candidates)
+            for k, probe in enumerate(candidates)
             if evaluator.available_effects[probe.effect].place != ALL_PLACES
         ]
+        switching_effects = {probe.effect for probe in candidates if probe.is_single_size}
         basis, _ = np.linalg.qr(self.parameters)
-        switching_effects = {
-            self.found.candidates[k].effect
-            for k in numbers
-            if self.found.candidates[k].is_single_size
-        }
         most_sensitive: dict[tuple[str, int], _Direction] = {}
-        for begin in range(0, len(numbers), CANDIDATES_PER_BLOCK):
-            block = numbers[begin : begin + CANDIDATES_PER_BLOCK]
+        for begin in range(0, len(indices), CANDIDATES_PER_BLOCK):
+            block = indices[begin : begin + CANDIDATES_PER_BLOCK]
             # 1. Information on each direction.
             columns = self._project_out_parameters(block, basis)
             norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
             # 2. A coefficient with several shapes is represented by the most sensitive one.
             for column, norm, k in zip(columns.T, norms.tolist(), block, strict=True):
-                probe = self.found.candidates[k]
+                probe = candidates[k]
                 if probe.effect in switching_effects and not probe.is_single_size:
                     continue
                 key = probe.effect, probe.coefficient_index

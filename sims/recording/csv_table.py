@@ -265,11 +265,7 @@ class RecordingTable:
                 raise InputError(f"{self.path}, row 1: column {format_value(name)} is given twice")
         for name in self.wanted:
             if name not in header:
-                hint = similar(name, [n for n in header if n not in self.wanted])
-                raise InputError(
-                    f"{self.path}: expected column '{name}', found columns {_join_names(header)}"
-                    f"{hint}"
-                )
+                raise self.make_missing_column_error(name, header)
         for name in header:
             if name not in self.wanted:
                 description = self.path.with_suffix(".toml").name
@@ -279,6 +275,18 @@ class RecordingTable:
                     "[inputs], [channels] or, if nothing reads it, [extra]"
                 )
         return header
+
+    def make_missing_column_error(self, name: str, found: Sequence[str]) -> InputError:
+        """Return an error that lists the columns, with the most similar one that is not declared.
+
+        Args:
+            name: name of the missing column.
+            found: names of the columns of the table.
+        """
+        hint = similar(name, [column for column in found if column not in self.wanted])
+        return InputError(
+            f"{self.path}: expected column '{name}', found columns {_join_names(found)}{hint}"
+        )
 
     def _check_row_widths(
         self, rows: list[list[str]], width: int, first_row: int

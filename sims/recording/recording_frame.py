@@ -235,11 +235,7 @@ class _FrameTable(RecordingTable):
         for name, source in places.items():
             for column in source.columns:
                 if column not in frame.columns:
-                    raise InputError(
-                        f"{self.path}: expected column '{column}', found columns "
-                        f"{', '.join(map(str, frame.columns))}"
-                        f"{similar(column, map(str, frame.columns))}"
-                    )
+                    raise self.make_missing_column_error(column, list(map(str, frame.columns)))
             columns[name] = source.combine(partial(self._get_values, name, frame))
         if sources.second != 1.0:
             columns["t"] = sources.second * columns["t"]

@@ -70,9 +70,9 @@ SETTLED_SHARE = 0.1
 MAX_FIRST_EFFECTS = 2
 """Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
 MAX_REMAINING_FORCE_SHARE = 0.7
-"""Maximum share of the missing force of some joint that an added effect leaves.
+"""Maximum share of a joint's missing force that remains when an added effect replaces it.
 
-The right second effect leaves 0.1 or less, and effects that imitate an unknown one 0.75 to 1.1.
+With the right effect 0.1 or less remains, and with effects that imitate another one 0.75 to 1.1.
 """
 MAX_IMITATIONS = 2
 """Number of effects in a row that replace no missing force after which no other is added."""
@@ -189,8 +189,9 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
         # one; if it is not, the library lacks it.
         is_imitation = remaining.min() > MAX_REMAINING_FORCE_SHARE
         imitations = imitations + 1 if is_imitation else 0
+        start = make_filtered_start(context, current)
         if imitations == MAX_IMITATIONS or has_noise_like_cost(
-            context, make_filtered_start(context, current)
+            context, select_lowest_of_each(context, [start])
         ):
             break
     return current
@@ -318,7 +319,7 @@ def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedMod
     """
     names = [f"{effect}@*" for effect in SERVO_MODEL]
     filters = context.filters
-    several = min(f.missing_forces.sum() for f in (filters.base, likeliest.followed)) > 1
+    several = all(f.missing_forces.sum() > 1 for f in (filters.base, likeliest.followed))
     if not several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
     return fit_filtered(
@@ -362,9 +363,10 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     """Return a model with one effect in place of several if it is as good.
 
     Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
-    few. If a model with several effects explains the runs, or nearly, the likeliest single effect
-    of those that were fitted alone, or else of the filters, is fitted too, with its competitors.
-    The model with the higher penalised log-likelihood is returned.
+    few. If a model with several effects explains the runs, or nearly, it is compared with the best
+    single effect and its competitors, and the model with the higher penalised log-likelihood is
+    returned. The single effect comes from the fits of all proposed effects by simulation; if they
+    were not all fitted, from filters.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -378,11 +380,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         or context.evaluator.search_control.is_over()
     ):
         return best
-    proposed = [
-        frozenset(start.effects)
-        for start in context.proposals.of(filters.empty_set)
-        if filters.act_where_forces_are_missing(start.effects)
-    ]
+    proposed = [frozenset(start.effects) for start in context.proposals.list_alone()]
     if not proposed:
         return best
     if all(effects in search.models for effects in proposed):

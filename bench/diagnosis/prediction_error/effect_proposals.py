@@ -107,6 +107,20 @@ class EffectProposals:
             for name, c in by_regression + joint_model[:max_joint_proposals]
         ]
 
+    def list_alone(self, max_joint_proposals: int = MAX_JOINT_PROPOSALS) -> list[FitStart]:
+        """Return models with one effect that may explain the runs alone.
+
+        Effects at one joint are left out if a force is missing at another joint.
+
+        Args:
+            max_joint_proposals: maximum number of effects of the joint and servo models.
+        """
+        return [
+            start
+            for start in self.of(self.filters.empty_set, max_joint_proposals)
+            if self.filters.act_where_forces_are_missing(start.effects)
+        ]
+
     def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
         """Return all proposals, with those of the joint and servo models in a separate list."""
         by_regression = self._propose_by_regression(current)

@@ -98,7 +98,7 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
 
 
 def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
-    """Return the joint at which alone an effect changes the generalised force.
+    """Return the single joint at which an effect changes the generalised force.
 
     Args:
         evaluator: the runs.
@@ -340,10 +340,10 @@ class ModelFilters:
 
     @cached_property
     def _joints_missing_force(self) -> set[int]:
-        """Joints at which the base model misses a force for certain.
+        """Joints at which the filter of the base model shows clearly that a force is missing.
 
-        It is empty if not all joints are measured, if the base moves or touches the ground, and if
-        servos reach their limits, where the linear model jumps.
+        The set is empty if not all joints are measured, if the base of the robot moves or stands on
+        the ground, or if servos reach their limits, where the linear model jumps.
         """
         base, evaluator = self.base, self.evaluator
         joints = evaluator.simulator.system.coordinates

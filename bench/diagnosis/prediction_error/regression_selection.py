@@ -37,11 +37,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.kalman.filter_and_smoother import IndexArray
 from bench.diagnosis.prediction_error.response_products import InnerProducts, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
@@ -51,8 +51,6 @@ from bench.diagnosis.search.score_test import (
     compute_explained_squares,
 )
 from sims.core.simulator import Array
-
-IndexArray = NDArray[np.intp]
 
 COLLINEARITY_TOLERANCE = 1e-7
 """Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
@@ -212,17 +210,13 @@ class Regression:
         """
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
-        squares, cross, rss = self._squares, self._cross, self.total
-        rows = np.zeros((columns.size, squares.size))
-        solved = np.zeros((columns.size, squares.size + 1))
-        if columns.size:
-            rows = self.products.select_rows(columns)
-            normal, scale = _normalise_gram(rows[:, columns])
-            rows = rows / scale[:, None]
-            solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
-            squares = squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
-            cross = cross - rows.T @ solved[:, -1]
-            rss, _ = self.solve(chosen)
+        squares, cross, (rss, _) = self._squares, self._cross, self.solve(chosen)
+        rows = self.products.select_rows(columns)
+        normal, scale = _normalise_gram(rows[:, columns])
+        rows = rows / scale[:, None]
+        solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
+        squares = squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
+        cross = cross - rows.T @ solved[:, -1]
         # Almost nothing of a collinear column remains after the projection.
         remains = squares > COLLINEARITY_TOLERANCE * self._squares
         contained_effects = set(self._list_contained_effects(chosen))

@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.diagnosis.kalman.filter_and_smoother import IndexArray
 from sims.core.simulator import Array
 
-IndexArray = NDArray[np.intp]
 SAMPLES_PER_BLOCK = 128
 """Number of samples that are converted to double precision together; they fit in the CPU cache."""
 
@@ -111,7 +111,7 @@ class ResponseProducts:
             responses: W (N, K) of each run.
             innovations: e (N,) of each run.
         """
-        self._responses = responses
+        self._responses, self._innovations = responses, innovations
         count = responses[0].shape[1]
         self.squares = np.zeros((len(responses), count))
         self.crosses = np.zeros((len(responses), count))
@@ -174,12 +174,10 @@ class ResponseProducts:
         Args:
             column: index of the column w; the new innovations are e + w.
         """
-        added = [responses[:, column].astype(np.float64) for responses in self._responses]
-        other = object.__new__(ResponseProducts)
-        other._responses, other._known_rows = self._responses, self._known_rows
-        row = np.zeros_like(self.crosses)
-        for run, samples, block in self._iterate_blocks():
-            row[run] += added[run][samples] @ block
-        other.squares, other.crosses = self.squares, self.crosses + row
-        other.totals = self.totals + 2.0 * self.crosses[:, column] + row[:, column]
-        return other
+        innovations = [
+            e + responses[:, column]
+            for responses, e in zip(self._responses, self._innovations, strict=True)
+        ]
+        products = ResponseProducts(self._responses, innovations)
+        products._known_rows = self._known_rows
+        return products

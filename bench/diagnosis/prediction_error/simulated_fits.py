@@ -185,15 +185,17 @@ def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) ->
     return list(best_of_each_set.values())
 
 
-def has_noise_like_cost(context: SearchContext, start: FitStart) -> bool:
-    """Return whether a start leaves little more than noise without any fit.
+def has_noise_like_cost(context: SearchContext, rated_starts: Sequence[RatedStart]) -> bool:
+    """Return whether the first start leaves little more than noise without any fit.
 
     Args:
         context: search, filters and regressions of the recording.
-        start: the start.
+        rated_starts: starts in ascending order of the cost; there may be none.
     """
-    ((cost, _),) = select_lowest_of_each(context, [start])
-    return cost < MAX_NOISE_LIKE_COST * int(context.filters.base.runs.recorded.sum())
+    if not rated_starts:
+        return False
+    sample_count = int(context.filters.base.runs.recorded.sum())
+    return rated_starts[0][0] < MAX_NOISE_LIKE_COST * sample_count
 
 
 def is_explained(context: SearchContext, model: FittedModel) -> bool:

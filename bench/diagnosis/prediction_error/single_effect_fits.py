@@ -24,10 +24,10 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
-    MAX_NOISE_LIKE_COST,
     RatedStart,
     fit_by_simulation,
     fit_nearby,
+    has_noise_like_cost,
     is_at_noise,
     is_explained,
     is_nearly_explained,
@@ -69,22 +69,12 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    proposed = [
-        replace(start, initial_states=states)
-        for start in context.proposals.of(filters.empty_set)
-        if filters.act_where_forces_are_missing(start.effects)
-    ]
+    proposed = [replace(start, initial_states=states) for start in context.proposals.list_alone()]
     costs = select_lowest_of_each(context, proposed)
-    if not _is_first_noise_like(context, costs):
+    if not has_noise_like_cost(context, costs):
         costs = _try_scaled(context, costs, SCANNED_FACTORS)
     limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
     return [(cost, start) for cost, start in costs if cost < limit]
-
-
-def _is_first_noise_like(context: SearchContext, costs: Sequence[RatedStart]) -> bool:
-    """Return whether the first cost, of a model without a fit, is nearly that of noise."""
-    sample_count = int(context.filters.base.runs.recorded.sum())
-    return bool(costs) and costs[0][0] < MAX_NOISE_LIKE_COST * sample_count
 
 
 def _try_scaled(
@@ -146,7 +136,7 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
     for likely_start in likely_starts[:MAX_SCANNED_FITS]:
         costs = [likely_start]
         for factors in CLOSER_FACTORS:
-            if not _is_first_noise_like(context, costs):
+            if not has_noise_like_cost(context, costs):
                 costs = _try_scaled(context, costs, factors)
         fitted = fit_by_simulation(context, costs[0][1])
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
@@ -173,11 +163,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    starts = [
-        start
-        for start in context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
-        if filters.act_where_forces_are_missing(start.effects)
-    ]
+    starts = context.proposals.list_alone(len(JOINT_MODEL + SERVO_MODEL))
     if not starts:
         return search.base_model
     fitted, best = list[FittedModel](), search.base_model
@@ -211,16 +197,14 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         The best model, or the base model if that is likelier.
     """
     starts: list[FitStart] = []
-    improved = [
+    small = [
         model
-        for model in sorted(fitted, key=lambda model: model.fit.cost)
+        for model in fitted
         if len(context.evaluator.get_coefficient_indices(model.effects[0])) <= MAX_IMPROVED_SIZE
     ]
-    for model in improved[:MAX_NEARBY]:
-        starts += [
-            model.fit.make_start(),
-            *list_nearby_starts(context, model, model.effects[0]),
-        ]
+    for model in sorted(small, key=lambda model: model.fit.cost)[:MAX_NEARBY]:
+        nearby_starts = list_nearby_starts(context, model, model.effects[0])
+        starts += [model.fit.make_start(), *nearby_starts]
     best = context.search.base_model
     for _, start in select_lowest_of_each(context, starts)[:MAX_REFINED]:
         refined = fit_by_simulation(context, start)

@@ -86,7 +86,7 @@ SIGNIFICANCE_LEVEL = 0.05
 and a note explains that.
 """
 MIN_SIMULATED_SHARE = 0.5
-"""Minimum share of candidates that were simulated on held-out runs for a panel of their own."""
+"""Minimum share of candidates simulated on held-out runs for which the left panel is drawn."""
 LOWEST_SHARE = -0.5
 """Lower limit of a share in the figure; for a failed model the exact value has no meaning."""
 POINTER = "▸ "
@@ -254,7 +254,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
             position, row, markeredgecolor=NEUTRAL_MARK, linestyle="", zorder=3, **marker_style
         )
         axis.annotate(
-            _format_share(report, candidate, share),
+            format_percent(share) + _format_interval(report, candidate),
             (1.0, row),
             (8, 0),
             xycoords=("axes fraction", "data"),
@@ -272,34 +272,34 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
     axis.set_title("Share of the gap closed, 95 % interval", fontsize=9.5, loc="left")
 
 
-def _format_share(report: DiagnosisReportData, candidate: Candidate, share: float) -> str:
-    """Format the share of the gap that a candidate closes, with its interval if there is one.
+def _format_interval(report: DiagnosisReportData, candidate: Candidate, prefix: str = "") -> str:
+    """Format the interval of a candidate's share of the gap; empty if there is none.
 
     Args:
         report: content of the report, with the intervals.
         candidate: effect of the library.
-        share: its share of the held-out gap.
+        prefix: text before the interval, in the brackets.
     """
     interval = report.share_intervals.get(candidate.effect)
     if interval is None:
-        return format_percent(share)
-    ends = " to ".join(format_percent(end)[:-2] for end in interval)
-    return f"{format_percent(share)} ({ends})"
+        return ""
+    return f" ({prefix}{' to '.join(format_percent(end)[:-2] for end in interval)})"
 
 
-def _format_score(report: DiagnosisReportData, candidate: Candidate, has_share: bool) -> str:
+def _format_score(report: DiagnosisReportData, candidate: Candidate, with_share: bool) -> str:
     """Format the score of a candidate, with a p-value that is neither tiny nor insignificant.
 
     Args:
         report: content of the report.
         candidate: effect of the library.
-        has_share: whether to add the share of the gap that it closes, if it was simulated.
+        with_share: whether to add the share of the gap that it closes, if it was simulated.
     """
     text = format_number(candidate.score)
     if MAX_UNPRINTED_P_VALUE < candidate.p_value <= SIGNIFICANCE_LEVEL:
         text += f"  ({_format_p_value(candidate.p_value)})"
-    if has_share and candidate.heldout_gain is not None:
-        text += f", closes {_format_share(report, candidate, candidate.heldout_gain)} of the gap"
+    if with_share and candidate.heldout_gain is not None:
+        text += f", closes {format_percent(candidate.heldout_gain)} of the gap"
+        text += _format_interval(report, candidate, "95 %: ")
     return text
 
 

@@ -121,7 +121,7 @@ def test_few_shares_are_written_next_to_the_scores():
     )
     assert len(drawn.axes) == 1, "most rows of a panel of shares would be empty"
     texts = words(drawn)
-    assert "300, closes 93 % (85 to 97) of the gap" in texts
+    assert "300, closes 93 % of the gap (95 %: 85 to 97)" in texts
     assert any("Without a share of the gap: not simulated" in text for text in texts)
     assert unreadable(drawn) == []
 
