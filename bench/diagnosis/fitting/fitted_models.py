@@ -192,6 +192,11 @@ class ModelSet:
         """React to a better fit of the effects `key`; a hook for subclasses, empty here."""
 
     @property
+    def has_contact_jumps(self) -> bool:
+        """True if simulated contacts may jump, so that a cost has several minima; False here."""
+        return False
+
+    @property
     def parameter_penalty(self) -> float:
         """Penalty log n of eq. (1), the merit, for each parameter that the data determine."""
         count = int(self.observed_mask.sum())

@@ -17,6 +17,10 @@ from sims.core.simulator import Array
 
 MIN_REPORTED_GAIN = -9.0
 """Lower limit of a candidate's reported share of the held-out gap; it only means "worse"."""
+NOISE_RATIO = 1.05
+"""Maximum ratio of an error to the noise at which the error is taken for noise."""
+ERROR_UNITS = ("m", "rad", "m/s", "rad/s")
+"""Units of motion, one of which an error may have if the usual unit shows none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +48,38 @@ class HeldOutGains:
 
     @cached_property
     def _channels(self) -> list[int]:
-        """Indices of the channels with the same unit as the channel that sensor effects act on."""
+        """Indices of the channels that count: those of one unit, since units cannot be added.
+
+        The unit is that of the channel on which sensor effects act. If the base model predicts
+        these channels to within the noise, it is the unit of the largest error instead: the pose of
+        a robot's base may not show what the encoder of a wheel shows.
+        """
         evaluator = self.result.runs.fitting
         units = [channel.unit for channel in evaluator.simulator.channels]
-        reading = evaluator.simulator.system.reading(evaluator.channels)
-        # Errors of different units cannot be added.
-        unit = units[evaluator.channels.index(reading)]
-        return [c for c, channel_unit in enumerate(units) if channel_unit == unit]
+        unit = units[
+            evaluator.channels.index(evaluator.simulator.system.reading(evaluator.channels))
+        ]
+        indices = {
+            one: [c for c, channel_unit in enumerate(units) if channel_unit == one]
+            for one in (unit, *units)
+        }
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
+        if runs is None or held_out_fits is None or () not in held_out_fits:
+            return indices[unit]
+        before = held_out_fits[()].simulated
+        ratios = {
+            one: _compute_rmse(runs, before, channels) / _compute_rms(self.noise_sigma[channels])
+            for one, channels in indices.items()
+            if one in (unit, *ERROR_UNITS)
+        }
+        largest = max(ratios, key=lambda one: ratios[one])
+        is_elsewhere = ratios[unit] < NOISE_RATIO < ratios[largest]
+        return indices[largest if is_elsewhere else unit]
 
     @property
     def _noise_floor(self) -> float:
         """RMS of the noise floor over the channels that count."""
-        sigma = self.noise_sigma[self._channels]
-        return float(np.sqrt(np.square(sigma).mean()))
+        return _compute_rms(self.noise_sigma[self._channels])
 
     def measure(self) -> HeldOutResult | None:
         """Measure by how much the causes improve the prediction of held-out runs.
@@ -163,4 +186,9 @@ def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]
     """
     observed_mask = np.isfinite(evaluator.observed)[..., channels]
     error = (evaluator.observed - simulated)[..., channels][observed_mask]
-    return float(np.sqrt(np.square(error).mean()))
+    return _compute_rms(error)
+
+
+def _compute_rms(values: Array) -> float:
+    """Return the root mean square of values of any shape."""
+    return float(np.sqrt(np.square(values).mean()))

@@ -36,8 +36,10 @@ from functools import cached_property
 
 import numpy as np
 
+from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.prediction_error.competing_models import (
     add_to_dry_friction,
     add_to_model,
@@ -75,6 +77,7 @@ from bench.diagnosis.prediction_error.servo_identification import (
     has_unknown_servos,
     identify_servos,
 )
+from bench.diagnosis.prediction_error.settled_simulations import refine_with_wide_differences
 from bench.diagnosis.prediction_error.simulated_fits import (
     RatedStart,
     fit_by_simulation,
@@ -329,6 +332,37 @@ class PredictionErrorSearch(EffectSearch):
         if self._should_continue(best):
             best = select_more_likely(best, select_in_model(context))
         return best
+
+    @property
+    def has_contact_jumps(self) -> bool:
+        """True for a robot on the ground."""
+        return self._search_context.filters.base.is_on_ground
+
+    def fit_to_convergence(self, model: FittedModel) -> FittedModel:
+        """Return the model fitted to final convergence.
+
+        For a robot on the ground, wide differences then replace the derivatives, since small ones
+        show the jumps of contacts and would make the intervals of the coefficients too narrow.
+
+        Args:
+            model: model whose coefficients are reported.
+        """
+        model = super().fit_to_convergence(model)
+        filters = self._search_context.filters
+        is_fitted = bool(model.effects) and np.isfinite(model.fit.cost)
+        if not is_fitted or not self.has_contact_jumps:
+            return model
+        fit = refine_with_wide_differences(
+            filters.get_similar_filter(model),
+            model.fit,
+            get_bounds_by_index(self.evaluator, model.effects),
+        )
+        cost = TrajectoryFitter(self.evaluator, self.noise).compute_cost(fit)
+        refined = self._rate_fit(replace(fit, cost=cost))
+        # Central differences would be small again.
+        self.refined_jacobians[id(refined.fit)] = refined.fit, refined.fit
+        self.models[frozenset(model.effects)] = refined
+        return refined
 
     def refit_first_states(self, model: FittedModel) -> FittedModel:
         """Fit a model that leaves more than noise again from better first states, if there are any.

@@ -5,17 +5,29 @@ explains (variable projection; G. Golub, V. Pereyra, Inverse Problems 19, 2003,
 doi:10.1088/0266-5611/19/2/201), with Q of `FirstStateFactors`:
 
     P r,    P = I - Q Q^T                                                                      (1)
+
+The simulated motion jumps slightly where a contact opens or closes, so that the derivative by a
+coefficient depends on the size of the difference: a small one shows jumps, which no data confirm.
+Reported coefficients c_k therefore have difference quotients over a wide change h_k, with the first
+states s fitted anew on both sides,
+
+    J_k = (y(c + h_k e_k, s+) - y(c - h_k e_k, s-)) / (2 h_k)                                  (2)
+
+and a Gauss-Newton step solves J d = r (implicit filtering; C. T. Kelley, Implicit Filtering, 2011,
+doi:10.1137/1.9781611971903, chapter 4).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.base_fit import Bounds
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 from sims.robot.dynamics.contact_states import KnownJacobians
@@ -26,6 +38,19 @@ MAX_REFINEMENTS = 3
 """Maximum number of Gauss-Newton steps of the coefficients before a fit."""
 MIN_DECREASE = 0.02
 """Minimum relative decrease of the sum of squares for another Gauss-Newton step."""
+TARGET_RESPONSE = 20.0
+"""Half the change of the simulation by a wide difference (2), as a norm in units of the noise.
+
+It is so large that jumps of contacts hardly contribute, and so small that the change is linear.
+"""
+MIN_RESPONSE, MAX_RESPONSE = 10.0, 40.0
+"""Range of this half change in which a difference is not chosen anew."""
+MAX_TRIED_DIFFERENCES = 3
+"""Maximum number of differences that are tried for one coefficient."""
+MAX_DIFFERENCE_RATIO = 5.0
+"""Maximum ratio of one tried difference to the one before."""
+MAX_WIDE_STEPS = 2
+"""Maximum number of Gauss-Newton steps with the difference quotients (2)."""
 
 
 @dataclass(frozen=True)
@@ -124,3 +149,106 @@ class SettledSimulations:
         rows[:, : samples * channels] = values.reshape(runs, -1, count)
         projected: Array = rows - bases @ (bases.transpose(0, 2, 1) @ rows)
         return projected
+
+
+def refine_with_wide_differences(
+    followed: FollowedRuns, fit: TrajectoryFit, bounds: Mapping[int, Bounds]
+) -> TrajectoryFit:
+    """Refine the coefficients of a robot on the ground by wide difference quotients (2).
+
+    Args:
+        followed: linearised model of the pieces, with parameters near those of the fit.
+        fit: fit with derivatives by small differences.
+        bounds: bounds of the refined coefficients, by index in theta.
+
+    Returns:
+        The fit with the difference quotients (2) as derivatives by these coefficients. Its
+        parameters and first states are those with the lowest sum of squares; its cost is not
+        computed anew. The given fit is returned if a simulation fails.
+    """
+    theta = fit.theta
+    states = _fit_first_states(followed, theta, fit.initial_states)
+    residual = followed.simulate_residuals(theta, states)
+    squares = _sum_squares(residual)
+    jacobian = fit.jacobian.copy()
+    columns, places = list[Array](), list[int]()
+    for column, place in enumerate(fit.free_indices.tolist()):
+        if place not in bounds:
+            continue
+        places.append(place)
+        norm = np.sqrt(_sum_squares(followed.scale_by_noise(fit.parameter_jacobian[..., column])))
+        quotient = _compute_wide_quotient(followed, theta, states, place, bounds[place], norm)
+        if not np.isfinite(quotient[np.isfinite(followed.evaluator.observed)]).all():
+            return fit
+        jacobian[..., column] = quotient
+        columns.append(np.nan_to_num(followed.scale_by_noise(quotient)).reshape(-1))
+    if not columns or not np.isfinite(squares):
+        return fit
+    derivatives = np.stack(columns, axis=1)
+    for _ in range(MAX_WIDE_STEPS):
+        step = np.linalg.lstsq(derivatives, np.nan_to_num(residual).reshape(-1), rcond=None)[0]
+        tried = theta.copy()
+        for place, change in zip(places, step.tolist(), strict=True):
+            tried[place] = np.clip(theta[place] + change, *bounds[place])
+        tried_states = _fit_first_states(followed, tried, states)
+        tried_residual = followed.simulate_residuals(tried, tried_states)
+        if not _sum_squares(tried_residual) < squares:
+            break
+        theta, states, residual = tried, tried_states, tried_residual
+        squares = _sum_squares(residual)
+    if squares > _sum_squares(followed.scale_by_noise(followed.evaluator.observed - fit.simulated)):
+        return replace(fit, jacobian=jacobian, is_own_jacobian=True)
+    return replace(
+        fit,
+        theta=theta,
+        initial_states=states,
+        simulated=followed.simulate(theta, states),
+        jacobian=jacobian,
+        is_own_jacobian=True,
+    )
+
+
+def _compute_wide_quotient(
+    followed: FollowedRuns, theta: Array, states: Array, place: int, bounds: Bounds, norm: float
+) -> Array:
+    """Compute the difference quotient (2) by one coefficient, (R, T, C).
+
+    Args:
+        followed: linearised model of the pieces.
+        theta: (P,) parameters.
+        states: (R, 2 D) first states.
+        place: index of the coefficient in theta.
+        bounds: bounds of the coefficient; the difference ends at them.
+        norm: norm of the derivative by small differences, in units of the noise, as a first guess.
+    """
+    low, high = bounds
+    half = float(TARGET_RESPONSE / max(norm, TARGET_RESPONSE / (high - low)))
+    for _ in range(MAX_TRIED_DIFFERENCES):
+        ends, simulated = [], []
+        for sign in (1.0, -1.0):
+            changed = theta.copy()
+            changed[place] = np.clip(theta[place] + sign * half, low, high)
+            ends.append(changed[place])
+            simulated.append(
+                followed.simulate(changed, _fit_first_states(followed, changed, states))
+            )
+        difference = simulated[0] - simulated[1]
+        quotient: Array = difference / max(ends[0] - ends[1], np.finfo(float).tiny)
+        response = 0.5 * np.sqrt(_sum_squares(followed.scale_by_noise(difference)))
+        if MIN_RESPONSE < response < MAX_RESPONSE or not np.isfinite(response):
+            break
+        factor = TARGET_RESPONSE / max(response, TARGET_RESPONSE / MAX_DIFFERENCE_RATIO)
+        half *= max(factor, 1.0 / MAX_DIFFERENCE_RATIO)
+    return quotient
+
+
+def _fit_first_states(followed: FollowedRuns, theta: Array, states: Array) -> Array:
+    """Return first states (R, 2 D) fitted for other parameters, with settled contacts."""
+    settled = followed.settle(theta, states, is_other_geometry=True)
+    return followed.improve_first_states(theta, settled)
+
+
+def _sum_squares(values: Array) -> float:
+    """Return the sum of squares over all samples that are present; infinite if it overflows."""
+    total = float(np.nansum(np.square(values)))
+    return total if np.isfinite(total) else np.inf

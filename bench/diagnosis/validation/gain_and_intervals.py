@@ -10,6 +10,17 @@ generalised least squares). With the whitened Jacobian J_r = [A_r B_r] by parame
 states, and the prior standard deviation sigma_0 of the initial states,
 
     covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (2)
+
+Simulated contacts jump, so that the sum of squares of a run has several minima, and the estimates
+of single runs scatter more than noise explains. With the gradient g_r of run r and the covariance C
+of (2), the scatter of R runs gives the variances
+
+    diag(C sum_r g_r g_r' C) R / (R - 1)                                                       (3)
+    g_r = A_r' e_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' e_r
+
+for whitened residuals e_r, which replace smaller ones of C (H. White, Econometrica 50, 1, 1982,
+doi:10.2307/1912526; for groups of samples: K.-Y. Liang, S. Zeger, Biometrika 73, 13, 1986,
+doi:10.1093/biomet/73.1.13).
 """
 
 from __future__ import annotations
@@ -200,7 +211,39 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     schur_complement, _ = compute_schur_complement(
         parameter_curvature, fisher_blocks.cross, fisher_blocks.states
     )
-    return invert_scaled(parameter_curvature, schur_complement)
+    covariance = invert_scaled(parameter_curvature, schur_complement)
+    if not models.has_contact_jumps or len(fisher_blocks.parameters) == 1:
+        return covariance
+    # Only robots on the ground need this import, which takes long.
+    from scipy.special import stdtrit
+
+    scores = _compute_run_scores(models, model, fisher_blocks)
+    count = len(scores)
+    scattered = np.square(scores @ covariance).sum(axis=0) * count / (count - 1)  # (3)
+    # Few runs estimate their scatter poorly, so that its quantile is that of Student's t.
+    scattered *= np.square(stdtrit(count - 1, 0.975) / Z95)
+    variances = np.maximum(np.diagonal(covariance), np.finfo(float).tiny)
+    factors = np.sqrt(np.maximum(scattered / variances, 1.0))
+    widened: Array = covariance * np.outer(factors, factors)
+    return widened
+
+
+def _compute_run_scores(models: ModelSet, model: FittedModel, blocks: FisherBlocks) -> Array:
+    """Compute the gradients g_r of (3) by the q parameters, (R, q), one row for each run.
+
+    Args:
+        models: the models, with the runs to which they are fitted.
+        model: fitted model.
+        blocks: its curvature blocks.
+    """
+    mask = np.isfinite(models.evaluator.observed)
+    residual = np.where(mask, models.compute_residual(model.fit), 0.0)
+    whitened = whiten(residual[..., None], mask, blocks.noise).reshape(len(residual), -1, 1)
+    products = np.matmul(blocks.jacobian.transpose(0, 2, 1), whitened)
+    q = blocks.parameters.shape[1]
+    by_states = np.linalg.solve(blocks.states, products[:, q:])
+    scores: Array = (products[:, :q] - blocks.cross @ by_states)[..., 0]
+    return scores
 
 
 def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:

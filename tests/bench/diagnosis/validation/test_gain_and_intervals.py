@@ -272,3 +272,36 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
     assert right.penalised_log_likelihood == pytest.approx(likeliest - 6 * np.log(count), abs=1.0)
     assert failed.penalised_log_likelihood == -np.inf
     assert np.isnan(failed.simulated).all()
+
+
+class SearchWithJumps(EffectSearch):
+    """Search of a robot whose simulated contacts may jump."""
+
+    has_contact_jumps = True
+
+
+@pytest.mark.parametrize(
+    ("search_class", "expected"), [(SearchWithJumps, True), (EffectSearch, False)]
+)
+def test_intervals_by_the_scatter_of_runs_cover_the_mean(search_class, expected):
+    """Check 95 % intervals of a mass that scatters between 6 runs by more than noise explains."""
+    times, rng, held = np.arange(120) / 60, np.random.default_rng(21), []
+    push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
+    made = recorded(
+        Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})] * 6, times
+    )
+    there = evaluator(made, candidates=[])
+    runs, states = np.arange(6), there.initial_state_guesses
+    noise = autoregressive(there, 0.004, 0.0)
+    for _ in range(50):
+        masses = rng.normal(1.3, 0.06, size=(6, 1))
+        clean = there.simulate(masses, runs, states)
+        there.observed[...] = clean + 0.004 * rng.normal(size=clean.shape)
+        fit = TrajectoryFitter(there, noise).fit_models(
+            [FitStart((), np.array([1.3]), states)], 12
+        )[0]
+        search = search_class(there, noise, frozenset(), rng, marked(there, True))
+        _, low, high = compute_intervals(search, search.add_fit(fit))[0]
+        held.append(low <= 1.3 <= high)
+    assert (np.mean(held) >= 0.88) == expected
+    assert expected or np.mean(held) < 0.6
