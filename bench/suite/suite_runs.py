@@ -50,8 +50,10 @@ CELL_COLUMNS = [
 ]
 TRAINING_COLUMNS = ["cell", "tuner", "fit_simulations", "fit_seconds"]
 SKIPPED_COLUMNS = ["tuner", "reason"]
-_STORED_DIGITS = 4
-"""Significant digits of stored errors."""
+_STORED_DIGITS, _FORMER_DIGITS = 3, 4
+"""Significant digits of stored errors, and those of files that do not state them."""
+_DIGITS_KEY = b"significant_digits"
+"""Key of the number of digits in the metadata of the file."""
 _SECONDS_DIGITS = 2
 """Decimals of stored seconds."""
 _ERRORS_COLUMNS = ("lengths", "mantissas", "exponents")
@@ -314,7 +316,7 @@ def merge_runs(new_runs: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
 
 
 def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
-    """Write runs in the stored form; errors are rounded to four significant digits.
+    """Write runs in the stored form; errors are rounded to three significant digits.
 
     Args:
         suite: runs.
@@ -332,6 +334,8 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     )
     for name, column in _encode_errors(suite.errors).items():
         table = table.append_column(name, column)
+    digits = {_DIGITS_KEY: str(_STORED_DIGITS).encode()}
+    table = table.replace_schema_metadata({**(table.schema.metadata or {}), **digits})
     with atomic_replacement(folder / CURVES_FILE) as path:
         # Few errors occur twice, so that a dictionary of them takes more space than it saves. Each
         # column is one page, because columns are compressed page by page.
@@ -387,7 +391,8 @@ def _decode_errors(table: Any) -> Array:
     lengths, mantissas, exponents = (
         table[name].combine_chunks().flatten().to_numpy() for name in _ERRORS_COLUMNS
     )
-    values = mantissas * 10.0 ** (exponents.astype(np.float64) - _STORED_DIGITS + 1)
+    digits = int((table.schema.metadata or {}).get(_DIGITS_KEY, _FORMER_DIGITS))
+    values = mantissas * 10.0 ** (exponents.astype(np.float64) - digits + 1)
     values[exponents == _MISSING], values[exponents == _FAILED] = np.nan, np.inf
     errors: Array = np.repeat(values, lengths).reshape(len(table), -1)
     return errors
