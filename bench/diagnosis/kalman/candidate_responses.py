@@ -840,6 +840,16 @@ class FollowedRuns:
                 break
         return states
 
+    def fit_settled_states(self, theta: Array, states: Array) -> Array:
+        """Return first states (R, 2 D) fitted for other parameters, with settled contacts.
+
+        Args:
+            theta: (P,) parameters of the model, perhaps of another geometry.
+            states: (R, 2 D) first states for parameters nearby.
+        """
+        settled = self.settle(theta, states, is_other_geometry=True)
+        return self.improve_first_states(theta, settled)
+
     def simulate(self, theta: Array, states: Array) -> Array:
         """Simulate all runs (R, T, C) of a robot on the ground from given first states.
 

@@ -56,25 +56,24 @@ class HeldOutGains:
         """
         evaluator = self.result.runs.fitting
         units = [channel.unit for channel in evaluator.simulator.channels]
-        unit = units[
-            evaluator.channels.index(evaluator.simulator.system.reading(evaluator.channels))
-        ]
+        reading = evaluator.simulator.system.reading(evaluator.channels)
+        usual_unit = units[evaluator.channels.index(reading)]
         indices = {
-            one: [c for c, channel_unit in enumerate(units) if channel_unit == one]
-            for one in (unit, *units)
+            unit: [c for c, channel_unit in enumerate(units) if channel_unit == unit]
+            for unit in units
+            if unit in (usual_unit, *ERROR_UNITS)
         }
-        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
-        if runs is None or held_out_fits is None or () not in held_out_fits:
-            return indices[unit]
+        runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits or {}
+        if runs is None or () not in held_out_fits:
+            return indices[usual_unit]
         before = held_out_fits[()].simulated
         ratios = {
-            one: _compute_rmse(runs, before, channels) / _compute_rms(self.noise_sigma[channels])
-            for one, channels in indices.items()
-            if one in (unit, *ERROR_UNITS)
+            unit: _compute_rmse(runs, before, channels) / _compute_rms(self.noise_sigma[channels])
+            for unit, channels in indices.items()
         }
-        largest = max(ratios, key=lambda one: ratios[one])
-        is_elsewhere = ratios[unit] < NOISE_RATIO < ratios[largest]
-        return indices[largest if is_elsewhere else unit]
+        largest = max(ratios, key=lambda unit: ratios[unit])
+        is_elsewhere = ratios[usual_unit] < NOISE_RATIO < ratios[largest]
+        return indices[largest if is_elsewhere else usual_unit]
 
     @property
     def _noise_floor(self) -> float:

@@ -513,8 +513,7 @@ class ModelFilters:
             return start
         states = followed.improved_first_states
         refined = SettledSimulations(followed, states).refine(start)
-        settled = followed.settle(refined.theta, states, is_other_geometry=True)
-        refined_states = followed.improve_first_states(refined.theta, settled)
+        refined_states = followed.fit_settled_states(refined.theta, states)
         cost = followed.compute_squares(start.theta, states).sum()
         if followed.compute_squares(refined.theta, refined_states).sum() < cost:
             start, states = refined, refined_states

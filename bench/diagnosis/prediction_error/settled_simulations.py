@@ -167,7 +167,7 @@ def refine_with_wide_differences(
         computed anew. The given fit is returned if a simulation fails.
     """
     theta = fit.theta
-    states = _fit_first_states(followed, theta, fit.initial_states)
+    states = followed.fit_settled_states(theta, fit.initial_states)
     residual = followed.simulate_residuals(theta, states)
     squares = _sum_squares(residual)
     jacobian = fit.jacobian.copy()
@@ -190,7 +190,7 @@ def refine_with_wide_differences(
         tried = theta.copy()
         for place, change in zip(places, step.tolist(), strict=True):
             tried[place] = np.clip(theta[place] + change, *bounds[place])
-        tried_states = _fit_first_states(followed, tried, states)
+        tried_states = followed.fit_settled_states(tried, states)
         tried_residual = followed.simulate_residuals(tried, tried_states)
         if not _sum_squares(tried_residual) < squares:
             break
@@ -230,22 +230,19 @@ def _compute_wide_quotient(
             changed[place] = np.clip(theta[place] + sign * half, low, high)
             ends.append(changed[place])
             simulated.append(
-                followed.simulate(changed, _fit_first_states(followed, changed, states))
+                followed.simulate(changed, followed.fit_settled_states(changed, states))
             )
         difference = simulated[0] - simulated[1]
         quotient: Array = difference / max(ends[0] - ends[1], np.finfo(float).tiny)
         response = 0.5 * np.sqrt(_sum_squares(followed.scale_by_noise(difference)))
         if MIN_RESPONSE < response < MAX_RESPONSE or not np.isfinite(response):
             break
-        factor = TARGET_RESPONSE / max(response, TARGET_RESPONSE / MAX_DIFFERENCE_RATIO)
-        half *= max(factor, 1.0 / MAX_DIFFERENCE_RATIO)
+        # Inverted, because the response may be zero.
+        share = np.clip(
+            response / TARGET_RESPONSE, 1.0 / MAX_DIFFERENCE_RATIO, MAX_DIFFERENCE_RATIO
+        )
+        half /= float(share)
     return quotient
-
-
-def _fit_first_states(followed: FollowedRuns, theta: Array, states: Array) -> Array:
-    """Return first states (R, 2 D) fitted for other parameters, with settled contacts."""
-    settled = followed.settle(theta, states, is_other_geometry=True)
-    return followed.improve_first_states(theta, settled)
 
 
 def _sum_squares(values: Array) -> float:

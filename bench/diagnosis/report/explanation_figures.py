@@ -273,7 +273,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
 
 
 def _format_interval(report: DiagnosisReportData, candidate: Candidate, prefix: str = "") -> str:
-    """Format the interval of a candidate's share of the gap; empty if there is none.
+    """Format the interval of a candidate's share of the gap; empty without one.
 
     Args:
         report: content of the report, with the intervals.

@@ -199,6 +199,10 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     derivatives A_r of run r by parameters and B_r by its initial state, whose prior has the
     standard deviation sigma_0.
 
+    If simulated contacts jump, larger variances by the scatter of the runs (3) replace those of
+    (2). They are scaled so that the quantile of a normal distribution gives the interval by
+    Student's t.
+
     Shapes: q fitted parameters.
 
     Args:
@@ -220,7 +224,7 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     scores = _compute_run_scores(models, model, fisher_blocks)
     count = len(scores)
     scattered = np.square(scores @ covariance).sum(axis=0) * count / (count - 1)  # (3)
-    # Few runs estimate their scatter poorly, so that its quantile is that of Student's t.
+    # Few runs estimate their scatter poorly.
     scattered *= np.square(stdtrit(count - 1, 0.975) / Z95)
     variances = np.maximum(np.diagonal(covariance), np.finfo(float).tiny)
     factors = np.sqrt(np.maximum(scattered / variances, 1.0))
@@ -236,9 +240,8 @@ def _compute_run_scores(models: ModelSet, model: FittedModel, blocks: FisherBloc
         model: fitted model.
         blocks: its curvature blocks.
     """
-    mask = np.isfinite(models.evaluator.observed)
-    residual = np.where(mask, models.compute_residual(model.fit), 0.0)
-    whitened = whiten(residual[..., None], mask, blocks.noise).reshape(len(residual), -1, 1)
+    residual = models.compute_residual(model.fit)[..., None]
+    whitened = whiten(residual, models.observed_mask, blocks.noise).reshape(len(residual), -1, 1)
     products = np.matmul(blocks.jacobian.transpose(0, 2, 1), whitened)
     q = blocks.parameters.shape[1]
     by_states = np.linalg.solve(blocks.states, products[:, q:])

@@ -40,12 +40,8 @@ class JumpingRuns:
     def scale_by_noise(self, values):
         return values / SIGMA
 
-    def settle(self, theta, states, is_other_geometry=False):
-        assert is_other_geometry
+    def fit_settled_states(self, theta, states):
         self.simulated.append(theta.copy())
-        return states
-
-    def improve_first_states(self, theta, states):
         return states
 
     def make_fit(self, theta):
