@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from sims import effects as library
 from sims.core import files
+from sims.core.document_fields import OPTIONAL
 from sims.core.simulator import InputError, Parameter, Simulator
 from sims.core.toml_validation import (
     check_finite,
@@ -83,11 +84,11 @@ class FittedValue:
     unit: str
     low: float | None
     high: float | None
-    at_bound: Literal["low", "high"] | None = None
-    stated: float | None = None
-    total: float | None = None
-    total_unit: str = ""
-    usual_range: tuple[float, float] | None = None
+    at_bound: Literal["low", "high"] | None = field(default=None, metadata=OPTIONAL)
+    stated: float | None = field(default=None, metadata=OPTIONAL)
+    total: float | None = field(default=None, metadata=OPTIONAL)
+    total_unit: str = field(default="", metadata=OPTIONAL)
+    usual_range: tuple[float, float] | None = field(default=None, metadata=OPTIONAL)
 
     @property
     def is_result(self) -> bool:

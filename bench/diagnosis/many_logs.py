@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import StringIO
 from math import nan
 from pathlib import Path
@@ -25,6 +25,7 @@ from bench.diagnosis.report.effect_and_unit_text import append_unit, format_labe
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.logs.recording_loading import compute_recording_digest, make_log_names, read_content
 from bench.pages.text_format import format_csv
+from sims.core.document_fields import Document
 from sims.core.files import check_folder_empty, get_first_line, write_atomically
 from sims.core.simulator import InputError
 
@@ -37,7 +38,7 @@ LOG_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class LogResult:
+class LogResult(Document):
     """Result of one log.
 
     Attributes:
@@ -345,7 +346,7 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
         check_folder_empty(out)
         return {}
     try:
-        stored_results = [LogResult(**row) for row in json.loads(path.read_text())]
+        stored_results = [LogResult.from_document(row) for row in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
         raise InputError(f"{path}: was not written by simgap; name another folder") from None
     by_name = {row.log: row for row in stored_results}
@@ -371,7 +372,7 @@ def _write_results(out: Path, rows: Sequence[LogResult]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(
-            out / BATCH_STATE_FILE, json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+            out / BATCH_STATE_FILE, json.dumps([row.to_document() for row in rows], indent=1) + "\n"
         )
         write_atomically(out / LOGS_TABLE_FILE, format_log_table(rows))
     except OSError as error:

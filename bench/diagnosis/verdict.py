@@ -1,10 +1,12 @@
-"""Verdict: the result of explain, as an object and as verdict.json."""
+"""Verdict: the result of explain, as an object and as verdict.json.
+
+The fields of each class are the keys of its entry in verdict.json, in this order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,13 +20,12 @@ from bench.diagnosis.search.verdict_rules import (
     VERDICT_MEANINGS,
     VerdictName,
 )
+from sims.core.document_fields import OPTIONAL, Document
 from sims.extended_simulator import FittedValue
-
-JsonDocument = dict[str, Any]
 
 
 @dataclass(frozen=True, repr=False)
-class Cause:
+class Cause(Document):
     """Effect that the simulator lacks.
 
     Attributes:
@@ -42,7 +43,7 @@ class Cause:
     says: str
     coefficients: Mapping[str, FittedValue]
     p_value: float
-    form: str | None = None
+    form: str | None = field(default=None, metadata=OPTIONAL)
 
     @property
     def open_numbers(self) -> dict[str, FittedValue]:
@@ -54,29 +55,6 @@ class Cause:
             return {}
         return {name: n for name, n in self.coefficients.items() if not n.is_result}
 
-    def to_document(self) -> JsonDocument:
-        """Return the cause as in verdict.json."""
-        return {
-            "effect": self.effect,
-            "alternatives": list(self.alternatives),
-            "says": self.says,
-            "coefficients": _convert_estimates(self.coefficients),
-            "p_value": self.p_value,
-            **({"form": self.form} if self.form is not None else {}),
-        }
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> Cause:
-        """Build a cause from its entry in verdict.json."""
-        return cls(
-            document["effect"],
-            tuple(document["alternatives"]),
-            document["says"],
-            _read_estimates(document["coefficients"]),
-            document["p_value"],
-            document.get("form"),
-        )
-
     def __repr__(self) -> str:
         names = " or ".join([self.effect, *self.alternatives])
         numbers = [
@@ -86,7 +64,7 @@ class Cause:
 
 
 @dataclass(frozen=True, repr=False)
-class HeldOutResult:
+class HeldOutResult(Document):
     """Errors on held-out runs, or on runs left out in turn (cross-validation).
 
     Cross-validation is used for recordings of two or three runs without marked ones. A value that
@@ -110,18 +88,6 @@ class HeldOutResult:
     high: float | None
     unit: str = ""
 
-    def to_document(self) -> JsonDocument:
-        """Return the errors as in verdict.json, with null where there is no number."""
-        numbers = {
-            "rmse_base": self.rmse_base,
-            "rmse_extended": self.rmse_extended,
-            "noise_floor": self.noise_floor,
-            "gap_closed": self.gap_closed,
-            "low": self.low,
-            "high": self.high,
-        }
-        return {**numbers, "unit": self.unit}
-
     def __repr__(self) -> str:
         before, after = _format_number(self.rmse_base), _format_number(self.rmse_extended)
         change = f"{before} -> {after} {self.unit}".rstrip()
@@ -131,7 +97,7 @@ class HeldOutResult:
 
 
 @dataclass(frozen=True, repr=False)
-class Candidate:
+class Candidate(Document):
     """Effect of the library with the evidence for it about the base model.
 
     Attributes:
@@ -147,21 +113,12 @@ class Candidate:
     p_value: float
     heldout_gain: float | None
 
-    def to_document(self) -> JsonDocument:
-        """Return the candidate as in verdict.json."""
-        return {
-            "effect": self.effect,
-            "score": self.score,
-            "p_value": self.p_value,
-            "heldout_gain": self.heldout_gain,
-        }
-
     def __repr__(self) -> str:
         return f"Candidate({self.effect}: score {self.score:.3g}, p {self.p_value:.2g})"
 
 
 @dataclass(frozen=True)
-class RecordingFault:
+class RecordingFault(Document):
     """Wrong unit or reversed sign of recorded signals that explains nearly all of the misfit.
 
     Attributes:
@@ -185,28 +142,9 @@ class RecordingFault:
     error_after: float | None
     alternatives: tuple[str, ...] = ()
 
-    def document(self) -> JsonDocument:
-        """Return the fault as in verdict.json."""
-        return {
-            "signals": list(self.signals),
-            "factor": self.factor,
-            "unit": self.unit,
-            "says": self.says,
-            "lines": list(self.lines),
-            "error_before": self.error_before,
-            "error_after": self.error_after,
-            "alternatives": list(self.alternatives),
-        }
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> RecordingFault:
-        """Build a fault from its entry in verdict.json."""
-        lists = ("signals", "lines", "alternatives")
-        return cls(**{**document, **{name: tuple(document[name]) for name in lists}})
-
 
 @dataclass(frozen=True, repr=False)
-class Verdict:
+class Verdict(Document):
     """Verdict of explain.
 
     Attributes:
@@ -240,8 +178,8 @@ class Verdict:
     simulations: int
     seconds: float
     cut: EarlyStop | None = None
-    recording_faults: tuple[RecordingFault, ...] = ()
-    recording_notes: tuple[str, ...] = ()
+    recording_faults: tuple[RecordingFault, ...] = field(default=(), metadata=OPTIONAL)
+    recording_notes: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
 
     @property
     def meaning(self) -> str:
@@ -275,52 +213,6 @@ class Verdict:
             if number.at_bound is not None and not number.is_result
         }
 
-    def to_document(self) -> JsonDocument:
-        """Return the content of verdict.json."""
-        # The keys keep the order of the documentation and of older files.
-        next_run = self.next_experiment
-        faults = [fault.document() for fault in self.recording_faults]
-        return {
-            "verdict": self.verdict,
-            "system": self.system,
-            "engine": self.engine,
-            "causes": [cause.to_document() for cause in self.causes],
-            "parameters": _convert_estimates(self.parameters),
-            "heldout": self.heldout.to_document() if self.heldout is not None else None,
-            "candidates": [candidate.to_document() for candidate in self.candidates],
-            "next_experiment": next_run.to_document() if next_run is not None else None,
-            "simulations": self.simulations,
-            "seconds": self.seconds,
-            "cut": self.cut.to_document() if self.cut is not None else None,
-            **({"recording_faults": faults} if faults else {}),
-            **({"recording_notes": list(self.recording_notes)} if self.recording_notes else {}),
-        }
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> Verdict:
-        """Build a verdict from the content of a verdict.json that explain has written."""
-        # Null means that there is no value.
-        heldout, next_run = document["heldout"], document["next_experiment"]
-        # Older files do not have this key.
-        early_stop = document.get("cut")
-        return cls(
-            verdict=document["verdict"],
-            system=document["system"],
-            engine=document["engine"],
-            causes=tuple(Cause.from_document(cause) for cause in document["causes"]),
-            parameters=_read_estimates(document["parameters"]),
-            heldout=HeldOutResult(**heldout) if heldout is not None else None,
-            candidates=tuple(Candidate(**candidate) for candidate in document["candidates"]),
-            next_experiment=DiscriminatingRun(**next_run) if next_run is not None else None,
-            simulations=document["simulations"],
-            seconds=document["seconds"],
-            cut=EarlyStop.from_document(early_stop) if early_stop is not None else None,
-            recording_faults=tuple(
-                RecordingFault.of(fault) for fault in document.get("recording_faults", ())
-            ),
-            recording_notes=tuple(document.get("recording_notes", ())),
-        )
-
     def __repr__(self) -> str:
         names = ", ".join(" or ".join([c.effect, *c.alternatives]) for c in self.causes)
         cause_text = f": {names}" if names else ""
@@ -331,34 +223,6 @@ def to_finite_or_none(value: float) -> float | None:
     """Return a number for JSON; None for NaN and infinite values."""
     # NaN is not valid JSON: strict readers would refuse the whole file.
     return value if np.isfinite(value) else None
-
-
-def _convert_estimates(numbers: Mapping[str, FittedValue]) -> JsonDocument:
-    """Return numbers as in verdict.json, by name."""
-    return {name: _convert_estimate(number) for name, number in numbers.items()}
-
-
-def _convert_estimate(number: FittedValue) -> JsonDocument:
-    """Return a fitted value as a JSON object with value, unit and interval."""
-    document: JsonDocument = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
-    # Empty fields are left out.
-    for key in ("at_bound", "stated", "total", "total_unit"):
-        if (value := getattr(number, key)) not in (None, ""):
-            document[key] = value
-    if number.usual_range is not None:
-        document["usual_range"] = list(number.usual_range)
-    return document
-
-
-def _read_estimates(document: Mapping[str, Any]) -> dict[str, FittedValue]:
-    return {name: _read_estimate(estimate) for name, estimate in document.items()}
-
-
-def _read_estimate(estimate: Mapping[str, Any]) -> FittedValue:
-    """Build a fitted value from its JSON object, in which the usual range is a list."""
-    usual_range = estimate.get("usual_range")
-    ends = (float(usual_range[0]), float(usual_range[1])) if usual_range is not None else None
-    return FittedValue(**{**estimate, "usual_range": ends})
 
 
 def _format_value(number: FittedValue) -> str:

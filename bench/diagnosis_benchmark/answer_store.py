@@ -134,7 +134,7 @@ def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, 
         if "effects" not in answer["item"] or diagnoser not in answer["rows"]:
             continue
         yield build_answer_row(
-            question, BenchmarkCase.from_json(answer["item"]), answer["rows"][diagnoser]
+            question, BenchmarkCase.from_document(answer["item"]), answer["rows"][diagnoser]
         )
 
 

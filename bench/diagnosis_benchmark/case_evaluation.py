@@ -107,11 +107,11 @@ def evaluate_case(
         JSON document with the name of the case (``question``), the case with its true causes
         (``item``, {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
-    case_spec = CaseSpec.from_json(question)
+    case_spec = CaseSpec.from_document(question)
     if known_case is None:
         case = case_spec.draw_case(seed, salt)
     else:
-        case = BenchmarkCase.from_json(known_case) if known_case else None
+        case = BenchmarkCase.from_document(known_case) if known_case else None
     if case is None:
         return {"question": case_spec.name, "item": {}, "rows": []}
     recording_text = render_recording(case)
@@ -132,7 +132,7 @@ def evaluate_case(
             "seed": make_seed_words("diagnosis", diagnoser.label, case_spec.name).tolist(),
         }
         rows.append(_ask_diagnoser(diagnoser, request, case_spec.name, limits, hidden))
-    return {"question": case_spec.name, "item": case.to_json(), "rows": rows}
+    return {"question": case_spec.name, "item": case.to_document(), "rows": rows}
 
 
 def _ask_diagnoser(

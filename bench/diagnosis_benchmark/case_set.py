@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 from bench.diagnosis_benchmark.machine_cases import hidden_causes, machine_case_sampling
 from bench.diagnosis_benchmark.machine_cases import machine_case_sampling as machines
 from sims import effects as library
+from sims.core.document_fields import Document
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     check_entries,
@@ -262,7 +263,7 @@ _SEED_STRIDE = 1000
 
 
 @dataclass(frozen=True)
-class CaseSpec:
+class CaseSpec(Document):
     """Specification from which a case is drawn.
 
     Attributes:
@@ -289,15 +290,6 @@ class CaseSpec:
         words += [f"{self.size:g}"] if self.size else []
         words += [str(part) for part in self.asked if part is not None]
         return "/".join([*words, str(self.index)])
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, document: dict[str, Any]) -> CaseSpec:
-        """Restore a case specification from its JSON document."""
-        return cls(**{**document, "asked": RequestedConditions(*document["asked"])})
 
     def draw_case(self, seed: int, salt: str = PUBLIC_SALT) -> BenchmarkCase | None:
         """Draw the case; make several attempts if the hidden cause is not observable.

@@ -382,7 +382,7 @@ class _EvaluationRun:
             diagnosers_to_run = [evaluated[name] for name in self._list_unanswered(question)]
             known_case = answer["item"] if answer else None
             case_args = (
-                question.to_json(),
+                question.to_document(),
                 self._study.config.seed,
                 self._salt,
                 known_case,

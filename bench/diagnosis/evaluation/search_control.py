@@ -14,8 +14,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
+
+from sims.core.document_fields import Document
 
 
 @runtime_checkable
@@ -116,8 +118,8 @@ PROGRESS_STEP_SHARE = 0.4
 
 
 @dataclass(frozen=True)
-class EarlyStop:
-    """Early end of a search.
+class EarlyStop(Document):
+    """Early end of a search, as in verdict.json.
 
     Attributes:
         reason: reason, ``budget`` or ``interrupt``.
@@ -126,22 +128,9 @@ class EarlyStop:
             ``held_out``, ``structure``, ``alternatives``.
     """
 
-    reason: StopReason
-    during_question: str
-    skipped_questions: tuple[str, ...]
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the entry of verdict.json."""
-        return {
-            "by": self.reason,
-            "during": self.during_question,
-            "not_asked": list(self.skipped_questions),
-        }
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> EarlyStop:
-        """Create an instance from the entry of verdict.json."""
-        return cls(document["by"], document["during"], tuple(document["not_asked"]))
+    reason: StopReason = field(metadata={"key": "by"})
+    during_question: str = field(metadata={"key": "during"})
+    skipped_questions: tuple[str, ...] = field(metadata={"key": "not_asked"})
 
 
 class SearchStoppedError(Exception):

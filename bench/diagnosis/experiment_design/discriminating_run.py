@@ -15,7 +15,7 @@ and initial states are limited, and the motion is simulated with both models.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +28,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
     read_model_file_limits,
 )
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from sims.core.document_fields import OPTIONAL, Document
 from sims.core.simulator import Array, Scenario
 
 MIN_DISCRIMINATION_SIGMAS = 2.0
@@ -52,8 +53,8 @@ MIN_INPUT_FACTOR = 1.1
 
 
 @dataclass(frozen=True)
-class DiscriminatingRun:
-    """Proposed run or measurement.
+class DiscriminatingRun(Document):
+    """Proposed run or measurement, as in verdict.json.
 
     Attributes:
         says: Proposal as a sentence.
@@ -63,14 +64,8 @@ class DiscriminatingRun:
     """
 
     says: str
-    change: Mapping[str, float] | None = None
-    apart: float | None = None
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the proposal as in verdict.json."""
-        if self.change is None or self.apart is None:
-            return {"says": self.says}
-        return {"says": self.says, "change": dict(self.change), "apart": self.apart}
+    change: Mapping[str, float] | None = field(default=None, metadata=OPTIONAL)
+    apart: float | None = field(default=None, metadata=OPTIONAL)
 
 
 class _Run(NamedTuple):

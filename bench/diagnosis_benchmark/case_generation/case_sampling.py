@@ -410,7 +410,7 @@ def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
     constants = {} if case.system == "slider" else setting.constants
     path = Path(folder) / f"{case.name}.csv"
     other_files = (
-        {path.with_suffix(".truth.json"): json.dumps(case.to_json(), indent=1) + "\n"}
+        {path.with_suffix(".truth.json"): json.dumps(case.to_document(), indent=1) + "\n"}
         if truth
         else {}
     )

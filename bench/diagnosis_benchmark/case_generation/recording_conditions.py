@@ -6,7 +6,7 @@ They are parameters, runs, inputs, channels and noise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     TrueSystem,
     get_constants,
 )
+from sims.core.document_fields import Document
 from sims.core.simulator import Array, Scenario
 from sims.systems.pendulum import Pendulum
 
@@ -384,7 +385,7 @@ CASE_KINDS = ("clean", "single", "double", "foreign")
 
 
 @dataclass(frozen=True)
-class BenchmarkCase:
+class BenchmarkCase(Document):
     """Benchmark case.
 
     Attributes:
@@ -452,17 +453,6 @@ class BenchmarkCase:
         if beyond is not None and beyond < min_beyond:
             return None
         return replace(self, effects=dict(effects), size=size, beyond=beyond, **changes)
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> BenchmarkCase:
-        """Restore a case from its JSON document."""
-        effects = {name: tuple(c) for name, c in document["effects"].items()}
-        fields = {**document, "effects": effects, "channels": tuple(document["channels"])}
-        return cls(**{**fields, "asked": RequestedConditions(*document.get("asked", ()))})
 
 
 def make_case_rng(name: str, purpose: str) -> np.random.Generator:

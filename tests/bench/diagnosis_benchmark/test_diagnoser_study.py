@@ -221,7 +221,7 @@ def test_recording_conditions_are_as_requested():
     asked = RequestedConditions(50, 3, "ar1")
     item = CaseSpec("clean", "pendulum", None, None, asked, 0).draw_case(0)
     assert (item.rate, item.runs, item.noise) == (50, 3, "ar1")
-    assert type(item).from_json(json.loads(json.dumps(item.to_json()))) == item
+    assert type(item).from_document(json.loads(json.dumps(item.to_document()))) == item
 
 
 @pytest.mark.parametrize(

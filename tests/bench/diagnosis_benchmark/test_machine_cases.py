@@ -210,8 +210,10 @@ def test_files_do_not_reveal_the_hidden_effect():
 
 def test_a_case_is_restored_from_its_json():
     item = draw_case("clean", "servo", 5)
-    assert BenchmarkCase.from_json(item.to_json()) == item
-    assert render_recording(item) == render_recording(BenchmarkCase.from_json(item.to_json()))
+    assert BenchmarkCase.from_document(item.to_document()) == item
+    assert render_recording(item) == render_recording(
+        BenchmarkCase.from_document(item.to_document())
+    )
     assert render_recording(item) != render_recording(draw_case("clean", "servo", 6))
 
 

@@ -171,7 +171,7 @@ def test_the_same_seed_gives_the_same_files(tmp_path):
         ]
         assert paths[0].read_bytes() == paths[1].read_bytes()
         assert (
-            BenchmarkCase.from_json(json.loads(paths[0].with_suffix(".truth.json").read_text()))
+            BenchmarkCase.from_document(json.loads(paths[0].with_suffix(".truth.json").read_text()))
             == item
         )
 

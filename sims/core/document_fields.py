@@ -1,0 +1,82 @@
+"""Conversion of dataclasses to JSON documents and back, by their fields and type hints.
+
+A document is a dict with one key for each field, in the order of the fields. Tuples become lists,
+and nested dataclasses become documents. The metadata of a field change this:
+
+* `OPTIONAL`: the key is left out where the field has its default.
+* ``{"key": name}``: the key has another name than the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import Field, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+
+if TYPE_CHECKING:
+    from typing import Self
+
+OPTIONAL: Mapping[str, Any] = {"optional": True}
+"""Metadata of a field whose key is left out where the field has its default."""
+
+
+class Document:
+    """Base class of dataclasses that are entries of a JSON file."""
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to plain values for JSON."""
+        document: dict[str, Any] = to_plain_values(self)
+        return document
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """Restore an instance from its document; a missing key gives the default of its field."""
+        restored: Self = _restore_dataclass(cls, document)
+        return restored
+
+
+def to_plain_values(value: Any) -> Any:
+    """Convert dataclasses, mappings and sequences to dicts and lists; copy other values."""
+    if is_dataclass(value):
+        named_values = [(field, getattr(value, field.name)) for field in fields(value)]
+        return {
+            _get_key(field): to_plain_values(part)
+            for field, part in named_values
+            if "optional" not in field.metadata or part != field.default
+        }
+    if isinstance(value, Mapping):
+        return {key: to_plain_values(part) for key, part in value.items()}
+    return [to_plain_values(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def _get_key(field: Field[Any]) -> str:
+    """Return the key of a field in a document."""
+    return str(field.metadata.get("key", field.name))
+
+
+def _restore(kind: Any, value: Any) -> Any:
+    """Restore a value of the type `kind` from plain values; other types are returned unchanged."""
+    if value is None:
+        return None
+    if is_dataclass(kind):
+        return _restore_dataclass(kind, value)
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return _restore(next(part for part in parts if part is not NoneType), value)
+    if origin is tuple:
+        return tuple(_restore(parts[0], part) for part in value)
+    if origin in (dict, Mapping):
+        return {key: _restore(parts[1], part) for key, part in value.items()}
+    is_named_tuple = isinstance(kind, type) and issubclass(kind, tuple)
+    return kind(*value) if is_named_tuple else value
+
+
+def _restore_dataclass(kind: Any, document: Mapping[str, Any]) -> Any:
+    """Restore a dataclass from its document."""
+    hints = get_type_hints(kind)
+    values = {}
+    for field in fields(kind):
+        if (key := _get_key(field)) in document:
+            values[field.name] = _restore(hints[field.name], document[key])
+    return kind(**values)
