@@ -28,31 +28,24 @@ from bench.diagnosis.report.effect_and_unit_text import (
     sanitise,
 )
 from bench.diagnosis.report.figure_panels import (
-    BASE_MODEL_LINE,
-    EXTENDED_MODEL_LINE,
     LONGEST_NAME,
-    MAX_OUTLINED_DOTS,
-    MAX_SAMPLES,
     RunView,
     draw_gap_location_panel,
     draw_profile_panel,
     format_profile_label,
-    format_selected_run,
     get_legend_entries,
     has_extended_model,
     place_names,
     select_gap_locations,
     select_informative_profiles,
     select_worst_run,
-    shorten_label,
 )
-from bench.diagnosis.report.joint_figure import draw_joint_figure, is_robot
+from bench.diagnosis.report.joint_figure import draw_run_figure
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
 from bench.figures import figure_output
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
-from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,
@@ -448,8 +441,6 @@ DPI = 150
 """Resolution of the PNG files in dots per inch; the page shows them at about two thirds of their
 size.
 """
-_WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
-"""Width of the overview in inches, by the number of channels."""
 _HEADING_OFFSET = 0.22
 """Distance from the upper edge to the middle of a heading, in inches."""
 _HEADING_SIZE = 11.0
@@ -561,7 +552,7 @@ def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, fl
     joints, columns = [], []
     for c, channel in enumerate(report.channels):
         kind, _, joint = channel.name.partition(".")
-        values = view.data_split.observed[view.row, :, c]
+        values = view.get_samples("observed", c)
         if kind == "q" and np.isfinite(values).any():
             joints.append(joint)
             columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
@@ -579,117 +570,6 @@ def _draw_robot(report: DiagnosisReportData) -> Figure:
     return draw_robot_figure(
         report.robot, get_extreme_pose(report, select_worst_run(report)), list_place_marks(report)
     )
-
-
-def _draw_overview(report: DiagnosisReportData) -> Figure:
-    """Draw the run with the largest residual: each channel over time, and its residual below.
-
-    For a robot, the figure of `joint_figure`, joint by joint, is drawn instead.
-    """
-    view = select_worst_run(report)
-    if is_robot(report):
-        return draw_joint_figure(report, view)
-    count = len(view.channels)
-    # Width and height in inches.
-    size = (_WIDTHS[count], 5.2)
-    figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
-    for column, c in enumerate(view.channels):
-        _draw_signal(axes[0][column], axes[1][column], report, view, c)
-    selection = (
-        f"; {count} of {len(report.channels)} channels" if count < len(report.channels) else ""
-    )
-    samples = view.count_samples()
-    title = f"{format_selected_run(report, view)} ({samples} samples{selection})"
-    figure.suptitle(title, fontsize=11, y=0.985)
-    # The columns differ only in the channel, so they share one legend.
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    band_handles, band_labels = axes[1][0].get_legend_handles_labels()
-    figure.legend(
-        [*handles, *band_handles], [*labels, *band_labels], loc="lower center", ncols=4, fontsize=9
-    )
-    left_margin = 0.75 / figure.get_figwidth()
-    figure.subplots_adjust(
-        # Margins as shares of the figure, and spaces as shares of a panel.
-        left=left_margin,
-        right=0.985,
-        top=0.92,
-        bottom=0.165,
-        hspace=0.1,
-        wspace=0.2,
-    )
-    return figure
-
-
-def _draw_signal(
-    signal_axis: Axes,
-    residual_axis: Axes,
-    report: DiagnosisReportData,
-    view: RunView,
-    channel_index: int,
-) -> None:
-    """Draw the measured and simulated signal of a channel, and the residual below it.
-
-    Long signals are thinned to their extremes. The residual has a band of two standard deviations
-    of the noise.
-
-    Args:
-        signal_axis: axes of the signal.
-        residual_axis: axes of the residual, below it.
-        report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
-        channel_index: index of the channel.
-    """
-    channel, split = report.channels[channel_index], view.data_split
-    times = split.times[view.row]
-    # Arrays are padded after the end of a shorter run.
-    signals = [
-        a[view.row, : len(times), channel_index]
-        for a in (split.observed, split.before, split.after)
-    ]
-    shown_samples = thin_signal(signals[0], MAX_SAMPLES)
-    shown_times = times[shown_samples]
-    measured, before, after = (signal[shown_samples] for signal in signals)
-
-    size = 3.6 if shown_samples.size < 250 else 2.6  # points: smaller dots for many samples
-    marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
-    # Thousands of vector outlines would dominate the file size.
-    marks["rasterized"] = shown_samples.size > MAX_OUTLINED_DOTS
-    signal_axis.plot(shown_times, measured, "o", label="measured", zorder=4, **marks)
-    base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
-    signal_axis.plot(shown_times, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
-    noise, band = 2 * channel.sigma, "±2σ: 95 % of the noise"
-    residual_axis.axhspan(-noise, noise, color=NOISE_BAND_GREY, linewidth=0, label=band, zorder=0)
-    residual_axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
-    residual_axis.plot(
-        shown_times, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0}
-    )
-    if has_extended_model(report):
-        # The wide curve is behind: where both agree, "before" is visible as dashes on it.
-        signal_axis.plot(
-            shown_times,
-            after,
-            label="simulated after",
-            zorder=2,
-            **{**EXTENDED_MODEL_LINE, "linewidth": 3.2},
-        )
-        residual_axis.plot(
-            shown_times, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8}
-        )
-
-    signal_axis.set_ylabel(shorten_label(channel.name, channel.unit, 14))
-    residual_axis.set_ylabel(shorten_label("residual", channel.unit))
-    residual_axis.set_xlabel("time [s]; residual: measured − simulated")
-    signal_axis.margins(x=0.01)
-    for axis in (signal_axis, residual_axis):
-        axis.locator_params(nbins=6)
-    # Noise must not fill the panel: its band should look narrow.
-    _extend_axis(residual_axis, 3 * channel.sigma)
-
-
-def _extend_axis(axis: Axes, size: float) -> None:
-    """Extend a vertical axis to at least this size on both sides of zero."""
-    low, high = axis.get_ylim()
-    axis.set_ylim(min(low, -size), max(high, size))
 
 
 class _FigureLayout(NamedTuple):
@@ -803,7 +683,7 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
 
 _FIGURE_FUNCTIONS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
     "robot": _draw_robot,
-    "overview": _draw_overview,
+    "overview": draw_run_figure,
     "where": _draw_residual_locations,
     "candidates": draw_candidates_figure,
 }

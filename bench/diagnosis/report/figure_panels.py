@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,6 +24,7 @@ from bench.figures.style import (
     ZERO_LINE_GREY,
     break_name,
 )
+from sims.core.simulator import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -325,49 +325,80 @@ MAX_SAMPLES = 3000
 """Maximum number of samples drawn of a run; of a longer run the extremes of each part are drawn."""
 MAX_OUTLINED_DOTS = 1000
 """Maximum number of dots drawn as vector outlines; more dots are rasterised in vector files too."""
-MAX_CHANNELS = 3
-"""Maximum number of channels shown: those with the largest residuals."""
 
 
 class RunView(NamedTuple):
-    """Run that a figure shows.
+    """Run that a figure or chart shows.
 
     Attributes:
         data_split: Data split of the run.
         row: Index of the run in it.
         held_out: Whether the run is held out.
-        channels: Indices of the channels to show.
+        sigma: (C,) Standard deviation of the noise of each channel.
+        gap: RMS residual of the base model over all channels, in units of the noise.
     """
 
     data_split: DataSplit
     row: int
     held_out: bool
-    channels: list[int]
+    sigma: Array
+    gap: float
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.data_split.names[self.row]
+
+    @property
+    def times(self) -> Array:
+        """Sample times (T,) of the run, s."""
+        return self.data_split.times[self.row]
 
     def count_samples(self) -> int:
         """Count the sample times; one counts once, however many channels were recorded."""
         return int(np.isfinite(self.data_split.observed[self.row]).any(axis=1).sum())
 
+    def get_samples(self, signal: str, channel_index: int) -> Array:
+        """Return the samples (T,) of a channel.
+
+        Args:
+            signal: ``observed``, ``before`` (base model) or ``after`` (extended model).
+            channel_index: index of the channel.
+        """
+        samples: Array = getattr(self.data_split, signal)
+        return samples[self.row, : len(self.times), channel_index]
+
+    def compute_residual(self, model: str, channel_index: int) -> Array:
+        """Compute the residual (T,) of a channel in units of its noise.
+
+        Args:
+            model: ``before`` (base model) or ``after`` (extended model).
+            channel_index: index of the channel.
+        """
+        observed = self.get_samples("observed", channel_index)
+        difference: Array = observed - self.get_samples(model, channel_index)
+        return difference / self.sigma[channel_index]
+
+
+def rank_runs(report: DiagnosisReportData) -> list[RunView]:
+    """List all runs by descending gap, but the worst held-out run first, if there is any."""
+    sigma = np.array([c.sigma for c in report.channels])
+    runs = []
+    for split in list_data_splits(report):
+        squares = np.square((split.observed - split.before) / sigma)
+        for row, run_squares in enumerate(squares):
+            finite = run_squares[np.isfinite(run_squares)]
+            gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
+            runs.append(RunView(split, row, split is report.held_out, sigma, gap))
+    last_split = runs[-1].data_split
+    runs.sort(key=lambda run: -run.gap)
+    worst = next(run for run in runs if run.data_split is last_split)
+    return [worst, *(run for run in runs if run is not worst)]
+
 
 def select_worst_run(report: DiagnosisReportData) -> RunView:
-    """Select the run with the largest gap in units of the noise, a held-out one if there is any.
-
-    Args:
-        report: Data of the report.
-
-    Returns:
-        The run with its worst channels, at most `MAX_CHANNELS`, in their original order.
-    """
-    split = list_data_splits(report)[-1]
-    sigma = np.array([c.sigma for c in report.channels])
-    squares = ((split.observed - split.before) / sigma) ** 2
-    with warnings.catch_warnings():
-        # The mean of a run or channel without samples is NaN, which counts as zero.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
-        by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
-    channels = np.argsort(-by_channel, kind="stable")[:MAX_CHANNELS]
-    return RunView(split, row, split is report.held_out, sorted(int(c) for c in channels))
+    """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
+    return rank_runs(report)[0]
 
 
 def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
@@ -382,4 +413,4 @@ def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
     # `validation_run` is an adjective: "held-out" or "left-out".
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
-    return f"Run {shorten_label(view.data_split.names[view.row])}, the {kind} {reason}"
+    return f"Run {shorten_label(view.name)}, the {kind} {reason}"

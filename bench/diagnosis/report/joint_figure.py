@@ -1,4 +1,4 @@
-"""Figure of a robot's motion joint by joint.
+"""Figure of one run, joint by joint for a robot and else channel by channel.
 
 Each row shows the measured and simulated motion, and next to it the residual of each recorded
 quantity in units of its noise.
@@ -22,6 +22,7 @@ from bench.diagnosis.report.figure_panels import (
     RunView,
     format_selected_run,
     has_extended_model,
+    select_worst_run,
     shorten_label,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
@@ -36,7 +37,6 @@ from bench.figures.style import (
     make_panel_grid,
     measure_text_width,
 )
-from sims.core.simulator import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,14 +91,14 @@ def is_robot(report: DiagnosisReportData) -> bool:
 
 
 def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
-    """List a row for each joint, in the order of the channels, then one for each sensor.
+    """List a row for each joint, in the order of the channels, then one for each other channel.
 
     Channels are named ``quantity.joint``, such as ``q.elbow`` for its position. A row has all
     channels of its joint; its motion is the position, or else the velocity or torque. Other
     channels are sensors.
 
     Args:
-        report: Data of the report of a robot.
+        report: Report data.
     """
     joints: dict[str, dict[str, int]] = {}
     sensors = []
@@ -129,18 +129,20 @@ def _list_quantities(report: DiagnosisReportData) -> list[str]:
     return [quantity for quantity in QUANTITY_LABELS if quantity in recorded_quantities]
 
 
-def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
-    """Draw a run joint by joint: motion and residuals of each joint in a row.
+def draw_run_figure(report: DiagnosisReportData) -> Figure:
+    """Draw the run with the largest residual: motion and residuals of each joint in a row.
+
+    A system that is not a robot has a row for each channel.
 
     Joints with the largest residuals are selected if there are many. Residuals of one quantity,
     such as position, have a common scale. Names of joints that the diagnosis names are highlighted.
 
     Args:
         report: Report data.
-        view: Run to draw.
     """
+    view = select_worst_run(report)
     rows = _select_worst_rows(report, view)
-    quantities = _list_quantities(report) or ["q"]
+    quantities = [name for name in QUANTITY_LABELS if any(name in row.channels for row in rows)]
     height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
@@ -161,9 +163,9 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
             else:
                 panel.set_axis_off()
     for column, quantity in enumerate(quantities, start=1):
-        _unify_scale(axes[:, column], report, view, rows, quantity)
-        label = QUANTITY_LABELS[quantity]
-        axes[0, column].set_title(f"residual of {label} [σ]", fontsize=9.5, loc="left")
+        _unify_scale(axes[:, column], view, rows, quantity)
+        label = f"residual of {QUANTITY_LABELS[quantity]}" if is_robot(report) else "residual"
+        axes[0, column].set_title(f"{label} [σ]", fontsize=9.5, loc="left")
     axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
     for panel in axes[-1]:
         panel.set_xlabel("time [s]")
@@ -178,48 +180,28 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
 
     Args:
         report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
+        view: run to show: its part of the data, and its index there.
     """
     rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
-        return max(_compute_residual_rms(report, view, c, "before") for c in row.channels.values())
+        return max(_compute_residual_rms(view, c, "before") for c in row.channels.values())
 
     worst_rows = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
     return [row for row in rows if row in worst_rows]
 
 
-def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:
+def _compute_residual_rms(view: RunView, c: int, model: str) -> float:
     """Return the RMS residual of a channel in this run in noise units; 0 without samples.
 
     Args:
-        report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
+        view: run to show.
         c: index of the channel.
         model: ``before`` for the base model, ``after`` for the extended one.
     """
-    residual = _compute_scaled_residual(report, view, c, model)
+    residual = view.compute_residual(model, c)
     finite = residual[np.isfinite(residual)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
-
-
-def _compute_scaled_residual(
-    report: DiagnosisReportData, view: RunView, c: int, model: str
-) -> Array:
-    """Return the residual (T,) of a channel in units of its noise.
-
-    Args:
-        report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
-        c: index of the channel.
-        model: ``before`` for the base model, ``after`` for the extended one.
-    """
-    count = len(view.data_split.times[view.row])
-    simulated = getattr(view.data_split, model)
-    residual: Array = (view.data_split.observed - simulated)[view.row, :count, c] / report.channels[
-        c
-    ].sigma
-    return residual
 
 
 def _draw_motion(
@@ -232,19 +214,17 @@ def _draw_motion(
     Args:
         panel: axes to draw on.
         report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
+        view: run to show: its part of the data, and its index there.
         row: the joint.
         is_named: whether the diagnosis names the joint; its name is then highlighted.
     """
-    channel, split = report.channels[row.motion_channel], view.data_split
-    times = split.times[view.row]
+    channel = report.channels[row.motion_channel]
     signals = [
-        a[view.row, : len(times), row.motion_channel]
-        for a in (split.observed, split.before, split.after)
+        view.get_samples(name, row.motion_channel) for name in ("observed", "before", "after")
     ]
     shown_samples = thin_signal(signals[0], MAX_SAMPLES)
     measured, before, after = (signal[shown_samples] for signal in signals)
-    shown_times = times[shown_samples]
+    shown_times = view.times[shown_samples]
     size = 4.0 if shown_samples.size < 250 else 3.4  # points: smaller dots for many samples
     panel.plot(
         shown_times,
@@ -262,8 +242,8 @@ def _draw_motion(
     if has_extended_model(report):
         # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
         panel.plot(shown_times, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
-    quantity = channel.name.partition(".")[0]
-    symbol = quantity if quantity in QUANTITY_LABELS else ""
+    quantity, _, joint = channel.name.partition(".")
+    symbol = quantity if joint and quantity in QUANTITY_LABELS else ""
     panel.set_ylabel(shorten_label(symbol, channel.unit, 14), fontsize=8)
     panel.annotate(
         _format_row_name(row, is_named),
@@ -304,26 +284,24 @@ def _draw_residual(
     Args:
         panel: axes to draw on.
         report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
+        view: run to show: its part of the data, and its index there.
         channel_index: index of the channel.
     """
-    times = view.data_split.times[view.row]
     panel.axhspan(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
     )
     panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
     models = ("before", "after") if has_extended_model(report) else ("before",)
     for model in models:
-        residual = _compute_scaled_residual(report, view, channel_index, model)
+        residual = view.compute_residual(model, channel_index)
         rows = thin_signal(residual, MAX_SAMPLES)
         line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
         if model == "after":
             line_style = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
         line_style["rasterized"] = rows.size > MAX_OUTLINED_DOTS
-        panel.plot(times[rows], residual[rows], **line_style)
+        panel.plot(view.times[rows], residual[rows], **line_style)
     rms_texts = [
-        format_number(_compute_residual_rms(report, view, channel_index, model), 2)
-        for model in models
+        format_number(_compute_residual_rms(view, channel_index, model), 2) for model in models
     ]
     panel.text(
         1.0,
@@ -342,11 +320,7 @@ def _draw_residual(
 
 
 def _unify_scale(
-    panels: Sequence[Axes],
-    report: DiagnosisReportData,
-    view: RunView,
-    rows: Sequence[JointRow],
-    quantity: str,
+    panels: Sequence[Axes], view: RunView, rows: Sequence[JointRow], quantity: str
 ) -> None:
     """Give the residuals of one quantity (a column) the same scale, to compare joints.
 
@@ -354,17 +328,14 @@ def _unify_scale(
 
     Args:
         panels: axes of the column.
-        report: content of the report.
-        view: run to show: its part of the data, its index there, and the selected channels.
+        view: run to show: its part of the data, and its index there.
         rows: joints and sensors of the figure.
         quantity: the quantity, such as ``q``.
     """
     limit = MIN_RESIDUAL_AXIS_SIGMAS
     for row in rows:
         if quantity in row.channels:
-            residual = np.abs(
-                _compute_scaled_residual(report, view, row.channels[quantity], "before")
-            )
+            residual = np.abs(view.compute_residual("before", row.channels[quantity]))
             finite = residual[np.isfinite(residual)]
             if finite.size:
                 # 8 % above the quantile, so that its samples do not touch the edge.
@@ -426,11 +397,12 @@ def _add_title_and_legend(
     """
     width, height = figure.get_size_inches().tolist()
     total = len(list_joint_rows(report))
-    selection = (
-        f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
-    )
+    rows_text, order_text = "channels", ""
+    if is_robot(report):
+        rows_text, order_text = "joints and sensors", ", joint by joint"
+    selection = f"; the worst {len(rows)} of {total} {rows_text}" if len(rows) < total else ""
     selected_run = format_selected_run(report, view)
-    title = f"{selected_run}, joint by joint ({view.count_samples()} samples{selection})"
+    title = f"{selected_run}{order_text} ({view.count_samples()} samples{selection})"
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():

@@ -15,10 +15,9 @@ from bench.diagnosis.report.effect_and_unit_text import (
     format_unit,
     sanitise,
 )
-from bench.diagnosis.report.figure_panels import has_extended_model, select_worst_run
+from bench.diagnosis.report.figure_panels import RunView, has_extended_model, rank_runs
 from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_joint_rows
-from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
-from bench.diagnosis.report.summary_text import list_data_splits
+from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.figures.signal_thinning import select_extreme_samples
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style, shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
@@ -47,22 +46,6 @@ _MOTION_HEIGHT, _RESIDUAL_HEIGHT, _SIDE_BY_SIDE_HEIGHT = 250, 190, 190
 """
 
 
-class ShownRun(NamedTuple):
-    """Run that the page shows.
-
-    Attributes:
-        data_split: Data split of the run.
-        row: Index of the run in it.
-        says: Name, use and gap of the run, for the selection control.
-        gap: RMS residual of the base model, in units of the noise.
-    """
-
-    data_split: DataSplit
-    row: int
-    says: str
-    gap: float
-
-
 class MotionTable(NamedTuple):
     """Table of the chart, with its runs and the number of omitted runs.
 
@@ -77,7 +60,7 @@ class MotionTable(NamedTuple):
     """
 
     frame: Table
-    runs: tuple[ShownRun, ...]
+    runs: tuple[RunView, ...]
     part_count: int
     longest: int
     absent: int
@@ -93,7 +76,7 @@ def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) ->
         report: Report data.
         max_rows: Approximate maximum number of samples.
     """
-    runs = _sort_runs(report)
+    runs = rank_runs(report)
     count = len(report.channels)
     shown_runs = runs[: max(1, max_rows // (MIN_ROWS_PER_CHANNEL * count))]
     samples_per_run = max(MIN_ROWS_PER_CHANNEL, max_rows // (len(shown_runs) * count))
@@ -105,34 +88,19 @@ def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) ->
         names = [*names[:5], "after", "residual_before", "residual_after"]
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
-    longest_run = max(len(run.data_split.times[run.row]) for run in shown_runs)
+    longest_run = max(len(run.times) for run in shown_runs)
     part_count = _count_parts(report, samples_per_run) if longest_run > samples_per_run else 0
     return MotionTable(
         frame, tuple(shown_runs), part_count, longest_run, len(runs) - len(shown_runs)
     )
 
 
-def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
-    """List all runs by descending RMS residual, but the run of the printed figure first.
-
-    The residual is that of the base model, in units of the noise, over all channels.
-    """
-    sigma = np.array([c.sigma for c in report.channels])
-    worst_run = select_worst_run(report)
-    runs = []
-    for split in list_data_splits(report):
-        squares = np.square((split.observed - split.before) / sigma)
-        split_note = ""
-        if split is report.held_out:
-            split_note = ", left out" if report.cross_validated else ", held out"
-        for row, name in enumerate(split.names):
-            finite = squares[row][np.isfinite(squares[row])]
-            gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
-            title = f"{sanitise(name, 40)}{split_note}: RMS residual {format_number(gap, 2)} σ"
-            runs.append(ShownRun(split, row, title, gap))
-    # The printed figure shows the worst run, so the chart begins with it.
-    first_run = (id(worst_run.data_split), worst_run.row)
-    return sorted(runs, key=lambda run: ((id(run.data_split), run.row) != first_run, -run.gap))
+def _format_run_title(report: DiagnosisReportData, run: RunView) -> str:
+    """Format the label of a run: its name, whether it is held out, and its RMS residual."""
+    split_note = ""
+    if run.held_out:
+        split_note = ", left out" if report.cross_validated else ", held out"
+    return f"{sanitise(run.name, 40)}{split_note}: RMS residual {format_number(run.gap, 2)} σ"
 
 
 def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
@@ -149,7 +117,7 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
 
 
 def _format_rows(
-    report: DiagnosisReportData, run: ShownRun, channel_index: int, max_rows: int
+    report: DiagnosisReportData, run: RunView, channel_index: int, max_rows: int
 ) -> list[list[str]]:
     """Format the samples of a channel of a run as columns of text for the chart's table.
 
@@ -161,12 +129,11 @@ def _format_rows(
         channel_index: index of the channel.
         max_rows: maximum number of samples.
     """
-    split, channel = run.data_split, report.channels[channel_index]
-    times = split.times[run.row]
+    channel, times = report.channels[channel_index], run.times
     models = ("before", "after") if has_extended_model(report) else ("before",)
-    observed = split.observed[run.row, : len(times), channel_index]
-    simulated = [getattr(split, model)[run.row, : len(times), channel_index] for model in models]
-    residuals = [(observed - signal) / channel.sigma for signal in simulated]
+    observed = run.get_samples("observed", channel_index)
+    simulated = [run.get_samples(model, channel_index) for model in models]
+    residuals = [run.compute_residual(model, channel_index) for model in models]
     rows = np.arange(len(times))
     if len(times) > max_rows:
         rows = select_extreme_samples([observed, *residuals], _count_parts(report, max_rows))
@@ -181,7 +148,7 @@ def _format_rows(
     decimals = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
     count = len(rows)
     # Columns: run, channel, time, signals, and residuals in units of the noise.
-    texts = [[sanitise(split.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
+    texts = [[sanitise(run.name, 80)] * count, [sanitise(channel.name, 80)] * count]
     texts.append(_format_numbers(times[rows], decimals))
     texts += [_format_numbers(values[rows], digits) for values in (observed, *simulated)]
     return texts + [_format_numbers(values[rows], 2) for values in residuals]
@@ -232,7 +199,8 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     panels: list[Panel] = []
     for run in table.runs:
         for facets, c in places:
-            panels += _make_panels(report, run, c, {"run": run.says, **facets}, is_wide)
+            run_title = _format_run_title(report, run)
+            panels += _make_panels(report, run, c, {"run": run_title, **facets}, is_wide)
     toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
     return MotionChart(
         table=table,
@@ -304,7 +272,7 @@ def _list_hidden(
 
 def _make_panels(
     report: DiagnosisReportData,
-    run: ShownRun,
+    run: RunView,
     channel_index: int,
     facets: dict[str, str],
     is_wide: bool,
@@ -324,7 +292,7 @@ def _make_panels(
     """
     channel = report.channels[channel_index]
     selection = {
-        "run": sanitise(run.data_split.names[run.row], 80),
+        "run": sanitise(run.name, 80),
         "channel": sanitise(channel.name, 80),
     }
     extended = has_extended_model(report)

@@ -11,7 +11,7 @@ from bench.diagnosis.report.cause_text import (
     get_candidate_status,
     select_shown_candidates,
 )
-from bench.diagnosis.report.explanation_figures import render_figures
+from bench.diagnosis.report.explanation_figures import draw_figure, render_figures
 from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.figure_panels import (
     draw_profile_panel,
@@ -93,10 +93,10 @@ def test_the_run_shown_has_the_largest_gap_of_the_held_out_ones():
     told = make_report()
     shot = select_worst_run(told)
     assert shot.held_out
-    assert shot.data_split.names[shot.row] == "held 2"
+    assert shot.name == "held 2"
     rest = select_worst_run(replace(told, held_out=None))
     assert not rest.held_out
-    assert rest.data_split.names[rest.row] == "4"
+    assert rest.name == "4"
 
 
 def test_a_run_without_samples_is_never_the_worst():
@@ -107,18 +107,24 @@ def test_a_run_without_samples_is_never_the_worst():
     assert shot.row == 0
 
 
-def test_of_many_channels_the_worst_three_are_shown():
+def test_of_many_channels_the_worst_ten_are_shown():
     told = make_report()
-    side, tiles = told.held_out, (1, 1, 3)
-    wide = replace(
-        side,
-        observed=np.tile(side.observed, tiles),
-        before=np.tile(side.before, tiles).copy(),
-        after=np.tile(side.after, tiles),
-    )
-    wide.before[:, :, [1, 4, 5]] += 5.0
-    shot = select_worst_run(replace(told, held_out=wide, channels=told.channels * 3))
-    assert shot.channels == [1, 4, 5]
+    tiles = (1, 1, 6)
+    wide = {
+        side: replace(
+            getattr(told, side),
+            **{
+                name: np.tile(getattr(getattr(told, side), name), tiles)
+                for name in ("observed", "before", "after")
+            },
+        )
+        for side in ("fitting", "held_out")
+    }
+    figure = draw_figure(replace(told, channels=told.channels * 6, **wide), "overview")
+    assert len(figure.axes) == 2 * 10
+    assert "the worst 10 of 12 channels" in figure.get_suptitle()
+    assert "joint by joint" not in figure.get_suptitle()
+    assert figure.axes[1].get_title(loc="left") == "residual [σ]"
 
 
 def test_profiles_are_chosen_by_how_much_they_stand_out_one_a_variable_first():

@@ -83,7 +83,7 @@ def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
         after=np.tile(told.fitting.after, (20, 1, 1)),
     )
     found = build_motion_table(replace(told, fitting=many))
-    names = [run.data_split.names[run.row] for run in found.runs]
+    names = [run.name for run in found.runs]
     assert names[:3] == ["held 2", "r79", "r78"]
     assert found.absent == 82 - len(names) > 0
     page = render_report(replace(told, fitting=many), {})
