@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.rotations import MIN_QUATERNION_NORM, compute_rotation_vectors, multiply_quaternions
 from sims.core.simulator import Array, InputError
 from sims.recording.recorded_poses import (
     POSITION_AXES,
@@ -31,6 +30,8 @@ from sims.recording.recorded_poses import (
 from sims.robot.robot_model import Joint, RobotModel
 
 IndexArray = NDArray[np.intp]
+MIN_QUATERNION_NORM = 1e-6
+"""Minimum length of a valid quaternion."""
 ANGULAR_VELOCITY_AXES = ("wx", "wy", "wz")
 """Axes of angular velocity, those of the body."""
 
@@ -177,6 +178,8 @@ class FloatingJoints:
         The pose becomes position + d_p and q exp(d_r / 2) (1), with the orientation q as a
         quaternion.
         """
+        import mujoco
+
         displaced_pose = pose.copy()
         for axes, quaternion_columns, first in self._joint_addresses:
             place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
@@ -184,13 +187,10 @@ class FloatingJoints:
             rotation = displacements[
                 :, first + len(axes) : first + len(axes) + len(ANGULAR_VELOCITY_AXES)
             ]
-            angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-            # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
-            half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
-            quaternion = np.concatenate([np.cos(0.5 * angle), half_sinc * rotation], axis=1)
-            displaced_pose[:, quaternion_columns] = multiply_quaternions(
-                pose[:, quaternion_columns], quaternion
-            )
+            for quaternion, vector in zip(
+                displaced_pose[:, quaternion_columns], rotation, strict=True
+            ):
+                mujoco.mju_quatIntegrate(quaternion, vector, 1.0)
         return displaced_pose
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
@@ -199,18 +199,19 @@ class FloatingJoints:
         A displacement has the difference of positions, and the rotation vector of q_reference^-1 q.
         F and P are the numbers of velocities and of pose numbers of all floating joints.
         """
+        import mujoco
+
         columns = []
         for axes, quaternion_columns, _ in self._joint_addresses:
             translation_columns = slice(
                 quaternion_columns.start - len(axes), quaternion_columns.start
             )
             columns.append(pose[:, translation_columns] - reference[:, translation_columns])
-            inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
-            columns.append(
-                compute_rotation_vectors(
-                    multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
-                )
-            )
+            vectors = np.zeros((len(pose), len(ANGULAR_VELOCITY_AXES)))
+            quaternions = (pose[:, quaternion_columns], reference[:, quaternion_columns])
+            for vector, quaternion, initial in zip(vectors, *quaternions, strict=True):
+                mujoco.mju_subQuat(vector, quaternion, initial)
+            columns.append(vectors)
         return np.concatenate(columns, axis=1) if columns else np.zeros((len(pose), 0))
 
     @cached_property

@@ -1,10 +1,9 @@
-"""Inertia tensors of bodies from principal moments, and of point masses."""
+"""Inertia tensors of point masses, and of bodies from principal moments and back."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sims.core.rotations import compute_rotation_matrices
 from sims.core.simulator import Array
 
 
@@ -30,9 +29,33 @@ def compute_inertia_tensors(quaternions: Array, moments: Array) -> Array:
     Shapes: L batch elements.
 
     Args:
-        quaternions: (L, 4) orientations of the principal axes, MuJoCo's w first.
+        quaternions: (L, 4) orientations of the principal axes, unit quaternions, w first.
         moments: (L, 3) principal moments.
     """
-    axes = compute_rotation_matrices(quaternions)
+    import mujoco
+
+    matrices = np.empty((len(quaternions), 9))
+    for matrix, quaternion in zip(matrices, quaternions, strict=True):
+        mujoco.mju_quat2Mat(matrix, quaternion)
+    axes = matrices.reshape(-1, 3, 3)
     result: Array = np.einsum("lij,lj,lkj->lik", axes, moments, axes)
     return result
+
+
+def compute_principal_axes(tensors: Array) -> tuple[Array, Array]:
+    """Compute the principal moments (L, 3) of tensors (L, 3, 3), and the orientation of their axes.
+
+    Shapes: L batch elements.
+
+    Returns:
+        The moments in ascending order, and the axes as unit quaternions (L, 4), w first.
+    """
+    import mujoco
+
+    moments, axes = np.linalg.eigh(tensors)
+    # A rotation has no reflection.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    quaternions = np.empty((len(axes), 4))
+    for quaternion, matrix in zip(quaternions, axes, strict=True):
+        mujoco.mju_mat2Quat(quaternion, matrix.ravel())
+    return moments, quaternions

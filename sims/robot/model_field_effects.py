@@ -31,12 +31,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sims.core.rotations import compute_quaternions
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_geom, find_pair
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
+    compute_principal_axes,
 )
 from sims.robot.integrator_settings import write_friction_form
 from sims.robot.places.centre_of_mass_limits import observable_tilts
@@ -395,13 +395,11 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     )
     tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
     tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
-    moments, axes = np.linalg.eigh(tensor)
-    # A rotation has no reflection.
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    moments, axes = compute_principal_axes(tensor)
     fields["body_mass"][loaded, body_id] = total
     fields["body_ipos"][loaded, body_id] = middle
     fields["body_inertia"][loaded, body_id] = moments
-    fields["body_iquat"][loaded, body_id] = compute_quaternions(axes)
+    fields["body_iquat"][loaded, body_id] = axes
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
