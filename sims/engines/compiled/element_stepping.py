@@ -26,8 +26,6 @@ other.
 
 from __future__ import annotations
 
-import numpy as np
-
 from sims.engines.compiled.accelerations import (
     begin_step,
     compute_acceleration,
@@ -38,17 +36,10 @@ from sims.engines.compiled.data_layout import (
     BOUNCES,
     CONSTANTS,
     DIMENSIONS,
-    DIRECTION,
     ELEMENT,
     EVENT_DELAY,
-    EXCESS_AFTER,
     F1,
-    F2,
-    F3,
-    F4,
     FLOOR,
-    FLOOR_LEVEL,
-    FRICTION_COORDINATE_COUNT,
     HAS_FORCES,
     HAS_FRICTION,
     IN_T,
@@ -57,25 +48,17 @@ from sims.engines.compiled.data_layout import (
     IS_IDLE,
     IS_RESTING,
     IS_STEP_START,
-    IS_STICKING,
     K1,
     K2,
     K3,
     K4,
-    MASS,
-    MAX_ACCELERATION,
     MAX_COORDINATES,
-    MAX_FRICTION,
-    MAX_STEP,
-    MAY_HAVE_EVENT,
     NEXT_V,
     NEXT_X,
     NO_EVENT,
-    NONLINEARITY,
     ORDER_INDEX,
     PENDING_EVENT,
     REMAINING_TIME,
-    SCRATCH,
     STEP_INDEX,
     STEP_LIMIT,
     Block,
@@ -86,9 +69,6 @@ from sims.engines.compiled.data_layout import (
 )
 from sims.engines.compiled.element_clock import load_element, next_step, record_and_check_remaining
 from sims.engines.compiled.events import (
-    FORCE_NONLINEARITY_TOLERANCE,
-    FRICTION_NONLINEARITY_TOLERANCE,
-    NEGLIGIBLE_ACCELERATION_SHARE,
     detect_and_schedule_event,
     handle_event,
     handle_impact,
@@ -155,10 +135,8 @@ def step_elements(block: Block) -> None:
             if block.n[IS_IDLE, i] != 0:
                 a[H, i] = 0.0
         try_step(block)
-        detect_possible_events(block)
-        accept_steps(block)
         for i in range(block.w):
-            if block.n[MAY_HAVE_EVENT, i] != 0 and block.n[IS_IDLE, i] == 0:
+            if block.n[IS_IDLE, i] == 0:
                 accept_or_retry(block, i)
 
 
@@ -256,119 +234,6 @@ def try_step(block: Block) -> None:
             v = a[V + k, i]
             a[NEXT_X + k, i] = a[X + k, i] + h * (v + sixth * (a[K1 + k, i] + middle_sum))  # (5)
             a[NEXT_V + k, i] = v + sixth * (outer + 2.0 * middle_sum)  # (6)
-
-
-def detect_possible_events(block: Block) -> None:
-    """Set MAY_HAVE_EVENT for the elements that may have an event in the step just tried.
-
-    It is a fast first check in loops over all slots. Steps of elements without the flag are
-    accepted at once; those with it are examined one by one in `accept_or_retry`. The flag is set
-    for unused slots, for steps that end at a known event, if the accelerations k1 to k4 within the
-    step are too nonlinear, if the element falls below the ground or lifts off, and by
-    `detect_friction_events`.
-
-    Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
-    """
-    a = block.a
-    n = block.n
-    d = block.flags[DIMENSIONS]
-    for i in range(block.w):
-        n[MAY_HAVE_EVENT, i] = 1 if n[IS_IDLE, i] != 0 or n[PENDING_EVENT, i] != NO_EVENT else 0
-    if block.flags[HAS_FORCES] != 0 or block.flags[HAS_FRICTION] != 0:
-        for i in range(block.w):
-            a[NONLINEARITY, i] = 0.0
-            a[SCRATCH, i] = 0.0
-        for k in range(d):
-            for i in range(block.w):
-                # Six times equation (7); zero if the acceleration is linear within the step.
-                nonlinearity = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
-                a[NONLINEARITY, i] += nonlinearity * nonlinearity
-                a[SCRATCH, i] += a[K1 + k, i] * a[K1 + k, i]
-        for i in range(block.w):
-            a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], a[SCRATCH, i])
-    if block.flags[HAS_FORCES] != 0:
-        for i in range(block.w):
-            largest = FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
-            n[MAY_HAVE_EVENT, i] |= 1 if a[NONLINEARITY, i] > largest else 0
-    if block.flags[BOUNCES] != 0:
-        for i in range(block.w):
-            is_below_ground = a[NEXT_X + d - 1, i] < a[FLOOR_LEVEL, i]
-            lifts_off = n[IS_RESTING, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
-            n[MAY_HAVE_EVENT, i] |= 1 if is_below_ground or lifts_off else 0
-    if block.flags[HAS_FRICTION] != 0:
-        detect_friction_events(block)
-
-
-def detect_friction_events(block: Block) -> None:
-    """Set MAY_HAVE_EVENT for the elements that may have a friction event in the step just tried.
-
-    For an element that slips, these are friction that is too nonlinear in the step, and a reversal
-    of its motion. For one that sticks, it is a pulling force above the limit of dry friction. If
-    friction acts on several coordinates, the flag is set for all elements.
-
-    Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
-    """
-    a = block.a
-    n = block.n
-    if block.flags[FRICTION_COORDINATE_COUNT] > 1:
-        for i in range(block.w):
-            n[MAY_HAVE_EVENT, i] = 1
-        return
-    for i in range(block.w):
-        friction = nan_maximum(abs(a[F1, i]), abs(a[F4, i]))
-        a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], friction)
-        a[SCRATCH, i] = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
-    for i in range(block.w):
-        nonlinearity = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
-        largest = nan_maximum(a[MAX_FRICTION, i], a[SCRATCH, i])
-        is_nonlinear = nonlinearity > FRICTION_NONLINEARITY_TOLERANCE * largest
-        reverses = a[NEXT_V, i] * a[DIRECTION, i] < 0.0
-        has_slip_event = 1 if is_nonlinear or reverses else 0
-        breaks_away = 1 if a[EXCESS_AFTER, i] > 0.0 else 0
-        n[MAY_HAVE_EVENT, i] |= breaks_away if n[IS_STICKING, i] != 0 else has_slip_event
-
-
-def accept_steps(block: Block) -> None:
-    """Accept the steps just tried of the elements without MAY_HAVE_EVENT.
-
-    Their state becomes the new one, and their clock advances by H; other elements stay unchanged.
-    Values are selected without branches, so that the compiler can vectorise the loops over slots.
-
-    Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
-    """
-    a = block.a
-    n = block.n
-    for k in range(block.flags[DIMENSIONS]):
-        for i in range(block.w):
-            x = a[NEXT_X + k, i]
-            v = a[NEXT_V + k, i]
-            a[X + k, i] = a[X + k, i] if n[MAY_HAVE_EVENT, i] != 0 else x
-            a[V + k, i] = a[V + k, i] if n[MAY_HAVE_EVENT, i] != 0 else v
-    for i in range(block.w):
-        h = 0.0 if n[MAY_HAVE_EVENT, i] != 0 else a[H, i]
-        remaining = a[REMAINING_TIME, i] - h
-        doubled = 2.0 * a[STEP_LIMIT, i]
-        doubled = doubled if doubled < a[MAX_STEP, i] else a[MAX_STEP, i]
-        a[T, i] += h
-        # By rounding, parts of a step may add up to more than its length; a negative remaining time
-        # would run backwards.
-        a[REMAINING_TIME, i] = remaining if remaining > 0.0 else 0.0
-        # The limit doubles with each accepted step of that length, as the nonlinearity may still be
-        # near.
-        limit = a[STEP_LIMIT, i]
-        a[STEP_LIMIT, i] = doubled if n[MAY_HAVE_EVENT, i] == 0 and h >= limit else limit
-    for i in range(block.w):
-        if a[REMAINING_TIME, i] <= 0.0 and n[MAY_HAVE_EVENT, i] == 0:
-            next_step(block, i)
 
 
 def accept_or_retry(block: Block, i: int) -> None:

@@ -22,8 +22,8 @@ _INLINED_FUNCTIONS = frozenset(
     {
         *("evaluate_forces", "begin_step", "compute_acceleration"),
         *("compute_force_without_friction", "compute_frictionless_acceleration", "try_step"),
-        *("accept_steps", "next_step", "set_inputs", "record_and_check_remaining"),
-        *("detect_possible_events", "detect_friction_events", "shorten_if_nonlinear"),
+        *("next_step", "set_inputs", "record_and_check_remaining"),
+        "shorten_if_nonlinear",
         *("has_no_pending_event", "nan_maximum", "nan_minimum", "record_state", "dot"),
         *("compute_norm", "begin_step_1d", "compute_acceleration_1d"),
         *("compute_further_coordinates", "run_part"),
