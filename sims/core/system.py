@@ -232,7 +232,6 @@ class System(ABC):
         primary: Index of the coordinate on which biases and springs act.
         servo: Input that is the set point of the servo of the primary coordinate; empty without a
             servo.
-        uniform: Whether its own force is constant in space and time, so that it moves on parabolas.
         bends: Whether its own force may change sharply, so that steps must be shortened there.
         fastest: Maximum angular frequency in rad/s of oscillations that are not visible in its
             forces; steps are divided for it, too.
@@ -262,7 +261,6 @@ class System(ABC):
     floating_state_units: ClassVar[Mapping[str, str]] = {}
     base_orientations: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     loops: ClassVar[Sequence[frozenset[int]]] = ()
-    uniform: ClassVar[bool] = False
     guided: ClassVar[int] = 0
     bends: ClassVar[bool] = False
     fastest: ClassVar[float] = 0.0

@@ -1,9 +1,8 @@
 """Batch engine of the project: many simulations of a small system together, in machine code.
 
 The trajectory of each batch element depends on that element alone, bit for bit, and an effect that
-is inactive on an element changes nothing there. Elements on which only a constant force acts are
-integrated in closed form (`compiled.ballistic_motion`); the others are stepped
-(`compiled.element_stepping`).
+is inactive on an element changes nothing there. Elements are stepped by
+`compiled.element_stepping`.
 """
 
 from __future__ import annotations

@@ -62,7 +62,6 @@ class BallSystem(System):
     )
     primary = 2
     bounces = True
-    uniform = True
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return one (L, 1): forces are per unit mass.

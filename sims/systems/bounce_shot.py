@@ -104,7 +104,6 @@ class ShotSystem(System):
     sensed = ("z", "x", "y")
     primary = 2
     bounces = True
-    uniform = True
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:

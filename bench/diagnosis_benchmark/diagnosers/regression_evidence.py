@@ -371,8 +371,8 @@ class RegressionEvidence:
         """Compute A and B of L r = r'' - A r - B r' (2), each (T, D), by finite differences.
 
         They are the derivatives of the base model's acceleration by the D coordinates and by their
-        rates (stiffness and damping, per mass), along the fitted motion. They are zero if the
-        system's own force is uniform, and for systems of several coordinates.
+        rates (stiffness and damping, per mass), along the fitted motion. They are zero
+        for systems of several coordinates.
 
         Args:
             run: index of the run.
@@ -381,7 +381,7 @@ class RegressionEvidence:
         run_data = evaluator.prepared_runs[run]
         size, dimensions = int(evaluator.lengths[run]), len(system.coordinates)
         zeros = np.zeros((size, dimensions))
-        if system.uniform or dimensions != 1:
+        if dimensions != 1:
             return zeros, zeros
         times = run_data.scenario.times
         name = system.coordinates[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import compress
 
@@ -11,16 +10,13 @@ import numpy as np
 from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
-from sims.engines.compiled.ballistic_motion import fly_elements
 from sims.engines.compiled.data_layout import (
     FLOOR,
     GROUND_FRICTION,
     MIN_REMAINING_SHARE,
     RESTITUTION,
     BatchArrays,
-    Block,
 )
-from sims.engines.compiled.element_stepping import step_elements
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 from sims.engines.compiled.kernel import COMPILED, integrate_elements
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
@@ -38,9 +34,7 @@ def integrate_batch(
     """Integrate the motion of all elements of a batch in machine code.
 
     Elements with the same active effects have the same force program (see `force_program`), so
-    they are grouped by effects, and each group is integrated with its program. Where the force is
-    constant (a uniform system without effects that add force or friction), elements move on
-    parabolas in closed form; all others are integrated in steps.
+    they are grouped by effects, and each group is integrated with its program.
 
     Args:
         batch: batch to integrate.
@@ -60,11 +54,7 @@ def integrate_batch(
         columns += [c[:, elements, 0].T for _, c in effects]
         parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
         arrays = all_elements._replace(order=elements.astype(np.int64), parameters=parameters)
-        has_constant_force = batch.system.uniform and not any(
-            isinstance(e, (Force, Friction)) for e, _ in effects
-        )
-        integrate = fly_elements if has_constant_force else step_elements
-        _integrate_group(integrate, program, arrays, jobs)
+        _integrate_group(program, arrays, jobs)
     # A record is position, velocity and acceleration, one after the other.
     return Trajectories(*np.split(all_elements.records, 3, axis=2))
 
@@ -110,15 +100,11 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
 
 
 def _integrate_group(
-    function: Callable[[Block], None],
-    program: ForceProgram | NumpyForceProgram,
-    arrays: BatchArrays,
-    jobs: int,
+    program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, jobs: int
 ) -> None:
     """Integrate elements with equal effects, on several threads if there are enough of them.
 
     Args:
-        function: `step_elements` or `fly_elements`.
         program: force program of the effects.
         arrays: arrays of the batch, with the selected elements.
         jobs: maximum number of threads.
@@ -132,11 +118,10 @@ def _integrate_group(
         The number of slots is at most the number of elements, rounded up to whole SIMD vectors.
         """
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
-        # Elements in closed form are integrated one after the other.
-        width = 1 if function == fly_elements else min(program.block_width, padded_count)
+        width = min(program.block_width, padded_count)
         prepared = program.prepare(width)
         part = part._replace(queue=np.zeros_like(part.order))
-        integrate_elements(function, prepared.arrays, part, prepared.block, width)
+        integrate_elements(prepared.arrays, part, prepared.block, width)
         prepared.raise_error()
 
     # Every thread has its own buffers. No two threads write the same element, and the result of an

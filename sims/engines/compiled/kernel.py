@@ -7,7 +7,6 @@ from typing import Any
 
 from sims.engines.compiled import mujoco_callback
 from sims.engines.compiled.array_functions import ArrayFunctions, load_stored
-from sims.engines.compiled.ballistic_motion import fly_elements
 from sims.engines.compiled.data_layout import (
     BLOCK_SHAPES,
     BatchArrays,
@@ -27,14 +26,12 @@ COMPILED = ArrayFunctions(
     "the batch engine",
     {
         step_elements: BLOCK_SHAPES,
-        fly_elements: BLOCK_SHAPES,
         run_instructions: ("#i5", "#", "#", "rw", "#"),
     },
 )
 
 
 def integrate_elements(
-    function: Callable[[Block], None],
     program: ProgramArrays,
     arrays: BatchArrays,
     buffers: BlockBuffers,
@@ -43,7 +40,6 @@ def integrate_elements(
     """Integrate all elements of a batch.
 
     Args:
-        function: `step_elements` or `fly_elements`.
         program: program of the system and its effects.
         arrays: batch of elements.
         buffers: buffers of the slots, each of which holds one batch element at a time.
@@ -55,7 +51,7 @@ def integrate_elements(
     fields: tuple[Any, ...] = *program, *arrays[:-1], *buffers, arrays.steps_per_record, w
     block = Block(*fields)
     check_block(block)
-    COMPILED.bind(function, *block)()
+    COMPILED.bind(step_elements, *block)()
 
 
 def make_instruction_runner(
