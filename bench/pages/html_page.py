@@ -11,8 +11,6 @@ static then, and tables show their first rows.
 from __future__ import annotations
 
 import json
-import marshal
-import os
 import shlex
 import sys
 from base64 import b64encode
@@ -21,11 +19,10 @@ from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from types import CodeType
 from typing import TYPE_CHECKING, Any
 
 import jinja2
-from jinja2.bccache import Bucket, BytecodeCache
+from jinja2.bccache import Bucket, FileSystemBytecodeCache
 from markupsafe import Markup, escape
 
 from bench.pages.chart import Chart, Panel, PrintedFigure
@@ -120,7 +117,7 @@ def format_document(text: str, max_length: int = MAX_DOCUMENT_LENGTH) -> Markup:
     return escape("\n".join(indented))
 
 
-class CompiledTemplates(BytecodeCache):
+class CompiledTemplates(FileSystemBytecodeCache):
     """Cache of compiled templates; without permission to write, they are compiled every time.
 
     Args:
@@ -128,15 +125,9 @@ class CompiledTemplates(BytecodeCache):
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def load_bytecode(self, bucket: Bucket) -> None:
-        """Load the code of a template, if it was compiled from the same source."""
-        with suppress(OSError, ValueError, EOFError, TypeError):
-            content = self._get_path(bucket).read_bytes()
-            checksum = bucket.checksum.encode()
-            code = marshal.loads(content[len(checksum) :]) if content.startswith(checksum) else None
-            bucket.code = code if isinstance(code, CodeType) else None
+        # Bytecode depends on the version of Python and on that of Jinja2.
+        pattern = f"%s.{sys.implementation.cache_tag}-{jinja2.__version__}.bin"
+        super().__init__(str(folder), pattern)
 
     def dump_bytecode(self, bucket: Bucket) -> None:
         """Store the compiled code of a template on disk, for reuse in the next process.
@@ -144,20 +135,10 @@ class CompiledTemplates(BytecodeCache):
         Args:
             bucket: Jinja2's compiled template.
         """
-        if sys.dont_write_bytecode or bucket.code is None:
-            return
-        path = self._get_path(bucket)
-        # Another process may load the file while it is written.
-        temporary = path.with_suffix(f".{os.getpid()}")
-        with suppress(OSError):
-            self._folder.mkdir(exist_ok=True)
-            temporary.write_bytes(bucket.checksum.encode() + marshal.dumps(bucket.code))
-            temporary.replace(path)
-
-    def _get_path(self, bucket: Bucket) -> Path:
-        # Bytecode depends on the version of Python and on that of Jinja2.
-        name = f"{bucket.key}.{sys.implementation.cache_tag}-{jinja2.__version__}"
-        return self._folder / f"{name}.bin"
+        if not sys.dont_write_bytecode:
+            with suppress(OSError):
+                Path(self.directory).mkdir(exist_ok=True)
+                super().dump_bytecode(bucket)
 
 
 _PAGES_FOLDER = Path(__file__).parent
