@@ -66,7 +66,7 @@ def select_declared_columns(
     return [column for column in columns if column.name in names]
 
 
-def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
+def parse_parquet_column(column: ColumnSpec, values: pa.ChunkedArray) -> pa.Array:
     """Convert a column of a Parquet file to text, int64, float64 or bool.
 
     Integers are accepted where floats are declared, and empty cells of a float column become NaN.
@@ -105,7 +105,7 @@ def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
             raise CellError(row, column.name, column.expected_text, "nothing")
         values = compute.fill_null(values, np.nan)
     try:
-        return values.cast(_get_arrow_type(column))
+        return values.cast(_get_arrow_type(column)).combine_chunks()
     except pa.ArrowInvalid:  # A number that is too large for the type.
         raise CellError(
             None, column.name, column.expected_text, f"numbers beyond it ({kind})"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -172,10 +172,6 @@ class CsvTable:
         return next(lines, row + 2)
 
 
-_BATCH_ROWS = 131_072
-"""Number of rows checked at a time; all columns of many rows would not fit in memory."""
-
-
 class RunsTable(NamedTuple):
     """A file of runs.
 
@@ -197,27 +193,14 @@ class RunsTable(NamedTuple):
         place = "" if row is None else f", row {row}"
         return InputError(f"{self.path}{place}: {problem}; {self.remedy}")
 
-    def list_columns(self) -> list[str]:
-        """List the columns of the file.
-
-        Raises:
-            InputError: It is not a Parquet file.
-        """
-        from pyarrow import ArrowException, parquet
-
-        try:
-            return list(parquet.read_schema(self.path).names)
-        # In a damaged file even the names of columns may be invalid text.
-        except (OSError, ArrowException, UnicodeDecodeError) as error:
-            raise self._make_read_error(error) from None
-
     def read_runs(
         self, experiment: Experiment, records: Sequence[pa.Table] | None = None
     ) -> pd.DataFrame:
-        """Read one line per run, in the order of the file.
+        """Check all rows, and return one line per run, in the order of the file.
 
         Each line has the columns that are constant within the run, ``row``, at which it begins, and
-        ``used``, its last k.
+        ``used``, its last k. Columns are read one by one, since all of many rows would not fit in
+        memory.
 
         Args:
             experiment: Experiment of the runs.
@@ -227,25 +210,22 @@ class RunsTable(NamedTuple):
             InputError: The file is damaged; the message is one line.
         """
         import pyarrow as pa
-
-        try:
-            if records is None:
-                return read_checked_runs(self._read_batches(), self.list_columns(), experiment)
-            table = pa.concat_tables(records)
-            return read_checked_runs([table], table.column_names, experiment)
-        except CellError as error:
-            raise self.make_error(error.row, error.says) from None
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-            raise self._make_read_error(error) from None
-
-    def _read_batches(self) -> Iterator[pa.Table]:
-        """Yield the rows of the Parquet file in batches of at most `_BATCH_ROWS` rows."""
-        import pyarrow as pa
         from pyarrow import parquet
 
-        with parquet.ParquetFile(self.path) as file:
-            for batch in file.iter_batches(_BATCH_ROWS):
-                yield pa.Table.from_batches([batch])
+        try:
+            if records is not None:
+                table = pa.concat_tables(records)
+                return _read_checked_runs(table.select, table.column_names, experiment)
+            with parquet.ParquetFile(self.path) as file:
+                names = list(file.schema_arrow.names)
+                return _read_checked_runs(
+                    lambda columns: file.read(columns=columns), names, experiment
+                )
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+        # In a damaged file even the names of columns may be invalid text.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            raise self._make_read_error(error) from None
 
     def _make_read_error(self, error: Exception) -> InputError:
         """Make the one-line error for a file that is missing, or is not a Parquet file."""
@@ -274,16 +254,15 @@ def declare_run_columns(names: list[str], experiment: Experiment) -> list[Column
     return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
 
 
-def read_checked_runs(
-    batches: Iterable[pa.Table], names: list[str], experiment: Experiment
+def _read_checked_runs(
+    read_columns: Callable[[list[str]], pa.Table], names: list[str], experiment: Experiment
 ) -> pd.DataFrame:
     """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
 
-    A run has one row for each number of simulations k, in consecutive rows. The rows come in
-    batches that may divide a run, so each batch is checked together with the last row before it.
+    A run has one row for each number of simulations k, in consecutive rows.
 
     Args:
-        batches: The rows, as consecutive tables.
+        read_columns: Reads columns by their names.
         names: Names of the columns.
         experiment: Experiment of the runs.
 
@@ -291,161 +270,79 @@ def read_checked_runs(
         CellError: A cell or a run violates its declaration.
     """
     import pandas as pd
-
-    # Without runs there are no columns.
-    columns = (
-        select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
-    )
-    summaries: list[pd.DataFrame] = []
-    last_row: pa.Table | None = None
-    offset = 0
-    for batch in batches:
-        if not len(batch):
-            continue
-        rows = _convert_batch(batch, columns, last_row, offset)
-        summaries.append(_summarise_new_runs(rows, last_row is not None, offset))
-        offset += len(batch)
-        last_row = rows.slice(len(rows) - 1)
-    runs = (
-        pd.concat(summaries, ignore_index=True)
-        if summaries
-        else pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row"])
-    )
-    # k counts without gaps, so the number of rows gives the last k.
-    runs["used"] = np.diff(np.append(runs["row"].to_numpy(dtype=np.int64), offset)) - 1
-    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
-    if is_repeated.any():
-        place = int(is_repeated.argmax())
-        name = runs["run"].iloc[place]
-        raise CellError(int(runs["row"].iloc[place]), "run", "every run once", f"{name} again")
-    return runs
-
-
-def _convert_batch(
-    batch: pa.Table, columns: list[ColumnSpec], last_row: pa.Table | None, offset: int
-) -> pa.Table:
-    """Convert a batch of rows to its declared types, check it, and prepend the last row before it.
-
-    That row is needed to check a run that begins in one batch and continues in the next. Errors
-    name the row of the whole file.
-
-    Args:
-        batch: rows as text.
-        columns: declarations of the columns.
-        last_row: last row of the previous batch; None for the first batch.
-        offset: number of rows before this batch.
-
-    Raises:
-        CellError: A cell violates its declaration, or a run is incomplete.
-    """
     import pyarrow as pa
     from pyarrow import compute
 
-    try:
-        typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in columns}
-        at_start = typed["k"].to_numpy() == 0
-        is_recording = to_numpy_mask(compute.equal(typed["range"], "real"))
-        for column in columns:
-            check_cells(column, typed[column.name], at_start, is_recording)
-    except CellError as error:
-        row = None if error.row is None else error.row + offset
-        raise _shift_error_row(error, row) from None
-    batch_rows = pa.table(typed)
-    batch_rows = (
-        batch_rows
-        if last_row is None
-        else pa.concat_tables([last_row, batch_rows]).combine_chunks()
-    )
-    try:
-        _check_counts(batch_rows, last_row is not None)
-        _check_same(batch_rows)
-    except CellError as error:
-        raise _shift_error_row(error, (error.row or 0) + offset - (last_row is not None)) from None
-    return batch_rows
+    if not names:  # Without runs there are no columns.
+        return pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row", "used"])
+    columns = select_declared_columns(names, declare_run_columns(names, experiment))
+    declared = {column.name: column for column in columns}
+
+    def read(name: str) -> pa.Array:
+        return parse_parquet_column(declared[name], read_columns([name])[name])
+
+    run, k = read("run"), read("k").to_numpy()
+    is_recording = to_numpy_mask(compute.equal(read("range"), "real"))
+    is_run_start = np.ones(len(k), dtype=bool)
+    is_run_start[1:] = _find_changes(run)
+    _check_counts(run, k, is_run_start)
+    rows = np.flatnonzero(is_run_start)
+    constants = {"run": run.take(rows)}
+    for name, column in declared.items():
+        values = read(name)
+        check_cells(column, values, k == 0, is_recording)
+        if name in RUN_CONSTANT_COLUMNS or name.startswith("true_"):
+            _check_constant(name, values, ~is_run_start[1:])
+            constants[name] = values.take(rows)
+    # k counts without gaps, so the number of rows gives the last k.
+    used = np.diff(np.append(rows, len(k))) - 1
+    runs: pd.DataFrame = pa.table(constants).to_pandas().assign(row=rows, used=used)
+    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
+    if is_repeated.any():
+        place = int(is_repeated.argmax())
+        raise CellError(int(rows[place]), "run", "every run once", f"{runs['run'][place]} again")
+    return runs
 
 
-def _shift_error_row(error: CellError, row: int | None) -> CellError:
-    error.row = row
-    return error
-
-
-def _find_run_starts(rows: pa.Table) -> Mask:
-    """Return an (n,) mask of rows where a run begins, including the first row."""
-    return np.append(True, _find_changes(rows["run"]))
-
-
-def _find_changes(values: pa.ChunkedArray) -> Mask:
+def _find_changes(values: pa.Array) -> Mask:
     """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
     import pyarrow as pa
     from pyarrow import compute
 
-    column = values.combine_chunks()
-    if pa.types.is_floating(column.type):
-        numbers = column.to_numpy()
+    if pa.types.is_floating(values.type):
+        numbers = values.to_numpy()
         is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
         is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
         return is_changed
-    changed = compute.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0)))
-    return to_numpy_mask(changed)
+    return to_numpy_mask(compute.not_equal(values[1:], values[:-1]))
 
 
-def _check_counts(rows: pa.Table, goes_on: bool) -> None:
+def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> None:
     """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
-
-    `goes_on` is True if the first row is the last one of the batch before; it was checked there.
 
     Raises:
         CellError: k has another value, so that a row is missing or added.
     """
-    k: NDArray[np.int64] = rows["k"].to_numpy()
-    expected = np.append(0, k[:-1] + 1)
-    expected[_find_run_starts(rows)] = 0
-    if goes_on:
-        expected[0] = k[0]
+    expected = np.where(is_run_start, 0, np.roll(k, 1) + 1)
     is_wrong = k != expected
     if is_wrong.any():
         row = int(is_wrong.argmax())
-        run = rows["run"][row].as_py()
-        raise CellError(row, "k", f"{expected[row]}, the next of {run}", str(k[row]))
+        raise CellError(row, "k", f"{expected[row]}, the next of {run[row].as_py()}", str(k[row]))
 
 
-def _list_constant_columns(rows: pa.Table) -> list[str]:
-    """List the columns that are constant within a run."""
-    names = rows.column_names
-    return [name for name in names if name in RUN_CONSTANT_COLUMNS or name.startswith("true_")]
-
-
-def _check_same(rows: pa.Table) -> None:
-    """Check that the columns that describe a run are constant within it.
-
-    These are columns such as tuner and target, which are repeated in each row of the run.
+def _check_constant(name: str, values: pa.Array, is_same_run: Mask) -> None:
+    """Check that a column that describes a run, such as tuner and target, is constant within it.
 
     Args:
-        rows: Table in which the rows of a run follow each other.
+        name: Name of the column.
+        values: (n,) values, in which the rows of a run follow each other.
+        is_same_run: (n - 1,) mask of rows that belong to the run of the row before.
 
     Raises:
         CellError: a value differs from the row before.
     """
-    is_same_run = ~_find_run_starts(rows)[1:]
-    for name in _list_constant_columns(rows):
-        is_changed = _find_changes(rows[name]) & is_same_run
-        if is_changed.any():
-            row = int(is_changed.argmax()) + 1
-            values = rows[name].slice(row - 1, 2).to_pylist()
-            raise CellError(row, name, f"{values[0]} as in the row before", str(values[1]))
-
-
-def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
-    """Return one line for each run that begins in these rows, a batch of a larger file.
-
-    A line has the values that are constant within the run, and in ``row`` the row of the file at
-    which it begins. `goes_on` is True if the first row is the last one of the batch before, which
-    begins no run. `offset` is the number of rows before the batch.
-    """
-    new = _find_run_starts(rows)
-    if goes_on:
-        new[0] = False
-    places = np.flatnonzero(new)
-    keys = rows.select(["run", *_list_constant_columns(rows)])
-    summary: pd.DataFrame = keys.take(places).to_pandas()
-    return summary.assign(row=places + offset - goes_on)
+    is_changed = _find_changes(values) & is_same_run
+    if is_changed.any():
+        row = int(is_changed.argmax()) + 1
+        before, found = values[row - 1].as_py(), values[row].as_py()
+        raise CellError(row, name, f"{before} as in the row before", str(found))
