@@ -375,9 +375,9 @@ def _build_cells(
     """
     points = [k for k in _CURVE_POINTS if k <= tables.suite.budget]
     curve_tables = []
-    for cell, curves in tables.curves.items():
-        for tuner in curves.list_tuners():
-            values = curves.select(tuner=tuner).values[:, points]
+    for cell, by_tuner in tables.curves.items():
+        for tuner, curves in by_tuner.items():
+            values = curves.values[:, points]
             with np.errstate(invalid="ignore"):
                 low, median, high = np.percentile(values, [25, 50, 75], axis=0)
             columns = {"simulations": points, "median": median, "low": low, "high": high}
@@ -389,11 +389,10 @@ def _build_cells(
     cells = []
     for row in tables.suite.cells.itertuples():
         cell = str(row.cell)
-        present_tuners = set(tables.curves[cell].list_tuners())
         series = tuple(
             Series(name, "median", style, {"tuner": name, "cell": cell})
             for name, style in styles.items()
-            if name in present_tuners
+            if name in tables.curves[cell]
         )
         unit = "held-out RMSE" if row.range == "real" else "error [training widths]"
         panel = Panel(cell, "curves", "simulations", series, x_axis, Axis(f"{unit}, median", "log"))

@@ -8,7 +8,7 @@ for expected running times.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -40,32 +40,6 @@ TARGETS_SHARING_TRAINING = 10
 """Number of targets that share one training when its cost is counted."""
 _RESAMPLE_COUNT = 2000
 """Number of bootstrap resamples of cells."""
-ERROR_COLUMNS = ["cell", "tuner", "simulations", "median_error", "rank", "targets", "failures"]
-RANK_COLUMNS = ["training", "simulations", "tuner", "mean_rank", "low", "high", "cells"]
-PAIR_COLUMNS = [
-    "training",
-    "simulations",
-    "best",
-    "tuner",
-    "cells",
-    "best_better",
-    "error_ratio",
-    "p_value",
-    "p_holm",
-]
-ERT_COLUMNS = [
-    "cell",
-    "tuner",
-    "level",
-    "threshold",
-    "ert",
-    "low",
-    "high",
-    "ert_with_training",
-    "successes",
-    "runs",
-]
-PROFILE_COLUMNS = ["property", "value", "simulations", "tuner", "mean_rank", "cells"]
 FREE, COUNTED = "free", "counted"
 """Names of the two ways to count the cost of training: not at all, or shared by targets."""
 
@@ -74,6 +48,9 @@ FREE, COUNTED = "free", "counted"
 class SuiteTables:
     """Tables of a suite, each computed once.
 
+    A cell is a problem with one range of targets, see `suite_runs`. The cost of training is left
+    out (`FREE`), or shared by the targets (`COUNTED`).
+
     Attributes:
         suite: runs.
     """
@@ -81,25 +58,30 @@ class SuiteTables:
     suite: SuiteRuns
 
     @cached_property
-    def curves(self) -> dict[str, RunCurves]:
-        """Error curves of each cell: the error of each run after 0, 1, 2, ... simulations.
-
-        A cell is a problem with a range of targets, see `suite_runs`.
-        """
-        runs, curves_by_cell = self.suite.runs, {}
-        for cell in self.suite.cells["cell"]:
-            rows = (runs["cell"] == cell).to_numpy()
-            keys = runs[rows].reset_index(drop=True)
-            curves_by_cell[str(cell)] = RunCurves(
-                keys,
-                self.suite.errors[rows],
+    def curves(self) -> dict[str, dict[str, RunCurves]]:
+        """Error curves of the runs of each tuner, by cell and tuner."""
+        curves: dict[str, dict[str, RunCurves]] = {str(c): {} for c in self.suite.cells["cell"]}
+        for (cell, tuner), keys in self.suite.runs.groupby(["cell", "tuner"], sort=False):
+            curves[str(cell)][str(tuner)] = RunCurves(
+                keys.reset_index(drop=True),
+                self.suite.errors[keys.index],
                 keys["simulations"].to_numpy(dtype=np.int64),
                 keys["failed"].to_numpy(dtype=bool),
             )
-        return curves_by_cell
+        return curves
 
     @cached_property
-    def floors(self) -> dict[str, float]:
+    def _smallest_errors(self) -> dict[str, float]:
+        """Smallest median error of any tuner after all simulations, by cell."""
+        smallest = {}
+        for cell, by_tuner in self.curves.items():
+            with np.errstate(invalid="ignore"):
+                medians = [float(np.median(c.values[:, -1])) for c in by_tuner.values()]
+            smallest[cell] = min((m for m in medians if np.isfinite(m)), default=0.0)
+        return smallest
+
+    @cached_property
+    def _floors(self) -> dict[str, float]:
         """Error of each cell below which tuners count as equal.
 
         For simulated targets it is the `negligible_error` of the experiment. For a recording, whose
@@ -107,58 +89,15 @@ class SuiteTables:
         """
         floors = {}
         for row in self.suite.cells.itertuples():
-            floor = float(row.negligible_error)  # type: ignore[arg-type]
-            smallest = self._find_smallest_error(str(row.cell))
-            measured = row.range == "real"
-            floors[str(row.cell)] = (1.0 + floor) * smallest if measured else floor
+            cell, floor = str(row.cell), float(row.negligible_error)  # type: ignore[arg-type]
+            is_measured = row.range == "real"
+            floors[cell] = (1.0 + floor) * self._smallest_errors[cell] if is_measured else floor
         return floors
-
-    def _find_smallest_error(self, cell: str) -> float:
-        """Return the smallest median error of any tuner after all simulations.
-
-        Args:
-            cell: Name of the problem and range.
-        """
-        with np.errstate(invalid="ignore"):
-            medians = [np.median(c.values[:, -1]) for c in self._tuner_curves[cell].values()]
-        return min((float(m) for m in medians if np.isfinite(m)), default=0.0)
 
     @cached_property
     def checkpoints(self) -> tuple[int, ...]:
         """Numbers of simulations after which tuners are compared, within the budget."""
         return tuple(k for k in CHECKPOINTS if k <= self.suite.budget)
-
-    def compute_log_errors(self, cell: str, k: int, training: str = FREE) -> pd.DataFrame:
-        """Compute logarithms of errors after k simulations: a row per target, a column per tuner.
-
-        With training counted, a trained tuner has k less its share of the training simulations, and
-        no advance over the start before that. A regressor has its estimate of the parameters before
-        any simulation of the target, but not before its training.
-
-        Args:
-            cell: name of the cell.
-            k: number of simulations.
-            training: `FREE` or `COUNTED`.
-        """
-        columns = {}
-        for tuner, means in self._target_means[cell].items():
-            share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
-            target_means = means[max(int(k - share), 0)]
-            if share > k:
-                start_errors = self._start_errors[cell].reindex(target_means.index)
-                target_means = start_errors.fillna(target_means)
-            means_array: Array = np.asarray(target_means, dtype=np.float64)
-            logs = compute_log_errors(means_array, self.floors[cell])
-            columns[tuner] = pd.Series(logs, index=target_means.index)
-        return pd.DataFrame(columns)
-
-    @cached_property
-    def _tuner_curves(self) -> dict[str, dict[str, RunCurves]]:
-        """Curves of the runs of each tuner, by cell and tuner."""
-        return {
-            cell: {tuner: curves.select(tuner=tuner) for tuner in curves.list_tuners()}
-            for cell, curves in self.curves.items()
-        }
 
     @cached_property
     def _target_means(self) -> dict[str, dict[str, pd.DataFrame]]:
@@ -171,7 +110,7 @@ class SuiteTables:
                 tuner: pd.DataFrame(curves.values).groupby(curves.keys["target"]).mean()
                 for tuner, curves in by_tuner.items()
             }
-            for cell, by_tuner in self._tuner_curves.items()
+            for cell, by_tuner in self.curves.items()
         }
 
     @cached_property
@@ -181,14 +120,16 @@ class SuiteTables:
         The start is the point at which a tuner begins, before any simulation of its own; trained
         tuners may begin elsewhere.
         """
-        result = {}
-        for cell, curves in self.curves.items():
-            costs = {t: self._get_training_share(cell, t) for t in curves.list_tuners()}
-            untrained = curves.keys["tuner"].map(costs) == 0.0
-            errors = pd.Series(curves.values[untrained.to_numpy(), 0])
-            targets = curves.keys.loc[untrained, "target"].reset_index(drop=True)
-            result[cell] = errors.groupby(targets).min()
-        return result
+        start_errors = {}
+        for cell, by_tuner in self.curves.items():
+            errors = [pd.Series(dtype=float)]
+            errors += [
+                pd.Series(curves.values[:, 0], index=curves.keys["target"])
+                for tuner, curves in by_tuner.items()
+                if not self._get_training_share(cell, tuner)
+            ]
+            start_errors[cell] = pd.concat(errors[1:] or errors).groupby(level=0).min()
+        return start_errors
 
     def _get_training_share(self, cell: str, tuner: str) -> float:
         """Return a target's share of the training simulations of a tuner; 0 without training.
@@ -200,7 +141,7 @@ class SuiteTables:
         return self._fit_simulations.get((cell, tuner), 0.0) / TARGETS_SHARING_TRAINING
 
     @cached_property
-    def _fit_simulations(self) -> Mapping[tuple[str, str], float]:
+    def _fit_simulations(self) -> dict[tuple[str, str], float]:
         rows = self.suite.training.itertuples()
         return {(str(r.cell), str(r.tuner)): float(r.fit_simulations) for r in rows}  # type: ignore[arg-type]
 
@@ -209,22 +150,51 @@ class SuiteTables:
         return {tuner for (_, tuner), cost in self._fit_simulations.items() if cost > 0}
 
     @cached_property
-    def _median_log_errors(self) -> dict[tuple[str, int], pd.DataFrame]:
-        """Median log errors over targets: a row per cell and a column per tuner.
+    def _medians(self) -> dict[tuple[str, int], pd.DataFrame]:
+        """Median log errors over targets, by (`FREE` or `COUNTED`, number of simulations)."""
+        return {
+            (training, k): self._compute_medians(k, training)
+            for training in (FREE, COUNTED)
+            for k in self.checkpoints
+        }
 
-        The key is (training, k): whether the simulations of a training are counted (COUNTED) or not
-        (FREE), and the number of simulations.
-        """
-        errors_by_budget = {}
-        for training in (FREE, COUNTED):
-            for k in self.checkpoints:
-                rows = {
-                    cell: _compute_median_over_targets(self.compute_log_errors(cell, k, training))
-                    for cell in self.curves
+    def _compute_medians(self, k: int, training: str) -> pd.DataFrame:
+        medians = {}
+        for cell, by_tuner in self._target_means.items():
+            logs = pd.DataFrame(
+                {
+                    t: self._compute_log_errors(means, cell, t, k, training)
+                    for t, means in by_tuner.items()
                 }
-                frame = pd.DataFrame(rows).T
-                errors_by_budget[training, k] = frame[[t for t in self.suite.tuners if t in frame]]
-        return errors_by_budget
+            )
+            # NaN where the tuner has no run on a target.
+            values: Array = logs.to_numpy(dtype=np.float64)
+            medians[cell] = pd.Series(np.median(values, axis=0), index=logs.columns)
+        frame = pd.DataFrame(medians).T
+        return frame[[t for t in self.suite.tuners if t in frame]]
+
+    def _compute_log_errors(
+        self, means: pd.DataFrame, cell: str, tuner: str, k: int, training: str
+    ) -> pd.Series[float]:
+        """Compute the logarithms of the errors of a tuner after k simulations, by target.
+
+        With training counted, a trained tuner has k less its share of the training simulations, and
+        no advance over the start before that. A regressor has its estimate of the parameters before
+        any simulation of the target, but not before its training.
+
+        Args:
+            means: mean errors over seeds, a row per target, a column per number of simulations.
+            cell: name of the cell.
+            tuner: label of the tuner.
+            k: number of simulations.
+            training: `FREE` or `COUNTED`.
+        """
+        share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
+        errors = means[max(int(k - share), 0)]
+        if share > k:
+            errors = self._start_errors[cell].reindex(errors.index).fillna(errors)
+        logs = compute_log_errors(errors.to_numpy(dtype=np.float64), self._floors[cell])
+        return pd.Series(logs, index=errors.index)
 
     def get_medians(self, k: int, training: str = FREE) -> pd.DataFrame:
         """Return median log errors after k simulations: a row per cell, a column per tuner.
@@ -233,29 +203,26 @@ class SuiteTables:
             k: number of simulations.
             training: `FREE` or `COUNTED`.
         """
-        return self._median_log_errors[training, k]
+        return self._medians[training, k]
 
     def get_ranks(self, k: int) -> pd.DataFrame:
         """Rank the tuners in each cell; 1 is best, NaN where a tuner has no such run."""
-        # Rounding gives errors that differ by the last bit the same rank.
-        return self.get_medians(k).round(9).rank(axis=1)
+        return _rank_tuners(self.get_medians(k))
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Median errors and ranks by cell, tuner and number of simulations.
-
-        A cell is a problem with one range of targets. The columns are `ERROR_COLUMNS`.
-        """
+        """Median errors and ranks by cell, tuner and number of simulations."""
         lines = []
         for simulations in self.checkpoints:
             ranks = self.get_ranks(simulations)
-            for cell, by_tuner in self._tuner_curves.items():
-                for tuner, tuner_curves in by_tuner.items():
+            for cell, by_tuner in self.curves.items():
+                for tuner, curves in by_tuner.items():
                     with np.errstate(invalid="ignore"):
-                        median = float(np.median(tuner_curves.values[:, simulations]))
-                    counts = tuner_curves.keys["target"].nunique(), int(tuner_curves.failed.sum())
+                        median = float(np.median(curves.values[:, simulations]))
+                    counts = curves.keys["target"].nunique(), int(curves.failed.sum())
                     lines.append((cell, tuner, simulations, median, ranks.at[cell, tuner], *counts))
-        return pd.DataFrame(lines, columns=ERROR_COLUMNS)
+        columns = ["cell", "tuner", "simulations", "median_error", "rank", "targets", "failures"]
+        return pd.DataFrame(lines, columns=columns)
 
     @cached_property
     def complete_tuners(self) -> list[str]:
@@ -267,118 +234,76 @@ class SuiteTables:
     def ranks(self) -> pd.DataFrame:
         """Mean ranks over cells with 95 % bootstrap intervals, best first.
 
-        A cell is a problem with one range of targets. The cost of training is left out (FREE) or
-        shared by the targets (COUNTED). The intervals come from resampled cells: they say how far
-        the mean rank depends on the chosen problems. Only tuners with results in every cell are
-        ranked.
+        The intervals come from resampled cells: they say how far the mean rank depends on the
+        chosen problems. Only tuners with results in every cell are ranked.
         """
         lines = []
-        for training in (FREE, COUNTED):
-            for simulations in self.checkpoints:
-                ranks = (
-                    self.get_medians(simulations, training)[self.complete_tuners]
-                    .round(9)
-                    .rank(axis=1)
-                )
-                if ranks.empty:
-                    continue
-                rng = make_rng("suite ranks", simulations)
-                resamples = rng.integers(len(ranks), size=(_RESAMPLE_COUNT, len(ranks)))
-                for tuner, mean in ranks.mean().sort_values(kind="stable").items():
-                    resampled = ranks[tuner].to_numpy()[resamples].mean(axis=1)
-                    interval = compute_percentile_interval(resampled)
-                    lines.append((training, simulations, tuner, mean, *interval, len(ranks)))
-        return pd.DataFrame(lines, columns=RANK_COLUMNS)
-
-    def find_best(self, k: int, training: str = FREE) -> str:
-        """Return the tuner with the lowest mean rank after k simulations.
-
-        Args:
-            k: number of simulations.
-            training: `FREE` or `COUNTED`.
-        """
-        rows = self.ranks
-        rows = rows[(rows["training"] == training) & (rows["simulations"] == k)]
-        return str(rows["tuner"].iloc[0])
+        for (training, simulations), medians in self._medians.items():
+            ranks = _rank_tuners(medians[self.complete_tuners])
+            rng = make_rng("suite ranks", simulations)
+            resamples = rng.integers(len(ranks), size=(_RESAMPLE_COUNT, len(ranks)))
+            for tuner, mean in ranks.mean().sort_values(kind="stable").items():
+                resampled = ranks[tuner].to_numpy()[resamples].mean(axis=1)
+                interval = compute_percentile_interval(resampled)
+                lines.append((training, simulations, tuner, mean, *interval, len(ranks)))
+        columns = ["training", "simulations", "tuner", "mean_rank", "low", "high", "cells"]
+        return pd.DataFrame(lines, columns=columns)
 
     @cached_property
     def pairs(self) -> pd.DataFrame:
         """Test the best tuner against each other one over all cells.
 
-        A cell is a problem with one range of targets. The test is Wilcoxon's signed-rank test of
-        the median log errors, with Holm's correction for the number of tuners. One row per tuner,
-        number of simulations, and with or without training cost.
+        The test is Wilcoxon's signed-rank test of the median log errors, with Holm's correction for
+        the number of tuners. One row per tuner, number of simulations, and with or without training
+        cost.
         """
         lines = []
-        for training in (FREE, COUNTED):
-            for simulations in self.checkpoints:
-                medians = self.get_medians(simulations, training)[self.complete_tuners]
-                if medians.shape[1] < 2:
-                    continue
-                best = self.find_best(simulations, training)
-                other_tuners = [tuner for tuner in medians if tuner != best]
-                tests = {
-                    t: compare_pair(medians[best].to_numpy(), medians[t].to_numpy())
-                    for t in other_tuners
-                }
-                corrected = correct_holm(np.array([tests[t].p_value for t in other_tuners]))
-                for tuner, p_holm in zip(other_tuners, corrected, strict=True):
-                    test = tests[tuner]
-                    values = test.targets, test.a_better, test.ratio, test.p_value, float(p_holm)
-                    lines.append((training, simulations, best, tuner, *values))
-        return pd.DataFrame(lines, columns=PAIR_COLUMNS)
+        for key, all_medians in self._medians.items():
+            medians = all_medians[self.complete_tuners]
+            if medians.shape[1] < 2:
+                continue
+            best = str(_rank_tuners(medians).mean().idxmin())
+            tests = {
+                str(t): compare_pair(medians[best].to_numpy(), medians[t].to_numpy())
+                for t in medians
+                if t != best
+            }
+            corrected = correct_holm(np.array([test.p_value for test in tests.values()]))
+            for (tuner, test), p_holm in zip(tests.items(), corrected, strict=True):
+                values = test.targets, test.a_better, test.ratio, test.p_value, float(p_holm)
+                lines.append((*key, best, tuner, *values))
+        columns = ["training", "simulations", "best", "tuner", "cells", "best_better"]
+        columns += ["error_ratio", "p_value", "p_holm"]
+        return pd.DataFrame(lines, columns=columns)
 
     @cached_property
     def running_times(self) -> pd.DataFrame:
         """Compute expected running times to three error levels, also with the training's cost.
 
         The levels of a problem from recorded data are multiples of its smallest error, since its
-        true parameters are unknown.
+        true parameters are unknown. The training's cost is the part of it that falls on one target.
         """
         lines = []
         for row in self.suite.cells.itertuples():
             cell = str(row.cell)
-            smallest = self._find_smallest_error(cell)
-            levels = (
-                [factor * smallest for factor in MEASURED_LEVELS]
-                if row.range == "real"
-                else list(ERROR_LEVELS)
-            )
-            for tuner, curves in self._tuner_curves[cell].items():
+            levels: tuple[float, ...] = ERROR_LEVELS
+            if row.range == "real":
+                levels = tuple(f * self._smallest_errors[cell] for f in MEASURED_LEVELS)
+            for tuner, curves in self.curves[cell].items():
+                # Beyond the end of a smaller budget nothing is known.
+                is_incomplete = np.isnan(curves.values).any()
+                budget = int(np.max(curves.used)) if is_incomplete else self.suite.budget
                 share = self._get_training_share(cell, tuner)
                 for number, threshold in enumerate(levels, 1):
-                    lines.append(
-                        (
-                            cell,
-                            tuner,
-                            number,
-                            threshold,
-                            *self._compute_running_time(curves, threshold, share),
-                        )
-                    )
-        return pd.DataFrame(lines, columns=ERT_COLUMNS)
-
-    def _compute_running_time(
-        self, curves: RunCurves, threshold: float, share: float
-    ) -> tuple[float, ...]:
-        """Compute the expected running time (ERT) to an error threshold, with interval and cost.
-
-        Args:
-            curves: errors of the runs of one tuner over the number of simulations.
-            threshold: error to be reached.
-            share: part of the training cost that falls on one target, in simulations.
-
-        Returns:
-            ERT, its 95 % interval (two numbers), ERT with training, successes and number of runs.
-        """
-        # Beyond the end of a smaller budget nothing is known.
-        is_complete = ~np.isnan(curves.values).any(axis=1)
-        budget = self.suite.budget if is_complete.all() else int(np.max(curves.used))
-        effort = compute_effort(curves, threshold, budget)
-        resamples = draw_target_resamples(len(effort.successes), "suite")
-        low, high = compute_percentile_interval(effort.compute_ert(resamples))
-        ert = float(effort.compute_ert())
-        return ert, low, high, ert + share, int(effort.successes.sum()), effort.runs
+                    effort = compute_effort(curves, threshold, budget)
+                    ert, counts = float(effort.compute_ert()), effort.successes
+                    resamples = draw_target_resamples(len(counts), "suite")
+                    interval = compute_percentile_interval(effort.compute_ert(resamples))
+                    values = ert, *interval, ert + share, int(counts.sum()), effort.runs
+                    lines.append((cell, tuner, number, threshold, *values))
+        columns = ["cell", "tuner", "level", "threshold", "ert", "low", "high"]
+        columns += ["ert_with_training", "successes", "runs"]
+        return pd.DataFrame(lines, columns=columns)
 
     @cached_property
     def profile(self) -> pd.DataFrame:
@@ -388,48 +313,47 @@ class SuiteTables:
         and the number of cells.
         """
         lines = []
-        groups = [
-            (name, value, cells) for name, value, cells in self.list_properties() if len(cells)
-        ]
         for simulations in self.checkpoints:
-            ranks = self.get_medians(simulations)[self.complete_tuners].round(9).rank(axis=1)
-            for name, value, cells in groups:
-                for tuner, mean in ranks.loc[cells].mean().sort_values(kind="stable").items():
-                    lines.append((name, value, simulations, tuner, mean, len(cells)))
-        return pd.DataFrame(lines, columns=PROFILE_COLUMNS)
+            ranks = _rank_tuners(self.get_medians(simulations)[self.complete_tuners])
+            for name, value, mask in self._list_properties():
+                cells = list(self.suite.cells.loc[mask, "cell"])
+                means = ranks.loc[cells].mean().sort_values(kind="stable")
+                lines += [
+                    (name, value, simulations, tuner, mean, len(cells))
+                    for tuner, mean in means.items()
+                    if cells
+                ]
+        columns = ["property", "value", "simulations", "tuner", "mean_rank", "cells"]
+        return pd.DataFrame(lines, columns=columns)
 
-    def list_properties(self) -> Iterator[tuple[str, str, list[str]]]:
-        """Yield each property of problems with one of its values, and the cells that have it.
+    def _list_properties(self) -> Iterator[tuple[str, str, pd.Series[bool]]]:
+        """Yield each property of problems with one of its values, and a mask of cells with it.
 
-        Cells are those of the tables: one problem with one range of targets each. The properties
-        are the numbers of parameters, noise, range, simulator and data.
+        The properties are the numbers of parameters, noise, range, simulator and data.
         """
         cells = self.suite.cells
         tags = cells["tags"].str.split(";")
         dimension = cells["parameters"].astype(int)
         kind = cells["range"]
 
-        def list_cells(mask: pd.Series[bool]) -> list[str]:
-            return [str(cell) for cell in cells.loc[mask, "cell"]]
-
         def find_tagged(tag: str) -> pd.Series[bool]:
             return tags.map(lambda words: tag in words).astype(bool)
 
         # Once explain has extended a simulator, nothing is missing any more.
         misspecified = find_tagged("misspecified") & (kind != "after")
-        yield "parameters", "1", list_cells(dimension == 1)
-        yield "parameters", "2 or 3", list_cells((dimension > 1) & (dimension <= 3))
-        yield "parameters", "4 to 10", list_cells(dimension > 3)
+        yield "parameters", "1", dimension == 1
+        yield "parameters", "2 or 3", (dimension > 1) & (dimension <= 3)
+        yield "parameters", "4 to 10", dimension > 3
         for tag in ("noise-free", "low-noise", "noisy"):
-            yield "noise", tag, list_cells(find_tagged(tag))
-        yield "range", "in range", list_cells(kind.isin(["in", "before", "after"]))
-        yield "range", "wide", list_cells(kind == "wide")
-        yield "simulator", "complete", list_cells(~misspecified & (kind != "real"))
-        yield "simulator", "an effect is missing", list_cells(misspecified & (kind != "real"))
-        yield "data", "measured", list_cells(kind == "real")
-        yield "data", "robot from a model file", list_cells(find_tagged("robot"))
+            yield "noise", tag, find_tagged(tag)
+        yield "range", "in range", kind.isin(["in", "before", "after"])
+        yield "range", "wide", kind == "wide"
+        yield "simulator", "complete", ~misspecified & (kind != "real")
+        yield "simulator", "an effect is missing", misspecified & (kind != "real")
+        yield "data", "measured", kind == "real"
+        yield "data", "robot from a model file", find_tagged("robot")
 
-    def find_losses(self, tuner: str, k: int, factor: float = 3.0) -> pd.DataFrame:
+    def find_losses(self, tuner: str, k: int, factor: float) -> pd.DataFrame:
         """Find the cells in which a tuner's error is larger than the best one's by a factor.
 
         Args:
@@ -441,40 +365,27 @@ class SuiteTables:
             Columns cell, winner and ratio; the largest ratio first.
         """
         medians = self.get_medians(k)
-        if tuner not in medians:
-            return pd.DataFrame(columns=["cell", "winner", "ratio"])
-        lines = []
-        smallest, winners = medians.min(axis=1), medians.idxmin(axis=1)
-        excess = medians[tuner] - smallest
-        for cell in medians.index[excess > np.log(factor)]:
-            # exp(700) is close to the largest finite number.
-            ratio = float(np.exp(min(float(excess[cell]), 700.0)))
-            lines.append((str(cell), str(winners[cell]), ratio))
-        frame = pd.DataFrame(lines, columns=["cell", "winner", "ratio"])
-        return frame.sort_values("ratio", ascending=False, kind="stable", ignore_index=True)
+        excess = medians[tuner] - medians.min(axis=1)
+        # exp(700) is close to the largest finite number.
+        ratios = np.exp(excess.clip(upper=700.0))
+        losses = pd.DataFrame(
+            {"cell": medians.index, "winner": medians.idxmin(axis=1), "ratio": ratios}
+        )[excess > np.log(factor)]
+        return losses.sort_values("ratio", ascending=False, kind="stable", ignore_index=True)
 
     @cached_property
-    def over_common_targets(self) -> SuiteTables:
-        """Tables over the targets that every tuner of their cell ran.
+    def ranks_over_common_targets(self) -> pd.DataFrame:
+        """Mean ranks over the targets that every tuner of their cell ran; empty if these are all.
 
-        They compare slow tuners, which ran on some of the targets only, with the others. Without
-        such tuners they are these tables.
+        They compare slow tuners, which ran on some of the targets only, with the others.
         """
         runs = self.suite.runs
         tuner_counts = runs.groupby("cell")["tuner"].nunique()
         by_target = runs.groupby(["cell", "target"])["tuner"].transform("nunique")
         is_common = by_target == runs["cell"].map(tuner_counts)
-        return self if is_common.all() else SuiteTables(self.suite.select(is_common))
-
-    @property
-    def has_partial_tuners(self) -> bool:
-        """True if some tuners ran on some of the targets only."""
-        return self.over_common_targets is not self
-
-    @property
-    def ranks_over_common_targets(self) -> pd.DataFrame:
-        """Mean ranks over the targets that all tuners ran; empty if they ran on all targets."""
-        return self.over_common_targets.ranks if self.has_partial_tuners else self.ranks.iloc[:0]
+        if is_common.all():
+            return self.ranks.iloc[:0]
+        return SuiteTables(self.suite.select(is_common)).ranks
 
     def build_tables(self) -> dict[str, pd.DataFrame]:
         """Return all tables of the suite by name; the name is that of the CSV file."""
@@ -488,7 +399,8 @@ class SuiteTables:
         }
 
 
-def _compute_median_over_targets(logs: pd.DataFrame) -> pd.Series[float]:
-    """Return the median of each tuner; NaN where a target has no value."""
-    values: Array = logs.to_numpy(dtype=np.float64)
-    return pd.Series(np.median(values, axis=0), index=logs.columns)
+def _rank_tuners(medians: pd.DataFrame) -> pd.DataFrame:
+    """Rank the tuners, one a column, in each row; equal errors share a rank."""
+    # Rounding gives errors that differ by the last bit the same rank.
+    ranks: pd.DataFrame = medians.round(9).rank(axis=1)
+    return ranks

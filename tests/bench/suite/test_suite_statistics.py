@@ -47,7 +47,6 @@ def test_headline_names_the_best_untrained_method_too():
 
 def test_a_method_with_fewer_targets_is_ranked_on_the_common_ones():
     tables = make_tables()
-    assert not tables.has_partial_tuners
     assert tables.build_tables()["ranks_common_targets"].empty
     # Method "never" is better than all others on the first target, and did not run on the rest.
     suite = tables.suite
