@@ -368,9 +368,8 @@ class SuiteTables:
         excess = medians[tuner] - medians.min(axis=1)
         # exp(700) is close to the largest finite number.
         ratios = np.exp(excess.clip(upper=700.0))
-        losses = pd.DataFrame(
-            {"cell": medians.index, "winner": medians.idxmin(axis=1), "ratio": ratios}
-        )[excess > np.log(factor)]
+        columns = {"cell": medians.index, "winner": medians.idxmin(axis=1), "ratio": ratios}
+        losses: pd.DataFrame = pd.DataFrame(columns)[excess > np.log(factor)]
         return losses.sort_values("ratio", ascending=False, kind="stable", ignore_index=True)
 
     @cached_property
@@ -402,5 +401,4 @@ class SuiteTables:
 def _rank_tuners(medians: pd.DataFrame) -> pd.DataFrame:
     """Rank the tuners, one a column, in each row; equal errors share a rank."""
     # Rounding gives errors that differ by the last bit the same rank.
-    ranks: pd.DataFrame = medians.round(9).rank(axis=1)
-    return ranks
+    return medians.round(9).rank(axis=1)
