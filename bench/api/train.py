@@ -16,6 +16,7 @@ from bench.benchmark.problem.experiment import (
     load_experiment,
 )
 from bench.benchmark.problem.robot_experiment import complete_robot_experiment
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import ProgressFactory
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated
@@ -182,7 +183,7 @@ class LossRecorder:
     @property
     def ground(self) -> TrainingSimulator:
         """Counted simulator for evaluating the held-out loss."""
-        return TuningProblem(self.experiment).make_training_simulator(_HELD_OUT_SIMULATIONS)
+        return CountedTrainingSimulator(TuningProblem(self.experiment), _HELD_OUT_SIMULATIONS)
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         """Record one pass over the training data.

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.core.random_streams import make_rng
@@ -137,7 +138,7 @@ class Study:
     def data(self, spread, seed):
         if (spread, seed) not in self._data:
             practice, rng = (
-                self.problem.make_training_simulator(1600),
+                CountedTrainingSimulator(self.problem, 1600),
                 make_rng("tunenet study", *spread, seed),
             )
             self._data[spread, seed] = generate_training_data(practice, rng, 1600, *spread)
@@ -257,7 +258,7 @@ def cost(study):
     rows = []
     for tuner in (TuneNet(), TuneNetPublished()):
         begin = time.perf_counter()
-        tuner.fit(study.problem.make_training_simulator(1600), make_rng("cost"), 1600)
+        tuner.fit(CountedTrainingSimulator(study.problem, 1600), make_rng("cost"), 1600)
         seconds = time.perf_counter() - begin
         each = study.errors(tuner)[1]
         rows.append((tuner.name, seconds, 1e3 * np.median(each), 1e3 * np.percentile(each, 95)))

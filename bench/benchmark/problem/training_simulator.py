@@ -11,77 +11,30 @@ have any.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.robot_experiment import get_simulator_class
-from methods.tuner import BudgetExceededError, ScenarioInfo
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from methods.tuner import BudgetExceededError
 from sims import effects as library
-from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator, UnitCube
+from sims.core.simulator import Array, InputError, Scenario, Simulator
 
 _RANGE_TOLERANCE = 1e-9
 """Tolerance for points outside the training range, in the unit cube, because of rounding."""
-
-
-class TrainingProblem(Protocol):
-    """Problem that a tuner trains on, as `bench.benchmark.problem.tuning_problem.TuningProblem` is.
-
-    Attributes:
-        cube: map between bounds and unit cube.
-        scale: (C,) scale of the residuals of each channel.
-    """
-
-    cube: UnitCube
-    scale: Array
-
-    def draw_scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
-        """Draw the scenarios of one target."""
-
-    def describe_scenarios(self, scenarios: Sequence[Scenario]) -> ScenarioInfo:
-        """Return the scenario information that tuners get."""
-
-    def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
-        """Simulate points of the unit cube.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            points: (n, dim) points of the unit cube.
-            scenarios: runs to simulate.
-
-        Returns:
-            Observations (n, T, C).
-        """
-
-
-class RandomisedSimulation(Protocol):
-    """Simulator with effects that the tuned one lacks, for example `RandomisedSimulator`."""
-
-    def simulate(
-        self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
-    ) -> Array:
-        """Simulate points of the unit cube with random effects.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            rng: random generator of the effects.
-            points: (n, dim) points of the unit cube.
-            scenarios: runs to simulate.
-
-        Returns:
-            Observations (n, T, C).
-        """
 
 
 class CountedTrainingSimulator:
     """Training simulator of learned tuners; see `methods.tuner.TrainingSimulator`."""
 
     def __init__(
-        self, problem: TrainingProblem, budget: int, nuisance: RandomisedSimulation | None = None
+        self,
+        problem: TuningProblem,
+        budget: int,
+        nuisance: RandomisedSimulator | None = None,
+        check_request: Callable[[bytes], None] = lambda _: None,
     ) -> None:
         """Store the sizes that a tuner may know before its first simulation.
 
@@ -93,8 +46,10 @@ class CountedTrainingSimulator:
             budget: number of simulations allowed.
             nuisance: simulator with random effects that is used instead; None for the problem's
                 own.
+            check_request: called with the state of the generator and the points of each request.
         """
         self._problem = problem
+        self._check_request = check_request
         self._nuisance = nuisance
         self.dim = problem.cube.dim
         self.training = problem.cube.training
@@ -135,6 +90,7 @@ class CountedTrainingSimulator:
             BudgetExceededError: more simulations are requested than the budget allows.
         """
         points = np.asarray(points, dtype=np.float64)
+        self._check_request(repr(rng.bit_generator.state).encode() + points.tobytes())
         low, high = self.training
         if not ((points >= low - _RANGE_TOLERANCE) & (points <= high + _RANGE_TOLERANCE)).all():
             raise ValueError(
@@ -158,24 +114,6 @@ NO_EFFECT_SHARE = 0.5
 """Share of the training simulations without any of the effects."""
 
 
-class RandomisableProblem(Protocol):
-    """Problem that a tuner trains on, as `bench.benchmark.problem.tuning_problem.TuningProblem` is.
-
-    Attributes:
-        experiment: experiment with the effects and their ranges.
-        simulator: simulator that is tuned.
-        cube: map between bounds and unit cube.
-        channels: observed channels, in order.
-        simulated: number of simulations made so far.
-    """
-
-    experiment: Experiment
-    simulator: Simulator
-    cube: UnitCube
-    channels: tuple[Channel, ...]
-    simulated: int
-
-
 class RandomisedSimulator:
     """Simulator of a problem with additional effects whose coefficients are drawn at random.
 
@@ -185,7 +123,7 @@ class RandomisedSimulator:
         InputError: the simulator cannot have an effect, or the effect is tuned.
     """
 
-    def __init__(self, problem: RandomisableProblem) -> None:
+    def __init__(self, problem: TuningProblem) -> None:
         """Build the simulator with one more effect for every effect named in the [nuisance] table.
 
         `ranges` are the bounds from which each coefficient is drawn, by ``effect.coefficient``. The

@@ -23,7 +23,6 @@ from bench.benchmark.problem.robot_experiment import (
     get_simulator_class,
 )
 from bench.benchmark.problem.targets import Target
-from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from methods.tuner import ScenarioInfo
 from sims.core.simulator import (
     Array,
@@ -283,10 +282,6 @@ class TuningProblem:
         # One of the two differences is positive outside, both are negative inside.
         excess = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
         return float(max(0.0, (excess / self.cube.compute_training_widths()).max()))
-
-    def make_training_simulator(self, budget: int) -> CountedTrainingSimulator:
-        """Return the training simulator for a learned tuner."""
-        return CountedTrainingSimulator(self, budget)
 
 
 @contextmanager

@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
-
 from bench.benchmark.isolation.isolation_layers import RunEndedError, limited_memory
 from bench.benchmark.isolation.tuner_processes import (
     NOTHING_WRITTEN,
@@ -32,12 +30,14 @@ from bench.benchmark.runner.tuner_loop import (
     Evaluate,
     ProposalEvaluator,
     RunTrace,
-    TunerRun,
     drive_tuner,
 )
-from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_isolated_tuner
+from bench.benchmark.runner.tuner_process_reuse import (
+    RepeatedRequests,
+    retry_if_killed,
+    start_isolated_tuner,
+)
 from bench.benchmark.runner.tuner_training import (
-    NOT_REPRODUCIBLE_REASON,
     build_tuner,
     load_trained_tuner,
     read_weights,
@@ -133,9 +133,7 @@ def close_problem() -> None:
     _problems.clear()
 
 
-def execute_run(
-    experiment: Experiment, request: RunRequest, requests: list[Array] | None = None
-) -> RunOutcome:
+def execute_run(experiment: Experiment, request: RunRequest) -> RunOutcome:
     """Execute one run of a tuner on a target; a failure becomes a status of the run's trace.
 
     The tuner runs in this process if it is trusted, otherwise in an isolated one. Then it is
@@ -146,16 +144,20 @@ def execute_run(
     Args:
         experiment: configuration of the experiment.
         request: request of the run.
-        requests: points that an isolated tuner requested before its process was killed; None for a
-            run that is repeated here if that happens.
 
     Raises:
         HiddenSimulationError: more points were simulated than the tuner requested from the harness.
         RunEndedError: the tuner's process was killed externally several times.
     """
-    if request.tuned is not None and requests is None:
-        earlier_requests: list[Array] = []
-        return retry_if_killed(lambda: execute_run(experiment, request, earlier_requests))
+    requests = RepeatedRequests()
+    return retry_if_killed(lambda: _execute_once(experiment, request, requests))
+
+
+def _execute_once(
+    experiment: Experiment, request: RunRequest, requests: RepeatedRequests
+) -> RunOutcome:
+    """Execute a run that may be a repetition; see `execute_run`."""
+    requests.restart()
     problem = get_problem(experiment)
     target = request.target
     evaluator = ProposalEvaluator(problem, target.fitting)
@@ -178,8 +180,12 @@ def execute_run(
         with limited_memory(experiment.memory):
             trace = drive_tuner(_build_tuner(request), task, evaluator, rng, experiment.timeout)
     else:
-        repeated = _ReplayCheckedEvaluator(evaluator, [] if requests is None else requests)
-        trace, written, import_seconds = _run_isolated(experiment, request, task, repeated)
+
+        def evaluate(points: Array) -> tuple[Array, Array]:
+            requests.check(points.tobytes())
+            return evaluator(points)
+
+        trace, written, import_seconds = _run_isolated(experiment, request, task, evaluate)
     seconds = perf_counter() - started
     hidden_simulations = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises an error has counted simulations without a result.
@@ -196,38 +202,6 @@ def execute_run(
         )
     rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
     return RunOutcome(trace, rmse, heldout, seconds, written, import_seconds)
-
-
-class _ReplayCheckedEvaluator:
-    """Evaluator that checks that a repeated run makes the same requests.
-
-    A run is repeated if its process was killed externally. Otherwise a tuner that causes its own
-    kill could repeat its run until the result is good.
-    """
-
-    def __init__(self, evaluate: Evaluate, earlier_requests: list[Array]) -> None:
-        self._evaluate, self._before, self._place = evaluate, earlier_requests, 0
-
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Simulate points and compute their losses, if the request equals the one before a kill.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            points: (n, dim) points of the unit cube.
-
-        Returns:
-            Observations (n, T, C) and losses (n,).
-
-        Raises:
-            RunEndedError: the repeated run asks for other points than the first one.
-        """
-        if self._place == len(self._before):
-            self._before.append(points)
-        elif not np.array_equal(self._before[self._place], points):
-            raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
-        self._place += 1
-        return self._evaluate(points)
 
 
 def _list_stream_names(experiment: Experiment, request: RunRequest) -> tuple[str | int, ...]:
@@ -279,24 +253,7 @@ def _run_isolated(
                 tuner.child.end()
             return trace, written, tuner.import_seconds
     except RunEndedError as ended:
-        trace = drive_tuner(FailedTuner(ended), task, evaluate, make_rng(*names))
+        trace = RunTrace.make_unfinished(
+            ended.status, ended.reason or "its process did not start in time", task.start
+        )
         return trace, NOTHING_WRITTEN, 0.0
-
-
-@dataclass(frozen=True)
-class FailedTuner:
-    """Tuner that could not be built; its run fails at the start.
-
-    Attributes:
-        error: reason of the failure.
-    """
-
-    error: RunEndedError
-
-    def tune(self, _task: Task, _rng: object) -> TunerRun:
-        """Fail to start a run.
-
-        Raises:
-            RunEndedError: always.
-        """
-        raise self.error

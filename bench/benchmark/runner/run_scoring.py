@@ -24,16 +24,7 @@ def make_unfinished_outcome(
 
     It has no simulations, and its only recommendation is the start.
     """
-    no_values, start = np.empty(0), target.blinded.start[None]
-    trace = RunTrace(
-        status,
-        reason,
-        proposals=start[:0],
-        losses=no_values,
-        recommendations=start,
-        tuner_seconds=no_values,
-        simulator_seconds=no_values,
-    )
+    trace = RunTrace.make_unfinished(status, reason, target.blinded.start)
     unknown_errors = np.full((1, len(problem.channels)), np.nan)
     return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)
 

@@ -78,6 +78,19 @@ class RunTrace:
     tuner_seconds: Array
     simulator_seconds: Array
 
+    @classmethod
+    def make_unfinished(cls, status: str, reason: str, start: Array) -> RunTrace:
+        """Make the trace of a run without simulations; its only recommendation is the start.
+
+        Args:
+            status: status of the run.
+            reason: reason of the status.
+            start: (dim,) start of the run.
+        """
+        no_values = np.empty(0)
+        points = start[None]
+        return cls(status, reason, points[:0], no_values, points, no_values, no_values)
+
 
 class _DivergenceError(Exception):
     """A tuner proposed or recommended a point that is not finite."""

@@ -47,7 +47,11 @@ from bench.benchmark.runner.code_digest import (
     hash_source_folders,
     select_relevant_keys,
 )
-from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_isolated_tuner
+from bench.benchmark.runner.tuner_process_reuse import (
+    RepeatedRequests,
+    retry_if_killed,
+    start_isolated_tuner,
+)
 from bench.core.plugin_registries import tuners
 from bench.core.random_streams import make_seed_words
 from methods.tuner import BudgetExceededError, TrainingCallback, TrainingSimulator, Tuner
@@ -211,10 +215,6 @@ _RETRAIN_ADVICE = "delete it to train again"
 """Advice for a file that cannot be used; it is never repaired silently."""
 
 
-NOT_REPRODUCIBLE_REASON = "it was killed, and the repeated training requested other simulations"
-"""Reason of a run or training that was not reproducible after a kill."""
-
-
 class WeightsError(InputError):
     """A file of trained weights cannot be used."""
 
@@ -353,9 +353,9 @@ def train_or_load(
         WeightsError: there is a file, but it is damaged or belongs to another training.
         RunEndedError: the tuner failed in its process.
     """
-    earlier_requests: list[str] = []
+    requests = RepeatedRequests()
     return retry_if_killed(
-        lambda: _train_or_read_weights(experiment, request, watch, anew, earlier_requests)
+        lambda: _train_or_read_weights(experiment, request, watch, anew, requests)
     )
 
 
@@ -364,7 +364,7 @@ def _train_or_read_weights(
     request: TrainingRequest,
     callback: TrainingCallback | None,
     trains_anew: bool,
-    earlier_requests: list[str],
+    requests: RepeatedRequests,
 ) -> TrainingResult:
     """Train the tuner of a request, or check its weights in the cache; see `train_or_load`.
 
@@ -376,9 +376,9 @@ def _train_or_read_weights(
         request: names the tuner's entry and the seed, and how to build the tuner in isolation.
         callback: gets the losses of each epoch.
         trains_anew: train even if the cache has the weights.
-        earlier_requests: hashes of the simulations requested before an external kill; the repeated
-            training must make the same requests.
+        requests: simulations that were requested before an external kill.
     """
+    requests.restart()
     entry, seed = request.entry, request.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
@@ -392,13 +392,12 @@ def _train_or_read_weights(
     stream = make_seed_words(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
-    train = _train_in_process if request.tuned is None else _train_isolated
     randomised_simulator = RandomisedSimulator(problem) if entry.randomised else None
-    simulator = _ReplayCheckedSimulator(
-        problem, experiment.training_budget, earlier_requests, randomised_simulator
+    simulator = CountedTrainingSimulator(
+        problem, experiment.training_budget, randomised_simulator, requests.check
     )
     started = perf_counter()
-    state = train(request, simulator, stream, callback)
+    state = _train(request, simulator, stream, callback)
     seconds = perf_counter() - started
     problem.close()
     if randomised_simulator is not None:
@@ -412,66 +411,15 @@ def _train_or_read_weights(
     return TrainingResult(path, simulator.used, seconds)
 
 
-class _ReplayCheckedSimulator(CountedTrainingSimulator):
-    """Training simulator that checks that a repeated training makes the same requests.
-
-    A training is repeated if its process was killed externally. Otherwise a tuner that causes its
-    own kill could use the budget several times.
-    """
-
-    def __init__(
-        self,
-        problem: TuningProblem,
-        budget: int,
-        earlier_requests: list[str],
-        nuisance: RandomisedSimulator | None = None,
-    ) -> None:
-        """Store the hashes of the requests before a kill, which the repeated training must repeat.
-
-        `_before` is extended with each new request, and `_place` is the index of the next one.
-
-        Args:
-            problem: Problem to train on.
-            budget: Number of simulations allowed.
-            earlier_requests: Hashes of the requests of the training that was killed.
-            nuisance: Simulator with random effects; None for the problem's own.
-        """
-        super().__init__(problem, budget, nuisance)
-        self._before, self._place = earlier_requests, 0
-
-    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Simulate points, and check them against the requests before a kill.
-
-        See `CountedTrainingSimulator.simulate`.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            rng: random generator.
-            points: (n, dim) points of the unit cube.
-
-        Returns:
-            Observations (n, T, C).
-
-        Raises:
-            RunEndedError: the request differs from the one before the kill.
-        """
-        request = compute_digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
-        if self._place == len(self._before):
-            self._before.append(request)
-        elif self._before[self._place] != request:
-            raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
-        self._place += 1
-        return super().simulate(rng, points)
-
-
-def _train_in_process(
+def _train(
     request: TrainingRequest,
     simulator: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
     callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
-    """Train a trusted tuner in this process, and return its weights.
+    """Train a tuner, and return its weights.
+
+    A trusted tuner trains in this process, others in an isolated one; this process simulates.
 
     Args:
         request: tuner and seed of the training.
@@ -479,27 +427,11 @@ def _train_in_process(
         stream: words of the seed of the random stream.
         callback: receives the progress; None for no progress.
     """
-    tuner = build_tuner(request.entry)
-    tuner.watch = callback
-    tuner.fit(simulator, np.random.default_rng(stream), simulator.budget)
-    return tuner.state()
-
-
-def _train_isolated(
-    request: TrainingRequest,
-    simulator: CountedTrainingSimulator,
-    stream: NDArray[np.uint32],
-    callback: TrainingCallback | None,
-) -> Mapping[str, Array]:
-    """Train a tuner in its isolated process, and return its weights; this process simulates.
-
-    Args:
-        request: tuner and seed of the training.
-        simulator: training simulator that counts its simulations.
-        stream: words of the seed of the random stream.
-        callback: receives the progress; None for no progress.
-    """
-    assert request.tuned is not None
+    if request.tuned is None:
+        trusted_tuner = build_tuner(request.entry)
+        trusted_tuner.watch = callback
+        trusted_tuner.fit(simulator, np.random.default_rng(stream), simulator.budget)
+        return trusted_tuner.state()
     with start_isolated_tuner(request.tuned, request.seed, "run", request.hidden) as tuner:
         state = train_remotely(tuner.child, simulator, stream, callback)
     # These names are arguments of `np.savez` or reserved in the file.

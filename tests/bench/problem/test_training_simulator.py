@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from methods.tuner import BudgetExceededError
 from tests.sample_experiments import spring_experiment
@@ -13,7 +14,7 @@ LOW, HIGH = np.array([0.25, 0.2]), np.array([0.75, 0.6])
 
 @pytest.fixture
 def simulator(spring):
-    return TuningProblem(spring_experiment()).make_training_simulator(10)
+    return CountedTrainingSimulator(TuningProblem(spring_experiment()), 10)
 
 
 def test_every_simulation_counts_and_none_beyond_the_budget_is_made(simulator):

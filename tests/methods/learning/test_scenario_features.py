@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from methods.learning.input_features import ScenarioFeatures, compute_response_coefficients
 from methods.tuner import EMPTY_SCENE, ScenarioInfo
@@ -182,7 +183,7 @@ def test_experiments_tell_what_observations_do_not_show(name, initial, inputs):
         assert scene.initial.tolist() == [scenarios[0].initial["vx"], scenarios[0].initial["vy"]]
     if inputs[1] == 2:
         assert np.array_equal(scene.inputs[:, 1], scenarios[0].inputs["u2"])
-    practice = problem.make_training_simulator(4)
+    practice = CountedTrainingSimulator(problem, 4)
     practice.simulate(np.random.default_rng(0), practice.sample(np.random.default_rng(1), 2))
     assert np.array_equal(
         practice.scene.inputs, scene.inputs
@@ -197,7 +198,7 @@ def test_ball_drop_learns_the_same_weights_bit_for_bit():
             TuningProblem(load_experiment("ball-drop")),
             TuneNet(told=is_informed, epochs=2),
         )
-        tuner.fit(problem.make_training_simulator(64), np.random.default_rng(0), 64)
+        tuner.fit(CountedTrainingSimulator(problem, 64), np.random.default_rng(0), 64)
         states.append(tuner.state())
         problem.close()
     assert states[0].keys() == states[1].keys()
