@@ -28,7 +28,7 @@ from bench.benchmark.statistics.training_amortisation import (
     map_break_even_counts,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
-from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles, style_of
+from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles
 from bench.pages.chart import Axis, AxisSpan, Panel, ReferenceLine, Series, SeriesKind
 from bench.pages.text_format import format_number
 
@@ -91,7 +91,8 @@ class ComparisonView:
     @cached_property
     def style(self) -> TunerStyles:
         """Styles of the tuners, and their order by the deciding error."""
-        return style_of(self.experiment, self.statistics)
+        statistics = self.statistics
+        return TunerStyles(self.experiment, statistics.order, notes=statistics.notes)
 
     def get_tuner_styles(self, tuners: Iterable[str]) -> list[tuple[str, MarkStyle]]:
         """Return the tuners of a column, best first, each with its style."""

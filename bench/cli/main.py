@@ -23,9 +23,7 @@ from bench.cli.output import (
     EXIT_OK,
     EXIT_PROBLEMS_FOUND,
     CommandResult,
-    JsonWriter,
     OutputWriter,
-    TextWriter,
 )
 from sims.core.mujoco_import import set_glfw_library
 
@@ -230,7 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code of the command: 0, 2 for wrong input, others as in the table of exit codes.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    printer: OutputWriter = JsonWriter() if "--json" in words else TextWriter()
+    printer = OutputWriter("--json" in words)
     try:
         options = _parse_command_line(words)
     except _UsageError as error:

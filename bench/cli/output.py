@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from sims.core.plain_values import to_json_value
 
@@ -56,86 +56,42 @@ class CommandResult(NamedTuple):
     code: int = EXIT_OK
 
 
-class OutputWriter(Protocol):
-    """Prints the results of commands."""
+class OutputWriter:
+    """Prints the results of a command: lines for a person, or one JSON document for a program.
+
+    Args:
+        as_json: Whether stdout gets the JSON document and nothing else.
+    """
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
 
     def print_line(self, line: str) -> None:
-        """Print a line of text."""
-        ...
+        """Print a line of text; the JSON document contains its information."""
+        if not self._as_json:
+            print(line)
 
     def capture_output(self) -> AbstractContextManager[None]:
-        """Return the context in which the command runs."""
-        ...
+        """Return the context in which the command runs; other output than JSON goes to stderr."""
+        return _redirect_stdout_to_stderr() if self._as_json else nullcontext()
 
     def print_result(self, answer: CommandResult) -> None:
-        """Print the result of the command."""
-        ...
+        """Print the JSON document of a command, whose lines have been printed before."""
+        if self._as_json:
+            print(format_json(answer.document))
 
     def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
-        """Print why the command failed.
+        """Print why the command failed: a line on stderr, and the JSON document.
 
         Args:
-            kind: Kind of the error.
+            kind: Kind of the error; an internal error has a traceback instead of the line.
             message: One line.
             code: Exit code of the program.
         """
-        ...
-
-
-class TextWriter:
-    """Prints for a person: every line at once."""
-
-    def print_line(self, line: str) -> None:
-        """Print the line."""
-        print(line)
-
-    def capture_output(self) -> AbstractContextManager[None]:
-        """Return a context that changes nothing."""
-        return nullcontext()
-
-    def print_result(self, answer: CommandResult) -> None:
-        """Print nothing: all lines have been printed before."""
-
-    def print_error(self, kind: ErrorKind, message: str, code: int) -> None:  # noqa: ARG002
-        """Print one line on stderr, except for internal errors, which have a traceback.
-
-        Args:
-            kind: kind of the error.
-            message: text of the error.
-            code: exit code of the program; unused.
-        """
-        _print_warning(kind, message)
-
-
-class JsonWriter:
-    """Prints for a program: one JSON document on stdout, and nothing else there."""
-
-    def print_line(self, line: str) -> None:
-        """Ignore the line: the document contains its information."""
-
-    def capture_output(self) -> AbstractContextManager[None]:
-        """Return a context that redirects all output to stderr."""
-        return _redirect_stdout_to_stderr()
-
-    def print_result(self, answer: CommandResult) -> None:
-        """Print the document."""
-        print(format_json(answer.document))
-
-    def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
-        """Print the error as JSON, and as a line on stderr for logs.
-
-        Args:
-            kind: kind of the error.
-            message: text of the error.
-            code: exit code of the program.
-        """
-        _print_warning(kind, message)
-        print(format_json({"error": {"kind": kind, "message": message, "code": code}}))
-
-
-def _print_warning(kind: ErrorKind, message: str) -> None:
-    if kind != "internal":
-        print(f"simgap: {message}", file=sys.stderr)
+        if kind != "internal":
+            print(f"simgap: {message}", file=sys.stderr)
+        if self._as_json:
+            print(format_json({"error": {"kind": kind, "message": message, "code": code}}))
 
 
 def format_json(document: JsonDocument) -> str:

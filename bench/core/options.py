@@ -69,20 +69,12 @@ def takes_options(
     """
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
-        """Return the function that takes the fields of the options dataclass as its arguments.
-
-        `options` (the dataclass) and `name` are bound by the enclosing function.
-
-        Args:
-            function: Function of one options object.
-        """
         signature, function_name = inspect.signature(options), name or function.__name__
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> Result:
             bound = bind_checked(function_name, signature, get_hints(options), args, kwargs)
-            make_options: Callable[..., Options] = options
-            return function(make_options(**bound.arguments))
+            return function(options(*bound.args, **bound.kwargs))
 
         call.__name__ = function_name
         _set_signature(call, options, signature)
@@ -96,7 +88,8 @@ def with_options(
 ) -> Callable[[Callable[[Source, Options], Result]], Callable[Concatenate[Source, P], Result]]:
     """Decorate a function of a source and options: callers give the options as keyword arguments.
 
-    The arguments are checked as by `sims.core.argument_checks.check_arguments`.
+    The source is the first argument, such as the path of a recording. The arguments are checked as
+    by `sims.core.argument_checks.check_arguments`.
 
     Args:
         options: Frozen dataclass of the options.
@@ -105,20 +98,14 @@ def with_options(
     def decorate(
         function: Callable[[Source, Options], Result],
     ) -> Callable[Concatenate[Source, P], Result]:
-        """Return the function that takes a source and the options' fields as keyword arguments.
-
-        `source` is the first parameter of the decorated function, such as the path of a recording.
-        """
         source, _ = inspect.signature(function).parameters.values()
-        fields = inspect.signature(options).parameters.values()
-        keyword_parameters = [
-            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in fields
-        ]
-        signature = inspect.Signature([source, *keyword_parameters])
+        keywords = inspect.signature(options).parameters.values()
+        signature = inspect.Signature(
+            [source, *(option.replace(kind=option.KEYWORD_ONLY) for option in keywords)]
+        )
 
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Result:
-            """Check the arguments, collect them in the options dataclass, and call the function."""
             hints = {**get_hints(options), source.name: get_hints(function)[source.name]}
             arguments = bind_checked(function.__name__, signature, hints, args, kwargs).arguments
             make_options: Callable[..., Options] = options

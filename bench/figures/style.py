@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
     from bench.benchmark.problem.experiment import Experiment
-    from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
     from bench.benchmark.storage.reference_results import ReferenceResult
 
 
@@ -317,26 +316,6 @@ class TunerStyles:
     def get_category_offset(self, tuner: str) -> float:
         """Return a small shift along a category axis that places error bars side by side."""
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
-
-
-def style_of(
-    experiment: Experiment,
-    statistics: ComparisonStatistics,
-    references: Sequence[ReferenceResult] = (),
-    panels: Sequence[tuple[str, str]] = (),
-) -> TunerStyles:
-    """Return the styles of a comparison's tuners, in the order of its ranking.
-
-    Args:
-        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
-        statistics: Its statistics.
-        references: Reference results drawn behind the curves.
-        panels: Metric and range of each panel of curves against simulations; the legend says which
-            curves coincide in them.
-    """
-    notes = [statistics.notes, statistics.find_coinciding_curves(panels)]
-    joined_notes = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
-    return TunerStyles(experiment, statistics.order, references, joined_notes)
 
 
 def make_panel_grid(
