@@ -81,175 +81,8 @@ BAR_WIDTH = 10
 """Width of the bar, in characters."""
 
 
-class SearchProgress:
-    """The state of a running search: a `ProgressListener` that stores the latest events."""
-
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, budget: float | None = None
-    ) -> None:
-        """Begin with nothing done, no stage and no model found.
-
-        `_share` is the share of the search that is done, `_best` the effects of the best model so
-        far and the percentage of the gap that it closes, both as text.
-
-        Args:
-            clock: Returns the time in seconds.
-            budget: Seconds after which the search ends; None without such a limit.
-        """
-        self._clock = clock
-        self._budget = budget
-        self._started = clock()
-        self._name = ""
-        self._total: int | None = None
-        self._done = 0
-        self._best: tuple[str, str] | None = None
-        self._share = 0.0
-        self._is_searching = True
-        # The remaining time as estimated when the share last increased, and the time of that
-        # estimate.
-        self._estimate: float | None = None
-        self._estimated_at = self._started
-
-    def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a stage; see `ProgressListener`.
-
-        Args:
-            name: name of the stage.
-            total: number of its steps; None if it is unknown.
-        """
-        self._name, self._total, self._done = name, total, 0
-        self._redraw_if_due()
-
-    def advance(self, count: int = 1) -> None:
-        """Finish steps of the stage; see `ProgressListener`."""
-        self._done += count
-        self._redraw_if_due()
-
-    def found(self, effects: Sequence[str], share: float) -> None:
-        """Store the best model so far; see `ProgressListener`.
-
-        Args:
-            effects: names of the effects of the model.
-            share: share of the discrepancy that they explain, from 0 to 1.
-        """
-        # 99.96 % must not be shown as 100 %.
-        percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
-        self._best = " + ".join(effects), percent
-        self._redraw_if_due()
-
-    def completed(self, share: float) -> None:
-        """Estimate the remaining time from the share done; see `ProgressListener`.
-
-        The remaining time is the elapsed time multiplied by (1 - share) / share.
-
-        Args:
-            share: Share of the work that is done, 0 to 1.
-        """
-        # A model with more effects makes the share smaller, but a bar must not go back.
-        if share > self._share:
-            self._share = min(share, 1.0)
-            self._estimated_at = self._clock()
-            if self._share >= MIN_SHARE_FOR_ESTIMATE:
-                self._estimate = self.elapsed() * (1.0 - self._share) / self._share
-        self._redraw_if_due()
-
-    def _redraw_if_due(self) -> None:
-        """Show the state after an event; a display does so, and the state alone does nothing."""
-
-    def elapsed(self) -> float:
-        """Return the seconds since the search began."""
-        return self._clock() - self._started
-
-    def remaining(self) -> float | None:
-        """Return the estimated remaining seconds; None if unknown or if the search has ended.
-
-        The estimate assumes the mean speed so far. Between two events it counts down; if the next
-        event is overdue, it grows with the time since the last one.
-        """
-        if self._estimate is None or not self._is_searching:
-            return None
-        estimate_age = self._clock() - self._estimated_at
-        return max(self._estimate - estimate_age, MIN_REMAINING_RATIO * estimate_age)
-
-    def finish(self, name: str) -> None:
-        """End the search and begin a stage that follows it, such as drawing figures."""
-        self._is_searching = False
-        self.stage(name)
-
-    def lines(self, empty: str = "", full: str = "") -> Iterator[str]:
-        """Yield the state of the search as one line, first the longest form, then shorter ones.
-
-        The caller shows the first one that fits into the width of the terminal.
-
-        Args:
-            empty: Character of the bar for the part that is not done; empty for no bar.
-            full: Character of the bar for the part that is done.
-        """
-        # Rounded down: a full bar means that everything is done.
-        filled_width = int(BAR_WIDTH * self._share)
-        percent, bar = f"{100 * self._share:3.0f}% ", ""
-        if not self._is_searching:
-            # The share refers to the search, which may have ended early.
-            percent = ""
-        elif empty:
-            bar = f"|{full * filled_width}{empty * (BAR_WIDTH - filled_width)}| "
-        long = self._join_parts(
-            self._format_times(), self._format_stage(), self._format_best_so_far()
-        )
-        short = self._join_parts(
-            self._format_times(), self._format_stage(), self._format_best_so_far("best {1} % {0}")
-        )
-        yield f"simgap {percent}{bar}{long}"
-        yield f"{percent}{bar}{short}"
-        yield f"{percent}{short}"
-
-    def report(self) -> str:
-        """Return the state as a line of a log."""
-        times = self._format_times() if self.elapsed() >= 1.0 else ""
-        return self._join_parts(self._format_stage(), self._format_best_so_far(), times)
-
-    @staticmethod
-    def _join_parts(*parts: str) -> str:
-        return "; ".join(part for part in parts if part)
-
-    def _format_best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
-        return form.format(*self._best) if self._best is not None else ""
-
-    def _format_stage(self) -> str:
-        if self._total is None or self._total < 2:
-            return self._name
-        return f"{self._name}, {min(self._done, self._total)} of {self._total}"
-
-    def _format_times(self) -> str:
-        """Format the elapsed time, and the remaining time while the search is running.
-
-        With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
-        missing.
-        """
-        elapsed = format_clock(self.elapsed())
-        if not self._is_searching:
-            return elapsed
-        if self._budget is not None:
-            remaining_seconds = self._budget - self.elapsed()
-            remaining_text = (
-                f"at most {format_clock(remaining_seconds)} left"
-                if remaining_seconds > 0
-                else "budget used up, finishing this step"
-            )
-            return f"{elapsed}, {remaining_text}"
-        remaining = self.remaining()
-        return elapsed if remaining is None else f"{elapsed}, about {format_clock(remaining)} left"
-
-
-def format_clock(seconds: float) -> str:
-    """Return a duration as ``0:07`` or ``1:02:03``."""
-    minutes, seconds_part = divmod(round(max(seconds, 0.0)), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"
-
-
-class ProgressDisplay(SearchProgress):
-    """Context that shows a search's progress on stderr.
+class ProgressDisplay:
+    """Context that shows a search's progress on stderr: a `ProgressListener`.
 
     On a terminal it keeps one live line, which it erases at the end. Elsewhere it prints a line at
     most every `LOG_INTERVAL` seconds. Events only store values and read the clock, so that the
@@ -266,10 +99,12 @@ class ProgressDisplay(SearchProgress):
         stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Choose the form of the display; nothing is shown before the first event.
+        """Begin with nothing done and no model found; nothing is shown before the first event.
 
-        `_shown` is the live line now on the terminal, `_shown_at` the time of the last output, and
-        `_waiting` has permanent lines that are still to be printed.
+        `_share` is the share of the search that is done, `_best` the effects of the best model so
+        far and the percentage of the gap that it closes, both as text. `_shown` is the live line
+        now on the terminal, `_shown_at` the time of the last output, and `_waiting` has permanent
+        lines that are still to be printed.
 
         Args:
             budget: Seconds after which the search ends; None without such a limit.
@@ -278,7 +113,19 @@ class ProgressDisplay(SearchProgress):
             stream: Output stream; stderr if None.
             clock: Returns the time in seconds.
         """
-        super().__init__(clock, budget)
+        self._clock = clock
+        self._budget = budget
+        self._started = clock()
+        self._name = ""
+        self._total: int | None = None
+        self._done = 0
+        self._best: tuple[str, str] | None = None
+        self._share = 0.0
+        self._is_searching = True
+        # The remaining time as estimated when the share last increased, and the time of that
+        # estimate.
+        self._estimate: float | None = None
+        self._estimated_at = self._started
         self._stream = sys.stderr if stream is None else stream
         self._live = self._stream.isatty()
         self._silent = silent
@@ -315,7 +162,7 @@ class ProgressDisplay(SearchProgress):
         # An exception may have occurred while a line was written.
         self._busy = False
         with self._block_timer_writes():
-            self._erase_live_line()
+            self._write_live_line("")
             self._print_waiting()
         self._silent = True
 
@@ -332,7 +179,7 @@ class ProgressDisplay(SearchProgress):
     def paused(self) -> Iterator[None]:
         """Erase the live line while something else is printed on the terminal."""
         with self._block_timer_writes():
-            self._erase_live_line()
+            self._write_live_line("")
         self._busy = True
         try:
             yield
@@ -377,42 +224,160 @@ class ProgressDisplay(SearchProgress):
     def _draw_lines(self) -> None:
         """Write the waiting lines, then the live line on a terminal.
 
-        The longest form of the line that fits into the terminal is used.
+        The short form of the line is used if the long one does not fit into the terminal.
         """
         if self._waiting:
-            self._erase_live_line()
+            self._write_live_line("")
             self._print_waiting()
-        if not self._live or not self._name:
-            return
-        from tqdm.utils import disp_len, disp_trim
+        if self._live and self._name:
+            from tqdm.utils import disp_len, disp_trim
 
-        columns = _get_terminal_width(self._stream) - 1
-        lines = list(self.lines(*_choose_bar_characters(self._stream)))
-        line = next((candidate for candidate in lines if disp_len(candidate) <= columns), lines[-1])
-        line = disp_trim(line, columns)
-        # A terminal echoes ^C at the end of the line, so two more characters are overwritten.
-        padding = min(disp_len(self._shown) + 2, columns) - disp_len(line)
-        self._stream.write("\r" + line + " " * max(padding, 0) + "\b" * max(padding, 0))
-        self._stream.flush()
-        self._shown = line
+            columns = _get_terminal_width(self._stream) - 1
+            long, short = self.lines()
+            self._write_live_line(long if disp_len(long) <= columns else disp_trim(short, columns))
 
     def _print_waiting(self) -> None:
         while self._waiting:
             self._stream.write(f"simgap: {self._waiting.pop(0)}\n")
             self._stream.flush()
 
-    def _erase_live_line(self) -> None:
-        """Overwrite the live line with spaces; nothing to do without a terminal or a line.
+    def _write_live_line(self, line: str) -> None:
+        """Replace the live line; an empty one erases it.
 
         Two more characters are overwritten, because a terminal echoes ^C at the end of the line.
         """
-        if self._live and self._shown:
+        if line or self._shown:
             from tqdm.utils import disp_len
 
             width = min(disp_len(self._shown) + 2, _get_terminal_width(self._stream) - 1)
-            self._stream.write("\r" + " " * width + "\r")
+            padding = max(width - disp_len(line), 0)
+            end = "\b" * padding if line else "\r"
+            self._stream.write("\r" + line + " " * padding + end)
             self._stream.flush()
-            self._shown = ""
+            self._shown = line
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage; see `ProgressListener`.
+
+        Args:
+            name: name of the stage.
+            total: number of its steps; None if it is unknown.
+        """
+        self._name, self._total, self._done = name, total, 0
+        self._redraw_if_due()
+
+    def advance(self, count: int = 1) -> None:
+        """Finish steps of the stage; see `ProgressListener`."""
+        self._done += count
+        self._redraw_if_due()
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Store the best model so far; see `ProgressListener`.
+
+        Args:
+            effects: names of the effects of the model.
+            share: share of the discrepancy that they explain, from 0 to 1.
+        """
+        # 99.96 % must not be shown as 100 %.
+        percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
+        self._best = " + ".join(effects), percent
+        self._redraw_if_due()
+
+    def completed(self, share: float) -> None:
+        """Estimate the remaining time from the share done; see `ProgressListener`.
+
+        The remaining time is the elapsed time multiplied by (1 - share) / share.
+
+        Args:
+            share: Share of the work that is done, 0 to 1.
+        """
+        # A model with more effects makes the share smaller, but a bar must not go back.
+        if share > self._share:
+            self._share = min(share, 1.0)
+            self._estimated_at = self._clock()
+            if self._share >= MIN_SHARE_FOR_ESTIMATE:
+                self._estimate = self.elapsed() * (1.0 - self._share) / self._share
+        self._redraw_if_due()
+
+    def elapsed(self) -> float:
+        """Return the seconds since the search began."""
+        return self._clock() - self._started
+
+    def remaining(self) -> float | None:
+        """Return the estimated remaining seconds; None if unknown or if the search has ended.
+
+        The estimate assumes the mean speed so far. Between two events it counts down; if the next
+        event is overdue, it grows with the time since the last one.
+        """
+        if self._estimate is None or not self._is_searching:
+            return None
+        estimate_age = self._clock() - self._estimated_at
+        return max(self._estimate - estimate_age, MIN_REMAINING_RATIO * estimate_age)
+
+    def finish(self, name: str) -> None:
+        """End the search and begin a stage that follows it, such as drawing figures."""
+        self._is_searching = False
+        self.stage(name)
+
+    def lines(self) -> tuple[str, str]:
+        """Return the state of the search as one line, in a long form and in a short one."""
+        percent, bar = f"{100 * self._share:3.0f}% ", ""
+        if self._is_searching:
+            empty, full = _choose_bar_characters(self._stream)
+            # Rounded down: a full bar means that everything is done.
+            filled_width = int(BAR_WIDTH * self._share)
+            bar = f"|{full * filled_width}{empty * (BAR_WIDTH - filled_width)}| "
+        else:
+            # The share refers to the search, which may have ended early.
+            percent = ""
+        times, stage = self._format_times(), self._format_stage()
+        long = self._join_parts(times, stage, self._format_best_so_far())
+        short = self._join_parts(times, stage, self._format_best_so_far("best {1} % {0}"))
+        return f"simgap {percent}{bar}{long}", f"{percent}{short}"
+
+    def report(self) -> str:
+        """Return the state as a line of a log."""
+        times = self._format_times() if self.elapsed() >= 1.0 else ""
+        return self._join_parts(self._format_stage(), self._format_best_so_far(), times)
+
+    @staticmethod
+    def _join_parts(*parts: str) -> str:
+        return "; ".join(part for part in parts if part)
+
+    def _format_best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
+        return form.format(*self._best) if self._best is not None else ""
+
+    def _format_stage(self) -> str:
+        if self._total is None or self._total < 2:
+            return self._name
+        return f"{self._name}, {min(self._done, self._total)} of {self._total}"
+
+    def _format_times(self) -> str:
+        """Format the elapsed time, and the remaining time while the search is running.
+
+        With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
+        missing.
+        """
+        elapsed = format_clock(self.elapsed())
+        if not self._is_searching:
+            return elapsed
+        if self._budget is not None:
+            remaining_seconds = self._budget - self.elapsed()
+            remaining_text = (
+                f"at most {format_clock(remaining_seconds)} left"
+                if remaining_seconds > 0
+                else "budget used up, finishing this step"
+            )
+            return f"{elapsed}, {remaining_text}"
+        remaining = self.remaining()
+        return elapsed if remaining is None else f"{elapsed}, about {format_clock(remaining)} left"
+
+
+def format_clock(seconds: float) -> str:
+    """Return a duration as ``0:07`` or ``1:02:03``."""
+    minutes, seconds_part = divmod(round(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"
 
 
 def _can_use_timer() -> bool:

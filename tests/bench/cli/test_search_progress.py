@@ -21,7 +21,6 @@ from bench.cli.progress_display import (
     LOG_INTERVAL,
     TERMINAL_INTERVAL,
     ProgressDisplay,
-    SearchProgress,
     format_clock,
 )
 from bench.diagnosis.evaluation.search_control import SearchControl
@@ -101,7 +100,7 @@ def test_the_line_fits_the_terminal_and_keeps_what_matters_most(clock, columns, 
 
 
 def test_the_estimate_moves_every_two_seconds_without_any_event(clock):
-    progress = SearchProgress(clock)
+    progress = display(clock)
     clock.now += 20.0
     progress.completed(0.25)
     assert progress.remaining() == pytest.approx(60.0)
@@ -114,15 +113,15 @@ def test_the_estimate_moves_every_two_seconds_without_any_event(clock):
 
 
 def test_a_bar_does_not_go_back(clock):
-    progress = SearchProgress(clock)
+    progress = display(clock)
     clock.now += 10.0
     progress.completed(0.5)
     clock.now += 10.0
     progress.completed(0.3)
-    assert " 50% " in next(progress.lines("-", "#"))
+    assert " 50% " in progress.lines()[0]
     assert progress.remaining() == pytest.approx(5.0), "half of the time since the last event"
     progress.completed(0.99)
-    assert "|#########-|" in next(progress.lines("-", "#")), "full only where all is done"
+    assert "|█████████░|" in progress.lines()[0], "full only where all is done"
 
 
 def test_the_live_line_is_written_at_most_five_times_a_second(clock):
