@@ -57,8 +57,7 @@ def check_identifiability(
         evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
         evaluator.worker_pool = worker_pool
         worker_pool.register(evaluator)
-        floor = compute_noise_floor(evaluator, recording)
-        noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
         base = fit_base_model(evaluator, noise)
         if not np.isfinite(base.fit.cost):
             raise InputError(

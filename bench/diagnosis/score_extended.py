@@ -255,8 +255,7 @@ def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: 
         extended: extended simulator, with its parameters and coefficients.
         sigma: (C,) standard deviation of the noise, which weights the channels.
     """
-    no_autocorrelation = np.zeros(len(sigma))
-    runs = HeldOutRuns(evaluator, NoiseModel(sigma, no_autocorrelation))
+    runs = HeldOutRuns(evaluator, NoiseModel.make_white(sigma))
     (prediction,) = runs.fit_initial_states([build_theta(evaluator, extended)])
     return prediction.simulated
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from contextlib import closing
 
-import numpy as np
 import scipy.signal
 import scipy.special
 import scipy.stats  # noqa: F401 - loaded ahead
@@ -47,10 +46,7 @@ def _warm_up_search(system: str) -> None:
     with closing(
         RunEvaluator(kind, simulated.recording, simulated.recording.training(), "batch")
     ) as evaluator:
-        noise = NoiseModel(
-            compute_noise_floor(evaluator, simulated.recording).sigma,
-            np.zeros(len(evaluator.channels)),
-        )
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, simulated.recording).sigma)
         compute_directions(evaluator, fit_base_model(evaluator, noise).fit, evaluator.library)
 
 

@@ -663,8 +663,7 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
         evaluator: run evaluator of the runs to which models are fitted.
         recording: the recording, which may state the noise.
     """
-    sigma = compute_noise_floor(evaluator, recording).sigma
-    return NoiseModel(sigma, np.zeros(len(sigma)))
+    return NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
 
 
 def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) -> FollowedRuns:

@@ -724,8 +724,7 @@ def _build_rescaled_evaluator(
     evaluator = subject.evaluator(subject.rescale(factors))
     # The noise is scaled with its channel.
     scales = np.abs([factors.get(name, 1.0) for name in evaluator.channels])
-    sigma = subject.noise_floor * scales
-    return evaluator, NoiseModel(sigma, np.zeros(len(sigma)))
+    return evaluator, NoiseModel.make_white(subject.noise_floor * scales)
 
 
 def _fit_rescaled(

@@ -154,7 +154,7 @@ def compute_detection_limits(
     """
     # 1. Simulation.
     noise_floor = compute_noise_floor(evaluator, evaluator.recording)
-    white_noise = NoiseModel(noise_floor.sigma, np.zeros(len(noise_floor.sigma)))
+    white_noise = NoiseModel.make_white(noise_floor.sigma)
     fit = _linearise_extended(evaluator, extended, white_noise)
     if not np.isfinite(fit.simulated[np.isfinite(evaluator.observed)]).all():
         raise InputError(f"{evaluator.recording.path}: the simulation of it fails")

@@ -62,6 +62,11 @@ class NoiseModel:
     sigma: Array
     phi: Array
 
+    @classmethod
+    def make_white(cls, sigma: Array) -> NoiseModel:
+        """Make noise without autocorrelation of the given standard deviations (C,)."""
+        return cls(sigma, np.zeros(len(sigma)))
+
 
 def _make_unit_noise(phi: float) -> NoiseModel:
     """Return the noise of one channel with the given correlation and variance one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -435,13 +435,35 @@ class RunEvaluator:
             simulated += self.discretisation_correction[runs]
         return simulated
 
+    def simulate_all_runs(self, theta: Array, states: Array, share: float = 1.0) -> Array:
+        """Simulate every run with each of N sets of parameters.
+
+        Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
+        Args:
+            theta: (N, P) sets of parameters.
+            states: (N, R, s) initial states, or (R, s) for all sets.
+            share: fraction of each run, from its beginning, that is simulated.
+
+        Returns:
+            Simulated channels (N, R, T, C); NaN after the simulated share.
+        """
+        sets, runs = len(theta), len(self.prepared_runs)
+        states = np.broadcast_to(states, (sets, *self.initial_state_guesses.shape))
+        simulated = self.simulate(
+            np.repeat(theta, runs, axis=0),
+            np.tile(np.arange(runs), sets),
+            states.reshape(sets * runs, -1),
+            share,
+        )
+        return simulated.reshape(sets, runs, *simulated.shape[1:])
+
     def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
         """Simulate B batch elements in several engine calls, without cache and step correction.
 
-        1. Group the elements that need the same time steps: the slowest element of a call sets its
-           steps.
-        2. Split large groups, so that a call fits in memory and workers share the work.
-        3. Simulate the calls, and collect their results.
+        Elements that need the same time steps are simulated together, because the slowest element
+        of a call sets its steps. Large groups are split, so that a call fits in memory and workers
+        share the work.
 
         Shapes: T samples, C channels, P parameters, s states of a run.
 
@@ -460,32 +482,18 @@ class RunEvaluator:
         if not len(theta):
             return simulated_runs
 
-        # 1. Groups.
-        # The slowest element of a call sets its steps, so elements that need many steps are
-        # simulated separately.
-        groups = self.group_compatible(theta)
         max_batch_size = max(MIN_BATCH_SIZE, MAX_BATCH_SAMPLES // length)
         if self.is_cheap_to_split:
             max_batch_size = min(
                 max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
             )
-        # 2. Calls.
         element_indices, calls = [], []
-        for group in np.unique(groups):
-            elements = np.flatnonzero(groups == group)
-            for elements_of_call in np.array_split(elements, -(-elements.size // max_batch_size)):
-                element_indices.append(elements_of_call)
-                calls.append(
-                    (
-                        bool(group >= 2),
-                        theta[elements_of_call],
-                        runs[elements_of_call],
-                        states[elements_of_call],
-                        share,
-                    )
-                )
-        # 3. Results.
-        for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
+        for is_fine, part in self._split_into_calls(theta, max_batch_size):
+            element_indices.append(part)
+            calls.append((is_fine, theta[part], runs[part], states[part], share))
+        for number, simulated in self.worker_pool.map_unordered(
+            self, RunEvaluator._simulate_runs, calls
+        ):
             sample_count = simulated.shape[1]
             if len(calls) == 1 and sample_count == length:
                 return simulated
@@ -580,36 +588,10 @@ class RunEvaluator:
         """True if splitting a batch into several calls costs no time, as with compiled steps."""
         return self.kind.has_model or self.engine == "batch"
 
-    def _make_scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
-        """Return the scenarios (times, inputs, constants) of batch elements with freed constants.
-
-        A freed constant is fitted like a parameter, but passed to the simulator as a constant.
-
-        Shapes: P parameters.
-
-        Args:
-            theta: (L, P) parameters, which contain the constants.
-            runs: (L,) index of the run of each batch element.
-            share: initial share of each run to which its scenario is cut.
-        """
-        if share not in self._shortened_scenarios:
-            self._shortened_scenarios[share] = [
-                take_first_samples(run_data.scenario, int(np.ceil(share * len(run_data.observed))))
-                for run_data in self.prepared_runs
-            ]
-        # Elements of one run share its scenario object, so the simulator prepares it only once.
-        scenarios = [self._shortened_scenarios[share][run] for run in runs]
-        return [
-            self._set_freed_constants(scenario, element_theta)
-            for scenario, element_theta in zip(scenarios, theta, strict=True)
-        ]
-
-    def simulate_batch(
+    def _simulate_runs(
         self, is_fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
-        """Simulate L batch elements in one engine call; all of them have the same time step.
-
-        The caller has grouped the elements. Constants that are fitted are set in the scenarios.
+        """Simulate L batch elements of recorded runs in one engine call; runs in a worker.
 
         Shapes: P parameters, s states of a run.
 
@@ -624,13 +606,42 @@ class RunEvaluator:
         Returns:
             Observations (L, T', C).
         """
+        if share not in self._shortened_scenarios:
+            self._shortened_scenarios[share] = [
+                take_first_samples(run_data.scenario, int(np.ceil(share * len(run_data.observed))))
+                for run_data in self.prepared_runs
+            ]
+        # Elements of one run share its scenario object, so the simulator prepares it only once.
+        scenarios = [self._shortened_scenarios[share][run] for run in runs]
+        return self._call_engine(is_fine, theta, scenarios, states)
+
+    def _call_engine(
+        self, is_fine: bool, theta: Array, scenarios: Sequence[Scenario], states: Array
+    ) -> Array:
+        """Simulate L batch elements with one time step; arguments as those of `_simulate_runs`."""
         simulator = self._fine_step_simulator if is_fine else self.simulator
-        scenarios = self._make_scenarios(theta, runs, share)
-        # Fitted constants are in the scenarios; the simulator does not treat them as parameters.
+        # A freed constant is fitted like a parameter, but passed to the simulator as a constant.
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
-        system_theta = np.delete(theta, freed_indices, axis=1)
-        initial = dict(zip(self.state_names, states.T, strict=True))
-        return simulator.simulate_batch(system_theta, scenarios, initial)
+        return simulator.simulate_batch(
+            np.delete(theta, freed_indices, axis=1),
+            [self._set_freed_constants(*pair) for pair in zip(scenarios, theta, strict=True)],
+            dict(zip(self.state_names, states.T, strict=True)),
+        )
+
+    def _split_into_calls(
+        self, theta: Array, max_batch_size: int
+    ) -> Iterator[tuple[bool, Indices]]:
+        """Yield for each engine call whether it needs fine steps, and its batch elements.
+
+        Args:
+            theta: (L, P) parameters of the batch elements.
+            max_batch_size: maximum number of elements of a call.
+        """
+        groups = self.group_compatible(theta)
+        for group in np.unique(groups):
+            elements = np.flatnonzero(groups == group)
+            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
+                yield bool(group >= 2), part
 
     def simulate_scenarios(
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
@@ -654,20 +665,11 @@ class RunEvaluator:
         length = max(scenario.times.size for scenario in scenarios)
         simulated = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
-        freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
-        groups = self.group_compatible(theta)
-        for group in np.unique(groups):
-            simulator = self._fine_step_simulator if group >= 2 else self.simulator
-            elements = np.flatnonzero(groups == group)
-            for elements_of_call in np.array_split(elements, -(-elements.size // max_batch_size)):
-                part_scenarios = [
-                    self._set_freed_constants(scenarios[i], theta[i]) for i in elements_of_call
-                ]
-                initial = dict(zip(self.state_names, states[elements_of_call].T, strict=True))
-                observations = simulator.simulate_batch(
-                    np.delete(theta[elements_of_call], freed_indices, 1), part_scenarios, initial
-                )
-                simulated[elements_of_call, : observations.shape[1]] = observations
+        for is_fine, part in self._split_into_calls(theta, max_batch_size):
+            observations = self._call_engine(
+                is_fine, theta[part], [scenarios[i] for i in part], states[part]
+            )
+            simulated[part, : observations.shape[1]] = observations
         return simulated
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
@@ -754,16 +756,6 @@ def _is_effect_observable(effect: type[Effect], recorded_signals: set[str]) -> b
     """Return whether all signals that an effect (or effect family) acts on are recorded."""
     members = members_of(effect)
     return all(not member.signal or member.signal in recorded_signals for member in members)
-
-
-def _simulate_engine_call(evaluator: RunEvaluator, *call: Any) -> Array:
-    """Simulate one engine call; a module-level function, so that workers can run it.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        *call: arguments of `RunEvaluator.simulate_batch`.
-    """
-    return evaluator.simulate_batch(*call)
 
 
 def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Recording) -> Parameter:

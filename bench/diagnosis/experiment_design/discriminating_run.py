@@ -384,25 +384,9 @@ def _compute_discrimination(
         competing_model: fitted model with the other one.
         sigma: (C,) standard deviation of the noise of each channel.
     """
-    model_thetas = [model.fit.theta, competing_model.fit.theta]
-    # Freed constants are fitted with the parameters, but passed to the simulator as constants.
-    freed_indices = evaluator.base_indices[evaluator.system_parameter_count :]
-    theta = np.delete(np.stack(model_thetas), freed_indices, axis=1)
-    freed_names = [parameter.name for parameter in evaluator.freed_constants]
-    scenarios = []
-    for model_theta in model_thetas:
-        values = model_theta[freed_indices].tolist()
-        freed_constants = dict(zip(freed_names, values, strict=True))
-        constants = {**run.scenario.constants, **freed_constants}
-        scenarios.append(replace(run.scenario, constants=constants))
-
-    # Each model is one batch element of the call, both with the same initial states.
-    initial = {}
-    for name, value in zip(evaluator.state_names, run.states.tolist(), strict=True):
-        initial[name] = np.full(2, value)
-    model_prediction, competing_prediction = evaluator.simulator.simulate_batch(
-        theta, scenarios, initial
+    thetas = np.stack([model.fit.theta, competing_model.fit.theta])
+    predictions = evaluator.simulate_scenarios(
+        thetas, [run.scenario] * 2, np.stack([run.states] * 2)
     )
-    evaluator.simulation_count += 2
-    whitened_difference = (model_prediction - competing_prediction) / sigma
+    whitened_difference = (predictions[0] - predictions[1]) / sigma
     return float(np.sqrt(np.square(whitened_difference).mean()))  # (1)

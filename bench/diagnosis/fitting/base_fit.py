@@ -265,14 +265,9 @@ def compute_start_costs(
         share: fraction of each run, from its beginning, that counts.
         failed_residual: residual of a sample that could not be simulated.
     """
-    start_count, run_count = len(starts), len(evaluator.prepared_runs)
-    thetas = [s.theta for s in starts]
-    theta = np.repeat(thetas, run_count, axis=0)
-    states = np.concatenate([s.initial_states for s in starts])
-    run_indices = np.tile(np.arange(run_count), start_count)
-    simulated = evaluator.simulate(theta, run_indices, states, share)
-    simulated = simulated.reshape(start_count, run_count, *simulated.shape[1:])
-
+    thetas = np.array([s.theta for s in starts])
+    states = np.array([s.initial_states for s in starts])
+    simulated = evaluator.simulate_all_runs(thetas, states, share)
     # An abandoned start has no samples, and must not seem to fit them.
     unmasked_residuals = np.nan_to_num(evaluator.observed - simulated, nan=failed_residual)
     residuals = np.where(evaluator.get_sample_mask(share), unmasked_residuals, 0.0) / noise.sigma
@@ -565,17 +560,11 @@ def _evaluate_base(
     Returns:
         Observations (n, T, C) and losses (n,).
     """
-    set_count = len(base)
-    run_count = len(evaluator.prepared_runs)
     # No effect is active, because the coefficients after the base parameters are zero.
-    theta = np.tile(evaluator.get_nominal_theta(), (set_count, 1))
+    theta = np.tile(evaluator.get_nominal_theta(), (len(base), 1))
     theta[:, evaluator.base_indices] = base
-    simulated = evaluator.simulate(
-        np.repeat(theta, run_count, axis=0),
-        np.tile(np.arange(run_count), set_count),
-        np.tile(evaluator.initial_state_guesses, (set_count, 1)),
-    ).reshape(set_count, -1, observed.shape[1])
-
+    simulated = evaluator.simulate_all_runs(theta, evaluator.initial_state_guesses)
+    simulated = simulated.reshape(len(base), *observed.shape)
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)
     # An abandoned simulation is NaN, which is expected here.
     with np.errstate(invalid="ignore"):

@@ -450,7 +450,6 @@ class TrajectoryFitter:
             sample_mask: (R, T, C) samples that count in the cost.
         """
         # 1. Displace each unknown of each trial point.
-        run_count, state_count = self.evaluator.initial_state_guesses.shape
         state_indices = self._list_displaced_states()
         steps = [fit_state.compute_inward_steps(start.theta) for fit_state, start in trials]
         displaced_inputs = [
@@ -458,16 +457,9 @@ class TrajectoryFitter:
             for (fit_state, start), step in zip(trials, steps, strict=True)
         ]
         # 2. Simulate all of them.
-        # Batch elements are ordered by model, then by unknown, then by run.
-        thetas = np.concatenate(
-            [np.repeat(theta, run_count, axis=0) for theta, _ in displaced_inputs]
-        )
-        states = np.concatenate(
-            [begin_states.reshape(-1, state_count) for _, begin_states in displaced_inputs]
-        )
-        run_indices = np.tile(np.arange(run_count), len(thetas) // run_count)
-        simulated = self.evaluator.simulate(thetas, run_indices, states, self.share)
-        simulated = simulated.reshape(-1, run_count, *simulated.shape[1:])
+        # Sets of parameters are ordered by model, then by unknown.
+        thetas, states = (np.concatenate(parts) for parts in zip(*displaced_inputs, strict=True))
+        simulated = self.evaluator.simulate_all_runs(thetas, states, self.share)
 
         # 3. Compute differences and costs.
         points = []
@@ -502,13 +494,11 @@ class TrajectoryFitter:
             trials: each fit with its trial point.
             sample_mask: (R, T, C) samples that count in the cost.
         """
-        run_count = len(self.evaluator.initial_state_guesses)
-        simulated = self.evaluator.simulate(
-            np.concatenate([np.tile(start.theta, (run_count, 1)) for _, start in trials]),
-            np.tile(np.arange(run_count), len(trials)),
-            np.concatenate([start.initial_states for _, start in trials]),
+        simulated = self.evaluator.simulate_all_runs(
+            np.array([start.theta for _, start in trials]),
+            np.array([start.initial_states for _, start in trials]),
             self.share,
-        ).reshape(len(trials), run_count, *self.evaluator.observed.shape[1:])
+        )
         return [
             FitPoint(
                 start,

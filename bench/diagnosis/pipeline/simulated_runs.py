@@ -136,7 +136,7 @@ class SimulatedRuns:
 
         fitting = build_evaluator(recording.training())
         floor = compute_noise_floor(fitting, recording)
-        noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
+        noise = NoiseModel.make_white(floor.sigma)
         validation: Validation | None = None
         if held_out := recording.held_out():
             validation = HeldOutRuns(build_evaluator(held_out), noise)

@@ -376,8 +376,9 @@ class RunView(NamedTuple):
             channel_index: index of the channel.
         """
         observed = self.get_samples("observed", channel_index)
-        difference: Array = observed - self.get_samples(model, channel_index)
-        return difference / self.sigma[channel_index]
+        difference = observed - self.get_samples(model, channel_index)
+        residual: Array = difference / self.sigma[channel_index]
+        return residual
 
 
 def rank_runs(report: DiagnosisReportData) -> list[RunView]:

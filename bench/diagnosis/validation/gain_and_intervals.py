@@ -92,7 +92,6 @@ def compute_central_jacobian(
         The fit with the new Jacobian.
     """
     parameter_count = fit.free_indices.size
-    runs, state_count = fit.initial_states.shape
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
@@ -102,10 +101,9 @@ def compute_central_jacobian(
     theta, states = _displace_both_sides(fit, steps, bounds)
 
     # One call simulates both sides and all runs, because the engine steps a batch at once.
-    displaced_theta = theta.reshape(-1, fit.theta.size)
-    repeated_theta = np.repeat(displaced_theta, runs, axis=0)
-    run_indices = np.tile(np.arange(runs), len(displaced_theta))
-    simulated = evaluator.simulate(repeated_theta, run_indices, states.reshape(-1, state_count))
+    simulated = evaluator.simulate_all_runs(
+        theta.reshape(-1, fit.theta.size), states.reshape(-1, *fit.initial_states.shape)
+    )
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.

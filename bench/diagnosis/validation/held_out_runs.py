@@ -561,15 +561,12 @@ class CrossValidation:
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not removals:
             return thetas
-        run_count = len(evaluator.prepared_runs)
         thetas_without = np.stack([fits[i].theta for i, _ in removals])
         for theta_without, (_, name) in zip(thetas_without, removals, strict=True):
             theta_without[evaluator.get_coefficient_indices(name)] = 0.0
-        simulated_without = evaluator.simulate(
-            np.repeat(thetas_without, run_count, axis=0),
-            np.tile(np.arange(run_count), len(removals)),
-            np.concatenate([fits[i].initial_states for i, _ in removals]),
-        ).reshape(len(removals), *evaluator.observed.shape)
+        simulated_without = evaluator.simulate_all_runs(
+            thetas_without, np.stack([fits[i].initial_states for i, _ in removals])
+        )
         observed_mask = np.isfinite(evaluator.observed)
         for (i, name), simulated in zip(removals, simulated_without, strict=True):
             change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]

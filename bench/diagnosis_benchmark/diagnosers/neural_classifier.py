@@ -247,9 +247,7 @@ def _compute_network_input(
     with closing(
         RunEvaluator(kind, recording, list(recording.runs), "batch", candidates=())
     ) as evaluator:
-        noise = NoiseModel(
-            compute_noise_floor(evaluator, recording).sigma, np.zeros(len(evaluator.channels))
-        )
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
         fit = fit_base_model(evaluator, noise).fit
         residual = (evaluator.observed - fit.simulated) / noise.sigma
         rms = float(np.sqrt(np.nanmean(np.square(residual))))

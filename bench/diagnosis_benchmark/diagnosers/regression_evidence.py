@@ -130,7 +130,7 @@ class RegressionEvidence:
             case.kind, recording, runs, engine, candidates=list(case.library)
         )
         floor = compute_noise_floor(self.evaluator, recording)
-        self.noise = NoiseModel(floor.sigma, np.zeros(floor.sigma.size))
+        self.noise = NoiseModel.make_white(floor.sigma)
         self.stated: Mask = floor.is_stated
         self.base: BaseFit = fit_base_model(self.evaluator, self.noise)
         count = len(recording.training())
