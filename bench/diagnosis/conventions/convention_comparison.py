@@ -32,9 +32,9 @@ from bench.diagnosis.conventions.convention_hypotheses import (
     ConventionHypothesis,
     HypothesisGenerator,
     JointSignals,
-    SignalChange,
     find_copied_commands,
 )
+from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor

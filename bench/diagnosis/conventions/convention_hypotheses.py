@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
 from bench.diagnosis.identifiability import join_first_names
 from bench.logs.importing.joint_order import find_best_order
@@ -28,7 +29,6 @@ from sims.recording.log_formats.lerobot_dataset import range_scale
 from sims.recording.log_formats.log_files import LogFile, read_log
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import read_meta
-from sims.recording.unit_conversion import unwrapped
 
 TRIED_ZERO_OFFSETS = (
     np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
@@ -57,36 +57,6 @@ INTEGER_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class SignalChange:
-    """Signal of the model as a function of a recorded signal, in SI units.
-
-    Attributes:
-        source: Name of the recorded signal.
-        scale: Factor.
-        offset: Offset that is added after the factor.
-        unwrap: Whether whole turns are restored first.
-        command: Name of the command that determines the turn of a position; empty without one.
-    """
-
-    source: str
-    scale: float = 1.0
-    offset: float = 0.0
-    unwrap: bool = False
-    command: str = ""
-
-    def applied(self, signals: Mapping[str, Array]) -> Array:
-        """Return the signal (T,) in the convention of the model.
-
-        Args:
-            signals: Recorded signals by name, each (T,).
-        """
-        values = signals[self.source]
-        if self.unwrap:
-            values = unwrapped(values, signals.get(self.command))
-        return self.scale * values + self.offset
-
-
-@dataclass(frozen=True)
 class ConventionHypothesis:
     """Convention that may differ.
 
@@ -110,49 +80,16 @@ class ConventionHypothesis:
         return len(self.changes) + (self.late != 0.0)
 
     def applied(self, recording: Recording) -> Recording:
-        """Return the recording with its signals in the conventions of the model."""
-        noise = dict(recording.noise)
-        for name, change in self.changes.items():
-            if change.source in recording.noise:
-                noise[name] = abs(change.scale) * recording.noise[change.source]
-        return replace(recording, noise=noise, runs=tuple(map(self._apply_to_run, recording.runs)))
+        """Return the recording with its signals in the conventions of the model.
 
-    def _apply_to_run(self, run: Run) -> Run:
-        """Return one run with its signals converted to the conventions of the model.
-
-        `run.before` has, by signal name, the stacked pair of time stamps and values recorded before
-        the run; the values are converted like those of the run. The initial states are dropped if a
-        signal changes, because they were stated in the old convention.
+        The initial states are dropped if a signal changes, because they were stated in the old
+        convention.
         """
-        signals = {**run.inputs, **run.channels}
-        earlier = {name: values[1] for name, values in run.before.items()}
-
-        def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
-            """Return signals by name, with those that the hypothesis changes converted.
-
-            A change may need another signal, for example if two joints are exchanged.
-
-            Args:
-                values: signals to convert, (T,) by name.
-                source: all signals of the run, from which a changed one may be computed.
-            """
-            return {
-                name: self.changes[name].applied(source) if name in self.changes else unchanged
-                for name, unchanged in values.items()
-            }
-
-        before = {
-            name: np.stack([run.before[name][0], values])
-            for name, values in convert(earlier, earlier).items()
-        }
-        result = replace(
-            run,
-            channels=convert(run.channels, signals),
-            inputs=convert(run.inputs, signals),
-            before=before,
-            initial={} if self.changes else run.initial,
-        )
-        return _advance_inputs(result, self.late) if self.late else result
+        changed = change_signals(recording, self.changes)
+        runs = [replace(run, initial={}) if self.changes else run for run in changed.runs]
+        if self.late:
+            runs = [_advance_inputs(run, self.late) for run in runs]
+        return replace(changed, runs=tuple(runs))
 
     def add_offset_step(self, step: float) -> ConventionHypothesis:
         """Return the hypothesis with a step in rad added to its offsets."""

@@ -12,8 +12,8 @@ from bench.diagnosis.conventions.convention_comparison import ConventionDifferen
 from bench.diagnosis.conventions.convention_hypotheses import (
     UNKNOWN_COLUMN,
     ConventionHypothesis,
-    SignalChange,
 )
+from bench.diagnosis.conventions.signal_changes import SignalChange
 from sims.core.files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import toml_key, toml_text

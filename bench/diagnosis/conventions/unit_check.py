@@ -26,6 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
@@ -41,7 +42,7 @@ from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.verdict import Cause, RecordingFault
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
-from sims.recording.recording import Recording, Run
+from sims.recording.recording import Recording
 from sims.recording.recording_description import stated_columns
 from sims.system_simulator import SystemSimulator
 
@@ -310,10 +311,8 @@ class Subject:
 
     def rescale(self, factors: Mapping[str, float]) -> Recording:
         """Return the recording with signals multiplied by factors."""
-        recording = self.recording
-        noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
-        runs = tuple(_rescale_run(run, factors) for run in recording.runs)
-        return replace(recording, noise=noise, runs=runs)
+        changes = {name: SignalChange(name, factor) for name, factor in factors.items()}
+        return change_signals(self.recording, changes)
 
     @cached_property
     def noise_floor(self) -> Array:
@@ -370,14 +369,10 @@ def find_wrong_units(
         if after - 1.0 > max_excess or residual_share > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
-        if distinction == "sharp":
+        if distinction != "none":
             accepted.append((hypothesis, after))
-        elif distinction == "absorbed":
-            accepted.append((hypothesis, after))
-            alternative_texts += [
-                PARAMETER_AT_BOUND_TEXT.format(name)
-                for name in _list_parameters_at_bounds(evaluator, base.fit)
-            ]
+        if distinction == "absorbed":
+            alternative_texts += _describe_parameters_at_bounds(evaluator, base.fit)
     if not accepted:
         return None
     # 4. Choice.
@@ -443,13 +438,10 @@ def find_imitated_unit(
     # 2. Units.
     # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
+    alternatives = _describe_parameters_at_bounds(evaluator, base)
     for hypothesis in _generate_unit_hypotheses((signal,)):
         unit_factor = hypothesis.factors()[signal.name]
         if unit_factor * factor > 0 and abs(math.log(unit_factor / factor)) < GAIN_TOLERANCE:
-            alternatives = tuple(
-                PARAMETER_AT_BOUND_TEXT.format(name)
-                for name in _list_parameters_at_bounds(evaluator, base)
-            )
             return replace(
                 hypothesis.make_error(subject.file, None, None), alternatives=alternatives
             )
@@ -459,10 +451,6 @@ def find_imitated_unit(
             f"The fit makes {signal.signal_text} nearly independent of the simulation "
             f"(a sensor gain of {coefficient.value:.4g}), which is not an answer: "
             f"check the unit, the column and the sign of {signal.signal_text} in {subject.file}"
-        )
-        alternatives = tuple(
-            PARAMETER_AT_BOUND_TEXT.format(name)
-            for name in _list_parameters_at_bounds(evaluator, base)
         )
         return RecordingFault(
             signals=(signal.name,),
@@ -489,35 +477,20 @@ def _get_unit_gain(signal: Signal, unit: str) -> float:
     return signal.scale * UNITS[signal.si][unit]
 
 
-def _rescale_run(run: Run, factors: Mapping[str, float]) -> Run:
-    """Return the run with each signal named in `factors` multiplied by its factor.
-
-    `run.before` has pairs of time stamps and values recorded before the run; only the values are
-    multiplied.
-    """
-
-    def scaled(signals: Mapping[str, Array]) -> dict[str, Array]:
-        return {n: v * factors[n] if n in factors else v for n, v in signals.items()}
-
-    before = {
-        n: np.stack([v[0], v[1] * factors[n]]) if n in factors else v for n, v in run.before.items()
-    }
-    return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
-
-
-def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
-    """List the names of parameters whose value in the base fit is at a bound of their range.
+def _describe_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> tuple[str, ...]:
+    """Return a sentence for each parameter whose value in the base fit is at a bound of its range.
 
     Args:
         evaluator: the runs, with the bounds of the parameters.
         fit: fit of the base model: parameters, initial states, simulated runs and derivatives.
     """
-    names = []
-    for index in fit.free_indices.tolist():
-        parameter = evaluator.parameters[index]
-        if bound_of(float(fit.theta[index]), *parameter.bounds) is not None:
-            names.append(parameter.name)
-    return names
+    parameters = [evaluator.parameters[index] for index in fit.free_indices.tolist()]
+    values = fit.theta[fit.free_indices].tolist()
+    return tuple(
+        PARAMETER_AT_BOUND_TEXT.format(parameter.name)
+        for parameter, value in zip(parameters, values, strict=True)
+        if bound_of(value, *parameter.bounds) is not None
+    )
 
 
 def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:

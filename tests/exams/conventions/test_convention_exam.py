@@ -13,11 +13,12 @@ from bench.diagnosis.conventions.convention_comparison import (
     ConventionComparison,
     ConventionDifference,
 )
-from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
+from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis
 from bench.diagnosis.conventions.corrected_description import (
     correct_description,
     list_changed_tables,
 )
+from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.logs.recording_loading import load_recording
 from sims.core.toml_validation import read_toml

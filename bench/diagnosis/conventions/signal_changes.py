@@ -1,0 +1,92 @@
+"""Changes of recorded signals: another source, a factor, an offset, or whole turns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+from sims.recording.unit_conversion import unwrapped
+
+
+@dataclass(frozen=True)
+class SignalChange:
+    """Signal of the model as a function of a recorded signal, in SI units.
+
+    Attributes:
+        source: Name of the recorded signal.
+        scale: Factor.
+        offset: Offset that is added after the factor.
+        unwrap: Whether whole turns are restored first.
+        command: Name of the command that determines the turn of a position; empty without one.
+    """
+
+    source: str
+    scale: float = 1.0
+    offset: float = 0.0
+    unwrap: bool = False
+    command: str = ""
+
+    def applied(self, signals: Mapping[str, Array]) -> Array:
+        """Return the signal (T,) in the convention of the model.
+
+        Args:
+            signals: Recorded signals by name, each (T,).
+        """
+        values = signals[self.source]
+        if self.unwrap:
+            values = unwrapped(values, signals.get(self.command))
+        return self.scale * values + self.offset
+
+
+def change_signals(recording: Recording, changes: Mapping[str, SignalChange]) -> Recording:
+    """Return a recording with changed signals; stated noise is scaled with its signal.
+
+    Args:
+        recording: the recording.
+        changes: changes by the name of the signal.
+    """
+    noise = dict(recording.noise)
+    for name, change in changes.items():
+        if change.source in recording.noise:
+            noise[name] = abs(change.scale) * recording.noise[change.source]
+    runs = tuple(_change_run(run, changes) for run in recording.runs)
+    return replace(recording, noise=noise, runs=runs)
+
+
+def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
+    """Return one run with changed signals.
+
+    `run.before` has, by signal name, the stacked pair of time stamps and values recorded before the
+    run; the values are changed like those of the run.
+    """
+    signals = {**run.inputs, **run.channels}
+    earlier = {name: values[1] for name, values in run.before.items()}
+
+    def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
+        """Return signals by name, with the changed ones converted.
+
+        A change may need another signal, for example if two joints are exchanged.
+
+        Args:
+            values: signals to convert, (T,) by name.
+            source: all signals of the run, from which a changed one may be computed.
+        """
+        return {
+            name: changes[name].applied(source) if name in changes else unchanged
+            for name, unchanged in values.items()
+        }
+
+    before = {
+        name: np.stack([run.before[name][0], values])
+        for name, values in convert(earlier, earlier).items()
+    }
+    return replace(
+        run,
+        channels=convert(run.channels, signals),
+        inputs=convert(run.inputs, signals),
+        before=before,
+    )
