@@ -28,9 +28,9 @@ import numpy as np
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
+from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
+from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -522,17 +522,7 @@ def freeze_unidentified_parameters(
             if iteration == MAX_REFITS - 1
             else unidentified_indices[: (len(unidentified_indices) + 1) // 2]
         )
-        theta = base.fit.theta.copy()
-        theta[frozen_indices] = evaluator.get_nominal_theta()[frozen_indices]
         base = replace(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
-        )
-        # Fit the remaining parameters again.
-        start = replace(base.fit.make_start(), theta=theta)
-        base = replace(
-            base,
-            fit=TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
-                [start], FINAL_ITERATIONS
-            )[0],
-        )
+        ).refit_at_nominal(evaluator, noise, frozen_indices)
     return base

@@ -7,7 +7,7 @@ widened as far as physics allows, and the base model is fitted again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -86,6 +86,35 @@ class BaseFit:
         """Indices in theta of all base parameters that stay at their nominal values."""
         return self.insensitive_parameters | self.unidentified_parameters
 
+    def refit(
+        self, evaluator: RunEvaluator, noise: NoiseModel, start: FitStart | None = None
+    ) -> BaseFit:
+        """Return the model with its free parameters fitted again.
+
+        Args:
+            evaluator: evaluator that simulates the recorded runs.
+            noise: noise that weights the channels.
+            start: start of the fit; None for the present fit.
+        """
+        fitter = TrajectoryFitter(evaluator, noise, self.fixed_parameters)
+        (fit,) = fitter.fit_models([start or self.fit.make_start()], FINAL_ITERATIONS)
+        return replace(self, fit=fit)
+
+    def refit_at_nominal(
+        self, evaluator: RunEvaluator, noise: NoiseModel, fixed_indices: Collection[int]
+    ) -> BaseFit:
+        """Return the model fitted again with some fixed parameters at their nominal values.
+
+        Args:
+            evaluator: evaluator that simulates the recorded runs.
+            noise: noise that weights the channels.
+            fixed_indices: indices of fixed parameters that are set.
+        """
+        indices = list(fixed_indices)
+        theta = self.fit.theta.copy()
+        theta[indices] = evaluator.get_nominal_theta()[indices]
+        return self.refit(evaluator, noise, replace(self.fit.make_start(), theta=theta))
+
 
 def fit_base_model(
     evaluator: RunEvaluator,
@@ -138,24 +167,15 @@ def fit_base_model(
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
         compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
-        best = TrajectoryFitter(evaluator, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[
-            0
-        ]
+        best = BaseFit(best, frozenset()).refit(evaluator, noise).fit
 
     # 4. Insensitive parameters.
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
     base_indices = evaluator.base_indices.tolist()
     insensitive = frozenset(i for i in base_indices if not _is_sensitive(evaluator, best, i, noise))
-    if insensitive:
-        insensitive_indices = list(insensitive)
-        theta = best.theta.copy()
-        theta[insensitive_indices] = evaluator.get_nominal_theta()[insensitive_indices]
-        start = replace(best.make_start(), theta=theta)
-        best = TrajectoryFitter(evaluator, noise, insensitive).fit_models(
-            [start], FINAL_ITERATIONS
-        )[0]
-    return BaseFit(best, insensitive)
+    base = BaseFit(best, insensitive)
+    return base.refit_at_nominal(evaluator, noise, insensitive) if insensitive else base
 
 
 def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
@@ -173,12 +193,8 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
     correct_discretisation(evaluator, noise, base.fit.theta, base.fit.initial_states)
-    if evaluator.discretisation_correction is None:
-        return base
-    fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
-        [base.fit.make_start()], FINAL_ITERATIONS
-    )[0]
-    return replace(base, fit=fit)
+    is_corrected = evaluator.discretisation_correction is not None
+    return base.refit(evaluator, noise) if is_corrected else base
 
 
 def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
@@ -309,27 +325,25 @@ MAX_WIDENING_ROUNDS = 5
 """Maximum number of rounds: the range is then a thousand times as wide."""
 
 
-def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[int]:
-    """Return the indices in theta of fitted base parameters whose range should be widened.
+def _list_wider_bounds(evaluator: RunEvaluator, base: BaseFit) -> dict[str, Bounds]:
+    """Return wider ranges of fitted base parameters that are at a bound of their range, by name.
 
-    They are at a bound of their range, and physics allows values beyond this bound.
+    Parameters for which physics does not allow values beyond this bound are not included.
 
     Args:
         evaluator: the runs, with the present range of each parameter.
         base: fit of the base model within these ranges.
     """
-    indices_at_bounds = []
-    for parameter_index in evaluator.base_indices.tolist():
-        if parameter_index in base.fixed_parameters:
-            continue
-        low, high = evaluator.parameters[parameter_index].bounds
-        bound = bound_of(float(base.fit.theta[parameter_index]), low, high)
-        lower, upper = widen_range(
-            evaluator.parameters[parameter_index], get_physical_limits(evaluator, parameter_index)
-        )
-        if (bound == "low" and lower < low) or (bound == "high" and upper > high):
-            indices_at_bounds.append(parameter_index)
-    return indices_at_bounds
+    wider_bounds = {}
+    for index in evaluator.base_indices.tolist():
+        parameter = evaluator.parameters[index]
+        low, high = parameter.bounds
+        bound = bound_of(float(base.fit.theta[index]), low, high)
+        lower, upper = widen_range(parameter, get_physical_limits(evaluator, index))
+        is_widened = (bound == "low" and lower < low) or (bound == "high" and upper > high)
+        if is_widened and index not in base.fixed_parameters:
+            wider_bounds[parameter.name] = lower, upper
+    return wider_bounds
 
 
 def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
@@ -347,18 +361,11 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
         The base model; the same if no parameter is at a bound.
     """
     for _ in range(MAX_WIDENING_ROUNDS):
-        parameters_at_bounds = list_parameters_at_bounds(evaluator, base)
-        if not parameters_at_bounds or evaluator.search_control.is_over():
+        wider_bounds = _list_wider_bounds(evaluator, base)
+        if not wider_bounds or evaluator.search_control.is_over():
             break
-        new_bounds = {}
-        for i in parameters_at_bounds:
-            parameter = evaluator.parameters[i]
-            new_bounds[parameter.name] = widen_range(parameter, get_physical_limits(evaluator, i))
-        use_bounds(evaluator, new_bounds)
-        fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
-            [base.fit.make_start()], FINAL_ITERATIONS
-        )[0]
-        base = replace(base, fit=fit)
+        use_bounds(evaluator, wider_bounds)
+        base = base.refit(evaluator, noise)
     return base
 
 

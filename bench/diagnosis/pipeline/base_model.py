@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.diagnosis.fitting.base_fit import (
-    FINAL_ITERATIONS,
     BaseFit,
     correct_discretisation,
     find_start_with_tuner,
     fit_base_model,
     fit_wider,
 )
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.validation.held_out_runs import find_first_states
@@ -168,9 +166,7 @@ class BaseModel:
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
         if start is None:
             return self
-        fitter = TrajectoryFitter(runs.fitting, runs.noise, self.fit.fixed_parameters)
-        (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
-        return replace(self, fit=replace(self.fit, fit=fit))
+        return replace(self, fit=self.fit.refit(runs.fitting, runs.noise, start))
 
     def find_segment_duration(self) -> float | None:
         """Return the duration in seconds of segments that a simulation can follow.

@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
     is_likelier_soft,
@@ -121,10 +119,8 @@ class CauseSearch:
             stiff_runs.with_kind(make_soft_kind(stiff_runs.kind)), before=stiff_runs.before
         )
         evaluator, fit = runs.fitting, base.fit
-        fitter = TrajectoryFitter(evaluator, runs.noise, fit.fixed_parameters)
         start = replace(fit.fit.make_start(), initial_states=evaluator.initial_state_guesses)
-        (soft_fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
-        soft_base = BaseModel(runs, replace(fit, fit=soft_fit)).correct_step_errors()
+        soft_base = BaseModel(runs, fit.refit(evaluator, runs.noise, start)).correct_step_errors()
         rng = runs.make_rng()
         search = runs.create_search(soft_base.fit, rng)
         # Friction of the file keeps its form unless it is a free number.
