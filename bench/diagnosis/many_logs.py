@@ -6,14 +6,12 @@ row with the reason and does not affect the others.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
-from math import nan
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -21,7 +19,12 @@ import pandas as pd
 
 from bench.benchmark.runner.worker_pools import Pool
 from bench.diagnosis.explain import explain
-from bench.diagnosis.report.effect_and_unit_text import append_unit, format_label
+from bench.diagnosis.report.effect_and_unit_text import (
+    append_unit,
+    format_label,
+    format_number,
+    joined,
+)
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.logs.recording_loading import compute_recording_digest, make_log_names, read_content
 from bench.pages.text_format import format_csv
@@ -81,28 +84,52 @@ def format_log_table(rows: Sequence[LogResult]) -> str:
     return format_csv(LOG_COLUMNS, lines)
 
 
-def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
-    """Summarise how often each cause was found, and the range of its numbers.
+class CommonCause(NamedTuple):
+    """Cause over all logs: its effects, the names of its logs, and the ranges of its numbers."""
 
-    The most frequent cause comes first.
+    name: str
+    logs: list[str]
+    ranges: str
+
+
+def list_common_causes(rows: Sequence[LogResult]) -> list[CommonCause]:
+    """List the causes over all logs, the most common first.
+
+    Alternatives that the data of a log do not distinguish count as one cause.
     """
-    by_cause: dict[str, list[Mapping[str, Any]]] = {}
+    logs_by_cause: dict[str, list[str]] = {}
+    numbers_by_cause: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
     for row in rows:
         for cause in row.causes:
-            by_cause.setdefault(format_cause(cause), []).append(cause["coefficients"])
-    lines = []
-    for effects, coefficients in sorted(
-        by_cause.items(), key=lambda entry: (-len(entry[1]), entry[0])
-    ):
-        spans = []
-        for name, first in coefficients[0].items():
-            values = [c[name]["value"] for c in coefficients if name in c]
-            label = "" if name == "coefficient" else f"{name} "
-            low, high = min(values), max(values)
-            span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            spans.append(f"{label}{append_unit(span, first['unit'])}")
-        lines.append(f"{effects}: in {len(coefficients)} of {len(rows)} logs, {', '.join(spans)}")
-    return lines
+            name = format_cause(cause)
+            logs_by_cause.setdefault(name, []).append(row.log)
+            for coefficient, number in cause["coefficients"].items():
+                by_coefficient = numbers_by_cause.setdefault(name, {})
+                by_coefficient.setdefault(coefficient, []).append(number)
+    causes = [
+        CommonCause(name, logs, _format_ranges(numbers_by_cause.get(name, {})))
+        for name, logs in logs_by_cause.items()
+    ]
+    return sorted(causes, key=lambda cause: -len(cause.logs))
+
+
+def _format_ranges(numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Format the range of each coefficient over the logs, such as ``0.3 to 0.7 N``."""
+    parts = []
+    for name, estimates in numbers.items():
+        values = [estimate["value"] for estimate in estimates]
+        ends = dict.fromkeys(format_number(end, 4) for end in (min(values), max(values)))
+        label = "" if name == "coefficient" else f"{place_of(name)} "
+        parts.append(label + append_unit(" to ".join(ends), estimates[0]["unit"]))
+    return joined(parts)
+
+
+def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
+    """Summarise how often each cause was found, and the range of its numbers, as lines."""
+    return [
+        f"{cause.name}: in {len(cause.logs)} of {len(rows)} logs, {cause.ranges}"
+        for cause in list_common_causes(rows)
+    ]
 
 
 REPORT_FILE = "report.html"
@@ -141,10 +168,9 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
 
 def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     """Read the text of logs.csv as a table; names that look like numbers stay text."""
-    head, *lines = csv.reader(StringIO(format_log_table(rows)))
-    frame = pd.DataFrame(lines, columns=head)
-    for name in ("value", "low", "high", "gap_closed", "seconds"):
-        frame[name] = frame[name].map(lambda text: float(text) if text else nan).astype(float)
+    frame = pd.read_csv(StringIO(format_log_table(rows)), dtype=str, keep_default_na=False)
+    numeric = ["value", "low", "high", "gap_closed", "seconds"]
+    frame[numeric] = frame[numeric].apply(pd.to_numeric).astype(float)
     return frame
 
 

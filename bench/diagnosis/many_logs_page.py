@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import pandas as pd
 
 from bench.diagnosis import many_logs
-from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult, format_cause
+from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult
 from bench.diagnosis.report.effect_and_unit_text import (
-    append_unit,
     format_effect_name,
-    format_number,
     format_sentence,
     joined,
 )
@@ -100,6 +98,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     """
     logs = many_logs.build_log_table(rows, batch.folders)
     number_table = many_logs.build_number_table(rows)
+    causes = many_logs.list_common_causes(rows)
     charts = make_summary_charts(logs, number_table)
     page = HtmlPage()
     tables = {"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables}
@@ -112,7 +111,9 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         batch=batch,
         table_file=LOGS_TABLE_FILE,
         verdicts=_format_verdicts(rows),
-        causes=_list_causes(rows, number_table, batch),
+        causes=causes,
+        first_recordings=[batch.recordings[log] for cause in causes[:1] for log in cause.logs],
+        cause_text=_format_cause_text,
         closed=_ClosedShare(
             closed_shares.median(), closed_shares.min(), closed_shares.max(), len(closed_shares)
         )
@@ -167,49 +168,10 @@ def _format_verdicts(rows: Sequence[LogResult]) -> str:
     return joined(parts)
 
 
-class _CommonCause(NamedTuple):
-    """Cause in words, its name, its logs and their recordings, and the ranges of its numbers."""
-
-    text: str
-    name: str
-    logs: list[str]
-    recordings: list[Path]
-    ranges: str
-
-
-def _list_causes(
-    rows: Sequence[LogResult], numbers: pd.DataFrame, batch: BatchPageInput
-) -> list[_CommonCause]:
-    """List the causes over all logs, the most common first.
-
-    Alternatives that the data of a log do not distinguish count as one cause.
-
-    Args:
-        rows: results of the logs.
-        numbers: one row for each coefficient of a cause of a log, with the column ``cause``.
-        batch: the batch, with the path of each recording.
-    """
-    counts = Counter(format_cause(cause) for row in rows for cause in row.causes)
-    causes = []
-    for name, _ in counts.most_common():
-        logs = [row.log for row in rows if name in map(format_cause, row.causes)]
-        text = joined([format_effect_name(part) for part in name.split(" or ")], "or")
-        recordings = [batch.recordings[log] for log in logs]
-        ranges = _format_ranges(numbers[numbers["cause"] == name])
-        causes.append(_CommonCause(format_sentence(text)[:-1], name, logs, recordings, ranges))
-    return causes
-
-
-def _format_ranges(numbers: pd.DataFrame) -> str:
-    """Format the range of each coefficient of a cause, such as ``: 0.3 to 0.7 N``."""
-    parts = []
-    for name, values in numbers.groupby("name", sort=False):
-        ends = dict.fromkeys(
-            format_number(end) for end in (values["value"].min(), values["value"].max())
-        )
-        label = "" if name == "coefficient" else f"{many_logs.place_of(str(name))} "
-        parts.append(label + append_unit(" to ".join(ends), str(values["unit"].iloc[0])))
-    return f": {joined(parts)}" if parts else ""
+def _format_cause_text(name: str) -> str:
+    """Format the effects of a cause in words, as the beginning of a sentence."""
+    text = joined([format_effect_name(part) for part in name.split(" or ")], "or")
+    return format_sentence(text)[:-1]
 
 
 class SummaryCharts(NamedTuple):
