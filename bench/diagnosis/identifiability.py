@@ -34,15 +34,10 @@ from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.gain_and_intervals import (
-    MIN_EIGENVALUE,
-    PSEUDOINVERSE_CUTOFF,
-    UNIDENTIFIED_VARIANCE,
-    Z95,
-)
+from bench.diagnosis.validation.gain_and_intervals import Z95, invert_scaled
 from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import format_unit
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Parameter
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 
@@ -201,73 +196,29 @@ class _IdentifiabilityAssessment:
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance (D'D)^-1, eq. (1).
 
-        The columns of D, the whitened derivatives `self.parameters` (samples, parameters), are
-        first scaled to unit length, so that D'D is a matrix of correlations. Combinations of
-        parameters that the data do not determine (its eigenvalues below `MIN_EIGENVALUE`) get the
-        variance `UNIDENTIFIED_VARIANCE` instead of that of the pseudoinverse, which is zero. A
+        The columns of D are the whitened derivatives `self.parameters` (samples, parameters). A
         parameter without any influence has an infinite variance.
         """
-        columns = self.parameters
-        scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-        is_sensitive = scale > 0
-        covariance = np.full((scale.size, scale.size), np.inf)
-        unit_columns = columns[:, is_sensitive] / scale[is_sensitive]
-        correlation_inverse = np.linalg.pinv(
-            unit_columns.T @ unit_columns, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True
-        )
-        # The pseudoinverse has the variance zero for combinations that are not determined.
-        values, vectors = np.linalg.eigh(unit_columns.T @ unit_columns)
-        unidentified = vectors[:, values < MIN_EIGENVALUE]
-        correlation_inverse += UNIDENTIFIED_VARIANCE * unidentified @ unidentified.T
-        sensitive_block = np.ix_(is_sensitive, is_sensitive)
-        covariance[sensitive_block] = correlation_inverse / np.outer(
-            scale[is_sensitive], scale[is_sensitive]
-        )
-        # Interval of each parameter, and its correlations with the others.
+        curvature = self.parameters.T @ self.parameters
+        covariance = invert_scaled(curvature, curvature)
+        errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        errors = np.where(np.diagonal(curvature) > 0, errors, np.inf)
+        correlations = np.abs(covariance / np.outer(errors, errors))
+        free_indices = self.fit.free_indices.tolist()
+        names = [self.evaluator.parameters[i].name for i in free_indices]
         assessments = []
-        for column, index in enumerate(self.fit.free_indices.tolist()):
+        for index, error, row in zip(free_indices, errors.tolist(), correlations, strict=True):
             parameter = self.evaluator.parameters[index]
-            standard_error = np.sqrt(max(float(covariance[column, column]), 0.0))
-            confounders = []
-            for other_column, other_index in enumerate(self.fit.free_indices.tolist()):
-                if (
-                    column != other_column
-                    and np.isfinite(covariance[column, other_column])
-                    and is_sensitive[column]
-                    and is_sensitive[other_column]
-                ):
-                    corr = covariance[column, other_column] / np.sqrt(
-                        covariance[column, column] * covariance[other_column, other_column]
-                    )
-                    confounders.append(
-                        (self.evaluator.parameters[other_index].name, float(abs(corr)))
-                    )
-            low, high = parameter.bounds
+            confounders = [
+                pair for pair in zip(names, row.tolist(), strict=True) if pair[0] != parameter.name
+            ]
             assessments.append(
-                _classify_parameter(
-                    parameter.name,
-                    free=True,
-                    unit=parameter.unit,
-                    half_width=Z95 * standard_error,
-                    bounds=(low, high),
-                    confounders=confounders,
-                )
+                _classify_parameter(parameter.name, True, parameter, Z95 * error, confounders)
             )
         # The fit has frozen parameters to which the runs are insensitive.
-        for index in sorted(
-            set(self.evaluator.base_indices.tolist()) - set(self.fit.free_indices.tolist())
-        ):
+        for index in sorted(set(self.evaluator.base_indices.tolist()) - set(free_indices)):
             parameter = self.evaluator.parameters[index]
-            assessments.append(
-                _classify_parameter(
-                    parameter.name,
-                    free=True,
-                    unit=parameter.unit,
-                    half_width=np.inf,
-                    bounds=parameter.bounds,
-                    confounders=(),
-                )
-            )
+            assessments.append(_classify_parameter(parameter.name, True, parameter, np.inf, ()))
         return assessments
 
     def _assess_causes(self) -> list[ParameterIdentifiability]:
@@ -324,31 +275,14 @@ class _IdentifiabilityAssessment:
             ]
             is_single_coefficient = sum(1 for effect, _ in most_sensitive if effect == name) == 1
             label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
+            identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
             if probe.is_single_size:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
-                identifiability = _classify_parameter(
-                    label,
-                    free=False,
-                    unit=parameter.unit,
-                    half_width=0.0,
-                    bounds=parameter.bounds,
-                    confounders=confounders,
+                identifiability = replace(
+                    identifiability, half=np.nan, word=_rate_switching_effect(norm)
                 )
-                assessments.append(
-                    replace(identifiability, half=np.nan, word=_rate_switching_effect(norm))
-                )
-                continue
-            assessments.append(
-                _classify_parameter(
-                    label,
-                    free=False,
-                    unit=parameter.unit,
-                    half_width=half_width,
-                    bounds=parameter.bounds,
-                    confounders=confounders,
-                )
-            )
+            assessments.append(identifiability)
         return assessments
 
 
@@ -364,9 +298,8 @@ def _rate_switching_effect(noises: float) -> IdentifiabilityLevel:
 def _classify_parameter(
     name: str,
     free: bool,
-    unit: str,
+    parameter: Parameter,
     half_width: float,
-    bounds: tuple[float, float],
     confounders: Sequence[tuple[str, float]],
 ) -> ParameterIdentifiability:
     """Classify a parameter by the width of its 95 % interval as a share of its plausible range.
@@ -377,13 +310,12 @@ def _classify_parameter(
     Args:
         name: Name of the parameter or cause.
         free: Whether it is a free parameter of the model, not a possible cause.
-        unit: Unit of its value.
+        parameter: Parameter with its unit and plausible range.
         half_width: Half the width of its 95 % interval; infinite if the data are insensitive to it.
-        bounds: Plausible range.
         confounders: Other parameters with their correlation; only the strongly correlated ones are
             kept.
     """
-    low, high = bounds
+    low, high = parameter.bounds
     share = 2.0 * half_width / max(high - low, 1e-300)
     level: IdentifiabilityLevel = "not identifiable"
     if share <= MAX_WEAK_WIDTH:
@@ -394,7 +326,7 @@ def _classify_parameter(
     # Of several entries with one name, the strongest remains: it is the last in reversed order.
     named_confounders = tuple(dict(strong_confounders[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
     return ParameterIdentifiability(
-        name, free, unit, float(half_width), low, high, level, named_confounders
+        name, free, parameter.unit, float(half_width), low, high, level, named_confounders
     )
 
 

@@ -155,19 +155,27 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     Returns:
         Speed, 0 after the end of a run; None without recorded coordinates.
     """
-    squares = np.zeros(simulated.shape[:2])
-    recorded_coordinates = [
-        n for n in evaluator.simulator.system.coordinates if n in evaluator.channels
-    ]
-    for name in recorded_coordinates:
-        values = simulated[:, :, evaluator.channels.index(name)]
-        for run_index, run_data in enumerate(evaluator.prepared_runs):
-            sample_count = len(run_data.observed)
-            # A single sample has no slope.
-            if sample_count > 1:
-                slope = np.gradient(values[run_index, :sample_count], run_data.scenario.times)
-                squares[run_index, :sample_count] += np.square(slope)
-    return np.sqrt(np.nan_to_num(squares)) if recorded_coordinates else None
+    recorded = [n for n in evaluator.simulator.system.coordinates if n in evaluator.channels]
+    slopes = [_compute_slopes(evaluator, simulated, name) for name in recorded]
+    return np.sqrt(np.nan_to_num(np.square(slopes).sum(axis=0))) if recorded else None
+
+
+def _compute_slopes(evaluator: RunEvaluator, simulated: Array, channel: str) -> Array:
+    """Compute the time derivative (R, T) of a simulated channel; NaN after the end of a run.
+
+    Args:
+        evaluator: Run evaluator of the runs.
+        simulated: (R, T, C) simulated motion.
+        channel: name of the channel.
+    """
+    values = simulated[:, :, evaluator.channels.index(channel)]
+    slopes = np.full_like(values, np.nan)
+    for row, run_values, run_data in zip(slopes, values, evaluator.prepared_runs, strict=True):
+        count = len(run_data.observed)
+        # A single sample has no slope.
+        if count > 1:
+            row[:count] = np.gradient(run_values[:count], run_data.scenario.times)
+    return slopes
 
 
 def _find_lasting_stretches(mask: Mask) -> Mask:
@@ -398,13 +406,7 @@ def _iterate_joint_variables(
     if position in evaluator.channels:
         values = simulated[:, :, evaluator.channels.index(position)]
         yield f"position of {joint.name}", unit, values
-        slopes = np.full_like(values, np.nan)
-        for run_index, run_data in enumerate(evaluator.prepared_runs):
-            sample_count = len(run_data.observed)
-            if sample_count > 1:
-                slopes[run_index, :sample_count] = np.gradient(
-                    values[run_index, :sample_count], run_data.scenario.times
-                )
+        slopes = _compute_slopes(evaluator, simulated, position)
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
     elif rate in evaluator.channels:
         values = simulated[:, :, evaluator.channels.index(rate)]
