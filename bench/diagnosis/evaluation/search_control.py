@@ -24,8 +24,7 @@ from sims.core.document_fields import Document
 class ProgressListener(Protocol):
     """Receives the events of one search in the order in which they happen.
 
-    Every method returns quickly and never raises: a listener must not end or delay a search. The
-    methods of this class do nothing.
+    Every method returns quickly and never raises: a listener must not end or delay a search.
     """
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -51,8 +50,30 @@ class ProgressListener(Protocol):
         """Report the estimated share of the whole search that is finished, 0 to 1."""
 
 
-class SilentListener(ProgressListener):
-    """A listener that ignores all events."""
+class SilentListener:
+    """A `ProgressListener` that ignores all events."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Ignore the event.
+
+        Args:
+            name: unused.
+            total: unused.
+        """
+
+    def advance(self, count: int = 1) -> None:
+        """Ignore the event."""
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Ignore the event.
+
+        Args:
+            effects: unused.
+            share: unused.
+        """
+
+    def completed(self, share: float) -> None:
+        """Ignore the event."""
 
 
 StopReason = Literal["budget", "interrupt"]

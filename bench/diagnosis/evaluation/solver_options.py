@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -184,19 +185,17 @@ class _ReferenceMotions:
         self._motions: dict[IntegratorSettings, Array] = {}
 
     def of(self, numerics: IntegratorSettings) -> Array:
-        """Return the motion (R, T, C) with a step and integrator, NaN after the end of a run."""
-        if numerics not in self._motions:
-            self._motions[numerics] = self._simulate_with(numerics)
-        return self._motions[numerics]
+        """Return the motion (R, T, C) with a step and integrator, NaN after the end of a run.
 
-    def _simulate_with(self, numerics: IntegratorSettings) -> Array:
-        """Simulate the first runs with a given time step and integrator, at nominal parameters.
-
-        No effects are active. The result is (R, T, C).
+        It is simulated at the nominal parameters without effects.
         """
-        evaluator = self._evaluator
-        states = evaluator.initial_state_guesses[: len(self._checked_runs)]
-        return simulate_with_settings(evaluator, numerics, evaluator.get_nominal_theta(), states)
+        if numerics not in self._motions:
+            evaluator = self._evaluator
+            states = evaluator.initial_state_guesses[: len(self._checked_runs)]
+            self._motions[numerics] = simulate_with_settings(
+                evaluator, numerics, evaluator.get_nominal_theta(), states
+            )
+        return self._motions[numerics]
 
     def reference(self, model_settings: IntegratorSettings) -> Array | None:
         """Return the converged motion of the robot (R, T, C); None if no integrator converges.
@@ -212,33 +211,28 @@ class _ReferenceMotions:
         Args:
             model_settings: Time step, integrator and options of the model file.
         """
-        # 1. RK4.
-        for division in (1, 2, 5):
-            coarse, refined = (
-                self.of(
-                    model_settings._replace(
-                        timestep=model_settings.timestep / divisor, integrator="RK4"
-                    )
-                )
-                for divisor in (division, 2 * division)
-            )
-            if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
-                return refined
-        # 2. Extrapolation.
-        for division in (2, 5):
-            extrapolated = []
-            for divisor in (division, 2 * division):
-                coarse, refined = (
-                    self.of(
-                        model_settings._replace(
-                            timestep=model_settings.timestep / k, integrator=STIFF_INTEGRATOR
-                        )
-                    )
-                    for k in (divisor, 2 * divisor)
-                )
-                extrapolated.append(2.0 * refined - coarse)  # (1)
-            if self.compute_rms_difference(*extrapolated) < CONVERGENCE_TOLERANCE:
-                return extrapolated[1]
+
+        def simulate(integrator: str, divisor: int) -> Array:
+            """Simulate with another integrator and a part of the time step of the file."""
+            timestep = model_settings.timestep / divisor
+            return self.of(model_settings._replace(timestep=timestep, integrator=integrator))
+
+        def extrapolate(divisor: int) -> Array:
+            """Extrapolate to the step zero from a part of the time step and half of it, eq. (1)."""
+            coarse, refined = (simulate(STIFF_INTEGRATOR, k) for k in (divisor, 2 * divisor))
+            return 2.0 * refined - coarse
+
+        for divisors, get_motion in (
+            ((1, 2, 5), partial(simulate, "RK4")),
+            ((2, 5), extrapolate),
+        ):
+            for divisor in divisors:
+                refined = get_motion(2 * divisor)
+                if (
+                    self.compute_rms_difference(get_motion(divisor), refined)
+                    < CONVERGENCE_TOLERANCE
+                ):
+                    return refined
         return None
 
     def compute_rms_difference(self, first: Array, second: Array) -> float:
