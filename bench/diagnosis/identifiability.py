@@ -36,7 +36,7 @@ from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.gain_and_intervals import Z95, invert_scaled
 from sims.core.effect import ALL_PLACES
-from sims.core.plain_values import format_unit
+from sims.core.plain_values import format_unit, join_first_names
 from sims.core.simulator import Array, Parameter
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
@@ -387,19 +387,6 @@ def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]
         places.setdefault(effect, set()).add(place)
     place_counts = {name: len(effect_places) for name, effect_places in places.items()}
     return [f"{name} ({n} places)" if n > 1 else name for name, n in place_counts.items()]
-
-
-def join_first_names(names: Sequence[str], max_count: int) -> str:
-    """Join the first names, and count the remaining ones.
-
-    Args:
-        names: Names.
-        max_count: Maximum number of names to write.
-    """
-    unnamed_count = len(names) - max_count
-    return ", ".join(names[:max_count]) + (
-        f" and {unnamed_count} more" if unnamed_count > 0 else ""
-    )
 
 
 _WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")

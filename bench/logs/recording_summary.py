@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from bench.logs.quality.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
-from sims.core.plain_values import align_columns, format_unit
+from sims.core.plain_values import align_columns, format_unit, join_first_names
 from sims.core.simulator import Array, Channel, Simulator
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
@@ -318,9 +318,7 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
 
 
 def _format_run_names(names: Sequence[str]) -> str:
-    runs = f"run{'s' if len(names) > 1 else ''} {', '.join(names[:_MAX_LISTED_NAMES])}"
-    unnamed_count = len(names) - _MAX_LISTED_NAMES
-    return f"{runs} and {unnamed_count} more" if unnamed_count > 0 else runs
+    return f"run{'s' if len(names) > 1 else ''} {join_first_names(names, _MAX_LISTED_NAMES)}"
 
 
 def _format_count(number: int, noun: str) -> str:

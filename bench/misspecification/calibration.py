@@ -17,11 +17,8 @@ from bench.benchmark.problem import targets
 from bench.benchmark.problem.experiment import CalibrationConfig, Experiment
 from bench.benchmark.problem.robot_experiment import find_model
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.core.plugin_registries import simulators
 from bench.core.random_streams import TargetStreams
-from sims import extended_simulator as extending
-from sims.core.simulator import Array, Scenario
-from sims.extended_simulator import ExtendedSimulator
+from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference
 from sims.recording.recording_writer import write_recording
@@ -51,6 +48,7 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     theta = problem.cube.to_physical(point[None])[:, : len(problem.world.parameters)]
     initial = {**experiment.initial, **calibration.initial}
     inputs = {**experiment.inputs, **calibration.inputs}
+    names = [channel.name for channel in problem.channels]
     runs = []
     for run_index in range(calibration.runs):
         scene = targets.draw_scenario(
@@ -59,15 +57,11 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         noise_free = problem.world.simulate(theta, scene)[0]
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + run_index).get_stream("noise")
         measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)
-        runs.append(
-            _run(
-                problem,
-                run_index,
-                scene,
-                measured,
-                run_index >= calibration.runs - calibration.held_out,
-            )
-        )
+        channels = dict(zip(names, np.ascontiguousarray(measured.T), strict=True))
+        held_out = run_index >= calibration.runs - calibration.held_out
+        # Runs are named from 1.
+        name = str(run_index + 1)
+        runs.append(Run(name, scene.times, channels, scene.inputs, scene.constants, {}, held_out))
     kind = type(problem.simulator)
     model = None
     if experiment.model:
@@ -89,47 +83,6 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     problem.close()
     parameters: Array = theta[0]
     return parameters
-
-
-def _run(
-    problem: TuningProblem, number: int, scene: Scenario, observed: Array, held_out: bool
-) -> Run:
-    """Make one run of the calibration recording.
-
-    Args:
-        problem: the tuning problem, for the names of the channels.
-        number: index of the run; runs are named from 1.
-        scene: initial state, inputs and constants of the run.
-        observed: noisy observations, (T, C).
-        held_out: whether the run is held out from the fit.
-    """
-    names = [channel.name for channel in problem.channels]
-    channels = dict(zip(names, np.ascontiguousarray(observed.T), strict=True))
-    return Run(str(number + 1), scene.times, channels, scene.inputs, scene.constants, {}, held_out)
-
-
-def run_explain(recording: Path, experiment: Experiment, jobs: int) -> ExtendedSimulator:
-    """Extend the simulator by explain, and write its result to the subfolder `explain`.
-
-    Args:
-        recording: CSV file of the calibration recording.
-        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
-        jobs: number of worker processes.
-    """
-    from bench.diagnosis.explain import explain  # a local import, because it imports all of explain
-
-    explanation = explain([recording], free=experiment.free, jobs=max(jobs, 1))
-    explanation.write(recording.parent / "explain")
-    return explanation.extended
-
-
-def load_extended(file: Path) -> ExtendedSimulator:
-    """Load an extended simulator from a file that explain wrote.
-
-    Raises:
-        InputError: the file cannot be used.
-    """
-    return extending.open_extended(file, simulators.get)[0]
 
 
 PLAIN, EXTENDED = "plain", "extended"

@@ -7,18 +7,18 @@ as it is and in the extended one.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_report import format_failures
 from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.statistics.comparison_statistics import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
-    FolderConfiguration,
     read_comparison,
     read_configuration,
 )
@@ -36,6 +36,7 @@ from bench.figures.style import (
 )
 from bench.misspecification import misspecification_scores
 from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
+from bench.misspecification.misspecification_scores import StudyScores
 from sims.core.files import write_atomically
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_MODELS = ("plain", "extended")
 _MARKER_STYLES: dict[str, dict[str, Any]] = {
     "plain": {"color": VERMILION, "marker": "s", "markerfacecolor": "white"},
     "extended": {"color": BLUE, "marker": "o"},
@@ -55,33 +55,7 @@ _REFERENCE_TUNER = "least_squares"
 _PANEL_COLUMNS = 3
 
 
-class StudyResult(Protocol):
-    """Data of one study to draw."""
-
-    @property
-    def experiment(self) -> Experiment:
-        """The experiment of the study."""
-
-    @property
-    def unit(self) -> str:
-        """Unit of the error channel."""
-
-    @property
-    def channel(self) -> str:
-        """Name of the error channel."""
-
-    @property
-    def name(self) -> str:
-        """A short name of the study."""
-
-    def list_tuners(self) -> list[str]:
-        """Return the labels of the tuners in the order of the experiment."""
-
-    def list_targets(self) -> list[str]:
-        """Return the names of the targets."""
-
-
-def draw_bias_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+def draw_bias_figure(studies: Sequence[StudyScores], table: pd.DataFrame) -> Figure:
     """Draw the signed error of each study's most biased parameter, by tuner.
 
     That parameter is the one with the largest error of least squares in the original simulator.
@@ -111,7 +85,7 @@ def draw_bias_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Fig
     )
 
 
-def draw_prediction_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+def draw_prediction_figure(studies: Sequence[StudyScores], table: pd.DataFrame) -> Figure:
     """Draw the prediction error in unseen runs, by tuner.
 
     Args:
@@ -134,7 +108,7 @@ def draw_prediction_figure(studies: Sequence[StudyResult], table: pd.DataFrame) 
 
 
 def draw_rank_slope_figure(
-    systems: Sequence[StudyResult], ranks: pd.DataFrame, ranking: pd.DataFrame
+    systems: Sequence[StudyScores], ranks: pd.DataFrame, ranking: pd.DataFrame
 ) -> Figure:
     """Draw mean ranks in both simulators, one row of panels per metric, one column per system.
 
@@ -191,7 +165,7 @@ def _make_panels(count: int) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
+def _draw_means(panel: Axes, study: StudyScores, lines: pd.DataFrame) -> None:
     """Draw one row per tuner with its mean and 95 % interval in both simulators.
 
     Args:
@@ -201,7 +175,7 @@ def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     """
     tuners = study.list_tuners()
     # The two simulators are shifted vertically, so that their bars do not overlap.
-    for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
+    for shift, model in zip((-0.16, 0.16), MODEL_LABELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
         mean = part["mean"].to_numpy(dtype=np.float64)
         # A mean's own interval contains it except for rounding.
@@ -238,7 +212,7 @@ def _find_largest_bias(lines: pd.DataFrame) -> str:
     return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
 
 
-def _draw_rank_lines(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
+def _draw_rank_lines(panel: Axes, study: StudyScores, ranks: pd.DataFrame) -> None:
     """Draw a line for each tuner between its mean ranks in the original and extended simulator.
 
     Crossing lines are tuners whose order changes. Colours are given by rank in the original
@@ -262,13 +236,13 @@ def _draw_rank_lines(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> No
     panel.set_xlim(-0.25, 1.25)
 
 
-def _format_missing_effects(study: StudyResult) -> str:
+def _format_missing_effects(study: StudyScores) -> str:
     """Format which effects the original simulator lacks, and the number of targets."""
     names = list(study.experiment.world.get("fixed", {}))
     return f"lacks {', '.join(names) or 'nothing'}; {len(study.list_targets())} targets"
 
 
-def _format_target_count(systems: Sequence[StudyResult]) -> str:
+def _format_target_count(systems: Sequence[StudyScores]) -> str:
     """Format the number of targets of all studies, as one number or a range."""
     counts = sorted({len(study.list_targets()) for study in systems})
     count_text = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
@@ -291,19 +265,11 @@ def _finish_figure(figure: Figure, panel: Axes, heading: str, caption: str) -> F
     return figure
 
 
-PrintLine = Callable[[str], None]
 VERDICT_FILE = "explain/verdict.json"
 """Path of the verdict of explain, in the folder of a study."""
 
 
-class ReportableMisspecificationStudy(Protocol):
-    """Protocol of the studies that can be reported."""
-
-    folder: Path
-    configuration: FolderConfiguration
-
-
-def write_report(study: ReportableMisspecificationStudy, print_line: PrintLine) -> int:
+def write_report(study: Study, print_line: PrintLine) -> int:
     """Write tables and figures of a study, and print a summary.
 
     Args:
@@ -378,7 +344,7 @@ def _write_comparison_tables(folder: Path, print_line: PrintLine) -> int:
 
 def _write_tables_and_figures(
     folder: Path,
-    outcomes: Sequence[misspecification_scores.StudyScores],
+    outcomes: Sequence[StudyScores],
     print_line: PrintLine,
     is_joint: bool,
 ) -> None:
@@ -422,7 +388,7 @@ def _write_tables_and_figures(
 
 def _list_summary_texts(
     folder: Path,
-    outcomes: Sequence[misspecification_scores.StudyScores],
+    outcomes: Sequence[StudyScores],
     frames: dict[str, pd.DataFrame],
     is_joint: bool,
 ) -> list[str]:
@@ -453,7 +419,7 @@ def _list_summary_texts(
     return texts
 
 
-def _format_verdict(scores: misspecification_scores.StudyScores, folder: Path) -> str:
+def _format_verdict(scores: StudyScores, folder: Path) -> str:
     """Format which effects the true system has, and which verdict and causes explain gave.
 
     Args:
@@ -471,7 +437,7 @@ def _format_verdict(scores: misspecification_scores.StudyScores, folder: Path) -
     )
 
 
-def _format_error_table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
+def _format_error_table(scores: StudyScores, lines: pd.DataFrame) -> str:
     """Format the errors of parameters and of prediction by tuner, in both simulators.
 
     Args:

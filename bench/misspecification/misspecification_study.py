@@ -25,16 +25,15 @@ from bench.benchmark.storage.run_status import (
     RunEnd,
     StudyOutcome,
 )
+from bench.core.plugin_registries import simulators
 from bench.misspecification.calibration import (
     MODEL_LABELS,
     PLAIN,
-    load_extended,
     make_base_experiment,
     make_extended_experiment,
-    run_explain,
     write_calibration_recording,
 )
-from sims.extended_simulator import list_effect_coefficients
+from sims.extended_simulator import list_effect_coefficients, open_extended
 
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
@@ -166,7 +165,11 @@ class MisspecificationStudy(Study):
         for file in (table, table.with_suffix(".toml")):
             file.unlink(missing_ok=True)
         write_calibration_recording(experiment, self.salt, table)
-        run_explain(table, experiment, jobs)
+        # A local import, because it imports all of explain.
+        from bench.diagnosis.explain import explain
+
+        explanation = explain([table], free=experiment.free, jobs=max(jobs, 1))
+        explanation.write((self.folder / EXTENDED_MODEL_FILE).parent)
         step()
 
     def _open_comparison(self, model: str, jobs: int) -> Comparison:
@@ -210,7 +213,7 @@ class MisspecificationStudy(Study):
         if model == PLAIN:
             return make_base_experiment(experiment)
         kind = get_simulator_class(experiment)
-        extended = load_extended(self.folder / EXTENDED_MODEL_FILE)
+        extended, *_ = open_extended(self.folder / EXTENDED_MODEL_FILE, simulators.get)
         return make_extended_experiment(experiment, list_effect_coefficients(extended, kind))
 
     @property

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
@@ -62,6 +62,19 @@ def to_json_value(value: Any) -> Any:
         return None
     # Text from files or system calls may contain lone surrogates, which cannot be encoded.
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
+
+
+def join_first_names(names: Iterable[str], max_count: int = 4) -> str:
+    """Join the first of distinct names, and count the remaining ones: ``a, b and 3 more``.
+
+    Args:
+        names: Names, possibly repeated.
+        max_count: Maximum number of names to write.
+    """
+    distinct_names = list(dict.fromkeys(names))
+    unnamed_count = len(distinct_names) - max_count
+    text = ", ".join(distinct_names[:max_count])
+    return f"{text} and {unnamed_count} more" if unnamed_count > 0 else text
 
 
 SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")

@@ -41,7 +41,6 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.friction_form_verdict import make_soft_kind
-from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.measured_states import compute_joint_forces, has_joint_forces
@@ -55,6 +54,7 @@ from bench.diagnosis.prediction_error.regression_selection import identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from bench.diagnosis.search.score_test import DirectionGroup
+from sims.core.plain_values import join_first_names
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator

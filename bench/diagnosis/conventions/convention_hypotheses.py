@@ -21,8 +21,8 @@ import numpy as np
 
 from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
-from bench.diagnosis.identifiability import join_first_names
 from bench.logs.importing.joint_order import find_best_order
+from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, InputError, Simulator
 from sims.recording.column_mapping import list_mapped_files
 from sims.recording.log_formats.lerobot_dataset import range_scale

@@ -38,8 +38,8 @@ from bench.diagnosis.fitting.base_fit import (
     fit_base_model,
 )
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
-from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.verdict import Cause, RecordingFault
+from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
 from sims.recording.recording import Recording

@@ -32,6 +32,7 @@ from sims import effects as library
 from sims.core.argument_checks import check_arguments
 from sims.core.effect import ALL_PLACES, Effect
 from sims.core.files import Content, write_all_atomically
+from sims.core.plain_values import join_first_names
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator
 from sims.recording.recording import Recording
@@ -109,9 +110,7 @@ def _describe_rest_forces(diagram: DriveDiagram) -> str:
 
 def _format_runs(runs: Sequence[str]) -> str:
     """Format the names of runs, such as ``runs a, b and 3 more``."""
-    named_runs = f"runs {', '.join(runs[:_NAMED_RUNS])}" if len(runs) > 1 else f"run {runs[0]}"
-    unnamed_count = len(runs) - _NAMED_RUNS
-    return f"{named_runs} and {unnamed_count} more" if unnamed_count > 0 else named_runs
+    return f"run{'s' if len(runs) > 1 else ''} {join_first_names(runs, _NAMED_RUNS)}"
 
 
 TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility"})

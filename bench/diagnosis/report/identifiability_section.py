@@ -29,6 +29,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Cause
+from sims.core.plain_values import join_first_names
 
 MAX_NAMED_CAUSES = 6
 """Maximum number of names in a cell or list; the remaining ones are counted."""
@@ -319,10 +320,7 @@ def _build_family_table(
 
 def _join_effect_names(effects: Sequence[str]) -> str:
     """Join the names of at most `MAX_NAMED_CAUSES` different effects, and count the others."""
-    unique = list(dict.fromkeys(effects))
-    named_effects = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
-    unnamed_count = len(unique) - MAX_NAMED_CAUSES
-    return f"{named_effects} and {unnamed_count} more" if unnamed_count > 0 else named_effects
+    return join_first_names(map(format_effect_name, effects), MAX_NAMED_CAUSES)
 
 
 def _format_half_interval(number: ParameterIdentifiability) -> str:

@@ -42,7 +42,8 @@ from bench.logs.importing.normalised_positions import check_normalised_positions
 from bench.logs.importing.sample_selection import MAX_FILLED_SAMPLES, find_lost_samples
 from bench.logs.quality import pose_check
 from bench.logs.quality.pose_check import find_missing_base_poses
-from bench.logs.quality.quality_finding import Anomaly, QualityFinding, format_names
+from bench.logs.quality.quality_finding import Anomaly, QualityFinding
+from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, InputError, Simulator
 from sims.core.system import StateSnapshot, System
 from sims.recording.recording import Recording, Run
@@ -95,7 +96,8 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
     if jittered:
         yield QualityFinding(
             "clock",
-            f"intervals vary by {max(jitters):.0%} of one (1 sigma) in {format_names(jittered)}",
+            f"intervals vary by {max(jitters):.0%} of one (1 sigma) in "
+            f"{join_first_names(jittered)}",
             "every sample is simulated at its own stamp, so use the times of measurement as "
             "stamps, not the times of writing",
         )
@@ -103,7 +105,7 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         yield QualityFinding(
             "clock",
             f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
-            f"{format_names(lossy)}",
+            f"{join_first_names(lossy)}",
             "readings are not interpolated; commands of a robot of up to "
             f"{MAX_FILLED_SAMPLES} lost samples are, unless they were held: log commands in a "
             "separate file if they jump",
@@ -152,7 +154,7 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
         yield QualityFinding(
             "clock",
             f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
-            f"in every channel while it moves, in {format_names(runs)}",
+            f"in every channel while it moves, in {join_first_names(runs)}",
             "leave these rows out: a value that is one interval old looks like a delay",
         )
 

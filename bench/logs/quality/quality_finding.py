@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 
@@ -23,23 +22,6 @@ class QualityFinding(NamedTuple):
     def text_line(self) -> str:
         """The complete finding in one line."""
         return f"{self.about}: {self.text}; {self.remedy}"
-
-
-_MAX_NAMES = 4
-"""Maximum number of names that are written out."""
-
-
-def format_names(names: Iterable[str]) -> str:
-    """Format a list of names, each once, and the number of names beyond the first few.
-
-    Args:
-        names: Names, possibly repeated.
-    """
-    distinct_names = list(dict.fromkeys(names))
-    unnamed_count = len(distinct_names) - _MAX_NAMES
-    return ", ".join(distinct_names[:_MAX_NAMES]) + (
-        f" and {unnamed_count} more" if unnamed_count > 0 else ""
-    )
 
 
 class Anomaly(NamedTuple):

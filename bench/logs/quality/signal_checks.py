@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.logs.quality.noise_estimation import estimate_noise
-from bench.logs.quality.quality_finding import QualityFinding, format_names
-from sims.core.plain_values import append_unit
+from bench.logs.quality.quality_finding import QualityFinding
+from sims.core.plain_values import append_unit, join_first_names
 from sims.core.simulator import Array, Channel, Simulator
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
@@ -182,13 +182,13 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     if still_channels:
         yield QualityFinding(
             "stillness",
-            f"{format_names(still_channels)} never moves",
+            f"{join_first_names(still_channels)} never moves",
             "its dynamics cannot be identified: move it, or leave its joint out",
         )
     if seldom_moving:
         yield QualityFinding(
             "stillness",
-            f"{format_names(seldom_moving)} of the samples are at rest",
+            f"{join_first_names(seldom_moving)} of the samples are at rest",
             "friction, damping and inertia are visible only in motion: move during more of the "
             "recording",
         )
