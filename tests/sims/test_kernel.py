@@ -159,7 +159,7 @@ def make_small_arrays():
         flags=np.array([1, 0, 0, 0, 1, 0]),
     )
     work = data_layout.BatchArrays(
-        order=np.array([1, 0]), queue=np.zeros(2, dtype=np.int64), parameters=np.ones((2, 1)),
+        order=np.array([1, 0]), parameters=np.ones((2, 1)),
         mass=np.ones(2), x=np.ones((2, 1)), v=np.ones((2, 1)), steps=np.ones((1, 4)),
         inputs=np.zeros((0, 1, 4)), max_steps=np.ones(2), planned_counts=np.ones(2),
         divisions=np.ones(2), ground=np.zeros((4, 2)), limits=np.array([np.inf, 0.07]),
@@ -174,7 +174,6 @@ def make_small_arrays():
         ("order", np.array([1, 2])),
         ("order", np.array([1, -1])),
         ("order", np.zeros(0, dtype=np.int64)),
-        ("queue", np.zeros(1, dtype=np.int64)),
         ("parameters", np.ones((2, 2))),
         ("steps", np.ones((3, 4))),
         ("inputs", np.zeros((1, 1, 4))),

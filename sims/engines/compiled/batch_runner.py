@@ -62,7 +62,7 @@ def integrate_batch(
 def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> BatchArrays:
     """Convert a batch to the contiguous arrays that the machine code reads.
 
-    No elements are selected yet (`order`, `queue` and `parameters` are empty); each group of
+    No elements are selected yet (`order` and `parameters` are empty); each group of
     elements sets its own. If all elements have the same steps, one row of steps is stored for all.
 
     Args:
@@ -82,7 +82,6 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     record_count = steps.shape[1] // batch.steps_per_sample + 1
     return BatchArrays(
         order=np.zeros(0, dtype=np.int64),
-        queue=np.zeros(0, dtype=np.int64),
         parameters=np.zeros((0, 0)),
         mass=_to_column(batch.system.mass(batch.theta, batch.constants), count),
         x=np.ascontiguousarray(batch.x, dtype=np.float64),
@@ -120,7 +119,6 @@ def _integrate_group(
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
         width = min(program.block_width, padded_count)
         prepared = program.prepare(width)
-        part = part._replace(queue=np.zeros_like(part.order))
         integrate_elements(prepared.arrays, part, prepared.block, width)
         prepared.raise_error()
 

@@ -102,7 +102,6 @@ class BatchArrays(NamedTuple):
 
     Attributes:
         order: (N,) selected elements.
-        queue: (N,) places in this order as elements begin, to be filled in.
         parameters: (N, P) parameters of the program, in the order of `order`.
         mass: (L,) generalised inertia.
         x: (L, D) initial position.
@@ -121,7 +120,6 @@ class BatchArrays(NamedTuple):
     """
 
     order: IntTable
-    queue: IntTable
     parameters: FloatArray
     mass: FloatArray
     x: FloatArray
@@ -166,7 +164,6 @@ class Block(NamedTuple):
     out: IntTable
     flags: IntTable
     order: IntTable
-    queue: IntTable
     parameters: FloatArray
     mass: FloatArray
     x: FloatArray
@@ -187,7 +184,7 @@ class Block(NamedTuple):
 
 
 BLOCK_SHAPES = (
-    *("#i5", "#4", "#q", "#d", "#6", "#s", "#s", "sp", "l", "ld", "ld", "kt", "ujt"),
+    *("#i5", "#4", "#q", "#d", "#6", "#s", "sp", "l", "ld", "ld", "kt", "ujt"),
     *("l", "l", "l", "4l", "2", "lyz", "rw", "aw", "#nw", "#", "#"),
 )
 """Shapes of the arrays of `Block`, see `measure_arrays`.

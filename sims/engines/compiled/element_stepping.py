@@ -75,7 +75,7 @@ from sims.engines.compiled.events import (
     shorten_if_nonlinear,
 )
 from sims.engines.compiled.interpreter import nan_maximum
-from sims.engines.compiled.step_size import choose_step_divisions, queue_by_divisions
+from sims.engines.compiled.step_size import choose_step_divisions, divide_steps
 
 
 def step_elements(block: Block) -> None:
@@ -94,13 +94,13 @@ def step_elements(block: Block) -> None:
     """
     # Elements that move fast get shorter steps.
     choose_step_divisions(block)
-    queue_by_divisions(block)
+    divide_steps(block)
     loaded_count = 0
     active_count = 0
     for i in range(block.w):
         block.n[ORDER_INDEX, i] = -1
         if loaded_count < block.order.size:
-            load_element(block, i, block.queue[loaded_count])
+            load_element(block, i, loaded_count)
             loaded_count += 1
             active_count += 1
         else:
@@ -124,7 +124,7 @@ def step_elements(block: Block) -> None:
                 active_count -= 1
                 block.n[ORDER_INDEX, i] = -1
                 if loaded_count < block.order.size:
-                    load_element(block, i, block.queue[loaded_count])
+                    load_element(block, i, loaded_count)
                     loaded_count += 1
                     active_count += 1
                     has_new_elements = True

@@ -91,33 +91,23 @@ def choose_step_divisions(block: Block) -> None:
                         divisions[element] = min(needed_divisions, MAX_STEP_DIVISIONS)
 
 
-def queue_by_divisions(block: Block) -> None:
-    """Queue the elements by the number of parts of their steps, and set their longest step.
-
-    Elements with the most parts begin first, since they take longest; the others fill the remaining
-    slots meanwhile. The loop over numbers of parts is a counting sort.
+def divide_steps(block: Block) -> None:
+    """Divide the longest step of each element by its number of parts.
 
     Args:
         block: force program, batch elements and their buffers. Slot i holds one element: its
             numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
             the force program, inputs and forces among them, `block.r[REGISTER, i]`.
     """
-    queued_count = 0
-    division = MAX_STEP_DIVISIONS
-    while division >= 1.0:
-        for k in range(block.order.size):
-            element = block.order[k]
-            if block.divisions[element] == division:
-                block.queue[queued_count] = k
-                queued_count += 1
-                if division > 1.0:
-                    # Slightly longer than the part, so that rounding does not leave a tiny step
-                    # after the last one.
-                    block.max_steps[element] = block.max_steps[element] / division * (1.0 + 1e-9)
-                if block.flags[HAS_HIDDEN_STATES] != 0:
-                    # The fine steps that hidden states need count as planned steps.
-                    block.planned_counts[element] *= division
-        division -= 1.0
+    for element in block.order:
+        division = block.divisions[element]
+        if division > 1.0:
+            # Slightly longer than the part, so that rounding does not leave a tiny step after the
+            # last one.
+            block.max_steps[element] = block.max_steps[element] / division * (1.0 + 1e-9)
+        if block.flags[HAS_HIDDEN_STATES] != 0:
+            # The fine steps that hidden states need count as planned steps.
+            block.planned_counts[element] *= division
 
 
 def select_sampled_steps(block: Block, i: int) -> None:
