@@ -21,8 +21,6 @@ from collections.abc import Callable, Mapping
 
 from sims.engines.external import bullet_world
 
-OPEN_LOOP = True
-"""True if the torque depends on the input alone."""
 LENGTH_REDUCTION_FACTOR = 1000.0
 """Factor k of equation (2), by which the body is heavier and its arm is shorter."""
 

@@ -12,10 +12,8 @@ from typing import Any
 
 from sims.systems.pendulum_bullet_world import gravity  # same torque as in Bullet
 
-__all__ = ["OPEN_LOOP", "gravity", "load", "model"]
+__all__ = ["gravity", "load", "model"]
 
-OPEN_LOOP = True
-"""True if the torque depends on the input alone."""
 LENGTH_REDUCTION_FACTOR = 1000.0
 """Factor by which the body is heavier and its arm is shorter than in the system."""
 _BODY_INERTIA = 1e-14

@@ -2,7 +2,4 @@
 
 from sims.systems.pendulum_bullet_world import build, gravity, load
 
-__all__ = ["OPEN_LOOP", "build", "gravity", "load"]
-
-OPEN_LOOP = False
-"""True if the torque depends on the input alone; the motor's also depends on angle and rate."""
+__all__ = ["build", "gravity", "load"]

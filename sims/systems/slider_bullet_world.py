@@ -9,9 +9,6 @@ from collections.abc import Callable, Mapping
 
 from sims.engines.external import bullet_world
 
-OPEN_LOOP = True
-"""True if the force depends on the input alone."""
-
 
 def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001
     """Build a guide with one body; return the body's id.

@@ -10,10 +10,7 @@ from typing import Any
 
 from sims.systems.slider_bullet_world import gravity  # same force as in Bullet
 
-__all__ = ["OPEN_LOOP", "gravity", "load", "model"]
-
-OPEN_LOOP = True
-"""True if the force depends on the input alone."""
+__all__ = ["gravity", "load", "model"]
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001

@@ -67,13 +67,11 @@ def module_with(**content):
 
 
 WHOLE = {
-    "OPEN_LOOP": True,
     "gravity": lambda constants: lambda x: 0.0,
     "build": lambda client, constants: 0,
     "load": lambda client, body, inertia, constants: True,
 }
 BROKEN = [
-    ({"OPEN_LOOP": None}, "has no OPEN_LOOP = True or False"),
     ({"gravity": 9.81}, "has no function gravity(constants)"),
     ({"build": None}, "has no function build(client, constants)"),
     (
@@ -121,7 +119,7 @@ def test_an_engine_refuses_a_broken_module_by_name(engine, name, tmp_path, monke
     package = tmp_path / "broken_system"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / f"{name}.py").write_text("OPEN_LOOP = True\n")
+    (package / f"{name}.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
 
     class Broken(SliderSystem):

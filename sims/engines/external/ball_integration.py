@@ -39,7 +39,6 @@ with f the effects' force per unit mass and k the engine's air damping
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -51,7 +50,6 @@ from sims.engines.external.external_engine import (
     ElementWork,
     Trajectory,
     Vector,
-    split_into_legs,
 )
 from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
@@ -117,14 +115,6 @@ class BallBody(Protocol):
         """Advance by one step with a force per unit mass (m/s^2) in addition to gravity."""
         ...
 
-    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
-        """Advance by each number of steps in `counts` under gravity alone.
-
-        Returns:
-            The state after each count.
-        """
-        ...
-
 
 class BallWithImpacts(BallBody, Protocol):
     """Ball over level ground."""
@@ -150,8 +140,7 @@ class BallWithImpacts(BallBody, Protocol):
 def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     """Integrate one batch element, a ball, with impacts at their exact times.
 
-    The run is divided into legs, in which step size and inputs are constant, so that the engine
-    makes many steps in one call. A ball that diverges ends the integration early.
+    A ball that diverges ends the integration early.
 
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
@@ -159,16 +148,13 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     ball.reset_world(element.plain_constants)
     rollout = BallRollout(ball, element)
     recorded_steps = set(element.recorded_steps.tolist())
-    steps = element.steps.tolist()
     recorded_states = [rollout.state]
-    for first_step, counts in split_into_legs(element):
-        states = rollout.advance_leg(steps[first_step], counts)
-        # A leg may end between two samples, where no state is recorded.
-        recorded_states.extend(
-            states if first_step + sum(counts) in recorded_steps else states[:-1]
-        )
-        if not math.isfinite(sum(rollout.state)):
-            break
+    for number, step in enumerate(element.steps.tolist(), start=1):
+        rollout.advance(step)
+        if number in recorded_steps:
+            recorded_states.append(rollout.state)
+            if not math.isfinite(sum(rollout.state)):
+                break
     return make_trajectory(element, recorded_states)
 
 
@@ -217,63 +203,17 @@ class BallRollout:
         """Position, velocity and acceleration."""
         return (*self.x, *self.v, *self.a)
 
-    def advance_leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
-        """Advance by each number of steps in `counts`.
-
-        A leg is a part of the run with constant step length and inputs. Without forces in
-        addition to gravity, many steps are made in one call of the engine.
-
-        Args:
-            step: step size in seconds.
-            counts: numbers of steps.
-
-        Returns:
-            Position, velocity and acceleration after each count.
-        """
-        if self._forces.acts:
-            return [self._advance_stepwise(step, count) for count in counts]
-        states: list[tuple[float, ...]] = []
-        remaining_counts = list(counts)
-        while remaining_counts:
-            # As many whole sample intervals as fit before the impact are integrated in one engine
-            # call.
-            steps_to_impact = math.inf if self.rests else self._time_to_ground() / step
-            count_before_impact = 0
-            for count in remaining_counts:
-                if steps_to_impact < count:
-                    break
-                steps_to_impact -= count
-                count_before_impact += 1
-            if count_before_impact:
-                states.extend(self._advance_freely(step, remaining_counts[:count_before_impact]))
-                remaining_counts = remaining_counts[count_before_impact:]
-                continue
-            # Then follow the whole steps before the impact, and the step that contains it.
-            if steps_to_impact >= 1.0:
-                self._advance_freely(step, (int(steps_to_impact),))
+    def advance(self, step: float) -> None:
+        """Advance by one step of `step` seconds; it is divided at the impacts that it contains."""
+        # A resting ball that is pulled upward takes off.
+        if self.rests and self.lift > 0.0:
+            self.rests = False
+            self.w = None
+            self._update_acceleration()
+        if self.rests or self._time_to_ground() >= step:
+            self._advance_without_impact(step)
+        else:
             self.advance_with_impacts(step)
-            remaining_counts[0] -= int(steps_to_impact) + 1
-            if not remaining_counts[0]:
-                states.append(self.state)
-                remaining_counts = remaining_counts[1:]
-        return states
-
-    def _advance_stepwise(self, step: float, count: int) -> tuple[float, ...]:
-        """Advance by `count` steps of `step` seconds, with forces in each; return the state.
-
-        A step in which the ball reaches the ground is divided at the impacts.
-        """
-        for _ in range(count):
-            # A resting ball that is pulled upward takes off.
-            if self.rests and self.lift > 0.0:
-                self.rests = False
-                self.w = None
-                self._update_acceleration()
-            if self.rests or self._time_to_ground() >= step:
-                self._advance_with_forces(step)
-            else:
-                self.advance_with_impacts(step)
-        return self.state
 
     def advance_with_impacts(self, remaining: float) -> None:
         """Advance by a step that contains impacts.
@@ -288,10 +228,7 @@ class BallRollout:
             time_to_impact = math.inf if self.rests else self._time_to_ground()
             if time_to_impact > _NO_TIME:
                 part = min(time_to_impact, remaining)
-                if self._forces.acts:
-                    self._advance_with_forces(part)
-                else:
-                    self._advance_freely(part, (1,))
+                self._advance_without_impact(part)
             if time_to_impact >= remaining:
                 return
             remaining -= time_to_impact
@@ -316,31 +253,8 @@ class BallRollout:
             self._ball.set_state(self.x, self.w)
         return self.w
 
-    def _advance_freely(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
-        """Advance under gravity alone, or at rest, by each number of steps in `counts`.
-
-        No force has to be evaluated, so that the engine runs on its own. Returns the state
-        after each count: position, velocity and acceleration, three numbers each. The engine's
-        velocity w is half a step earlier than v.
-
-        With the engine's velocity w, v' = w' + h/2 a' (3).
-        """
-        self._prepare_step(step)
-        ax, ay, az = self.a
-        x = 0.5 * step * ax
-        y = 0.5 * step * ay
-        z = 0.5 * step * az
-        states_reached = self._ball.advance_freely(counts)
-        self.x, self.w = states_reached[-1]
-        states = []
-        for position, w in states_reached:
-            v = w[0] + x, w[1] + y, w[2] + z  # (3)
-            states.append((*position, *v, ax, ay, az))
-        self.v = states[-1][3:6]
-        return states
-
-    def _advance_with_forces(self, step: float) -> None:
-        """Advance by one step of `step` seconds under all forces, in flight or at rest.
+    def _advance_without_impact(self, step: float) -> None:
+        """Advance by one step of `step` seconds in flight or at rest.
 
         The engine's velocity w belongs to the time half a step before the position. The applied
         force per unit mass, (v + h/2 a - w) / h - g (4), makes the velocity v' = w' + h/2 a' (3)
@@ -504,36 +418,22 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     ball.set_contact_parameters(*forces.compute_impact(max(-w[2], 0.0)))
     ball.set_state(x, w)
     recorded_steps = set(element.recorded_steps.tolist())
-    steps = element.steps.tolist()
     t = 0.0
     step = math.nan
     recorded_states = [(*x, *w, *compute_force(t, x, w))]
-    for first_step, counts in split_into_legs(element):
-        if steps[first_step] != step:
-            step = steps[first_step]
+    for number, seconds in enumerate(element.steps.tolist(), start=1):
+        if seconds != step:
+            step = seconds
             ball.set_step(step)
-        if forces.acts or changes_impacts:
-            states = []
-            for count in counts:
-                for _ in range(count):
-                    # Contact can act only if the predicted end of the next step is near the ground.
-                    if (
-                        changes_impacts
-                        and w[2] < 0.0
-                        and ball.is_near_contact(x[2] + step * w[2] - floor)
-                    ):
-                        ball.set_contact_parameters(*forces.compute_impact(-w[2]))
-                    x, w = ball.advance(compute_force(t, x, w))
-                    t += step
-                states.append((*x, *w, *compute_force(t, x, w)))
-        else:
-            # No force must be evaluated: the engine runs from sample to sample.
-            states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
-        recorded_states.extend(
-            states if first_step + sum(counts) in recorded_steps else states[:-1]
-        )
-        if not math.isfinite(sum(recorded_states[-1])):
-            break
+        # Contact can act only if the predicted end of the step is near the ground.
+        if changes_impacts and w[2] < 0.0 and ball.is_near_contact(x[2] + step * w[2] - floor):
+            ball.set_contact_parameters(*forces.compute_impact(-w[2]))
+        x, w = ball.advance(compute_force(t, x, w))
+        t += step
+        if number in recorded_steps:
+            recorded_states.append((*x, *w, *compute_force(t, x, w)))
+            if not math.isfinite(sum(recorded_states[-1])):
+                break
     positions, v, effect_forces = make_trajectory(element, recorded_states)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
     a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (6)

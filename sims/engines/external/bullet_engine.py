@@ -7,7 +7,7 @@ interface is specified in `sims.engines.external.world_interface`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import cast
 
@@ -212,23 +212,9 @@ class _BulletMover:
         mass = self._mass
         newtons = mass * force[0], mass * force[1], mass * force[2]
         p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
-        return self.advance_freely((1,))[0]
-
-    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
-        """Advance by each number of steps in `counts` under gravity alone; return the states."""
-        pybullet = bullet_world.import_pybullet()
-        client = self._client
-        body = self._body
-        step = pybullet.stepSimulation
-        get_position = pybullet.getBasePositionAndOrientation
-        get_velocity = pybullet.getBaseVelocity
-        states: list[BallState] = []
-        for count in counts:
-            for _ in range(count):
-                step(client)
-            states.append((get_position(body, client)[0], get_velocity(body, client)[0]))
-        self._x = states[-1][0]
-        return states
+        p.stepSimulation(self._client)
+        self._x = p.getBasePositionAndOrientation(self._body, self._client)[0]
+        return self._x, p.getBaseVelocity(self._body, self._client)[0]
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set the ball's restitution and friction coefficient.
@@ -285,7 +271,7 @@ class BulletBall(_BulletMover):
         contact_position = x[0], x[1], self._floor - ball_integration.CONTACT_PENETRATION
         self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT_STEP_SECONDS))
         self._set_contact(True)
-        _, velocity = self.advance_freely((1,))[0]
+        _, velocity = self.advance(_ZERO_VECTOR)
         self._set_contact(False)
         return velocity
 

@@ -10,7 +10,7 @@ import ctypes
 import functools
 import os
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from sims.engines.external.world_interface import BulletJointWorldModule
@@ -148,6 +148,7 @@ def create_jointed_body(
         -1,
         linearDamping=0.0,
         angularDamping=0.0,
+        jointDamping=0.0,
         activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
         maxJointVelocity=NO_LIMIT,
         physicsClientId=client,
@@ -167,21 +168,16 @@ class BulletJoint:
         self._world = world
         self._load = module.load
         self._gravity = module.gravity
-        self.open_loop: bool = module.OPEN_LOOP
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants; `set_step` and `set_state` set everything else."""
         self._constants, self.compute_gravity_force = constants, self._gravity(constants)
         self._client, self._body = self._world.get_body(constants)
 
-    def set_step(self, step: float, inertia: float, damping: float) -> bool:
-        """Set step (s), inertia and damping; return False if Bullet cannot represent them."""
-        p = import_pybullet()
-        if not self._load(self._client, self._body, inertia, self._constants):
-            return False
-        p.setTimeStep(step, self._client)
-        p.changeDynamics(self._body, 0, jointDamping=damping, physicsClientId=self._client)
-        return True
+    def set_step(self, step: float, inertia: float) -> bool:
+        """Set step (s) and inertia; return False if Bullet cannot represent them."""
+        import_pybullet().setTimeStep(step, self._client)
+        return self._load(self._client, self._body, inertia, self._constants)
 
     def set_state(self, x: float, w: float) -> None:
         """Set the joint's position and velocity.
@@ -194,30 +190,14 @@ class BulletJoint:
 
     def advance(self, force: float) -> tuple[float, float]:
         """Advance by one step; return position and velocity."""
-        return self.advance_freely(force, (1,))[0]
-
-    def advance_freely(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """Advance by each number of steps in `counts` with a constant force or torque at the joint.
-
-        Returns:
-            Position and velocity after each count.
-        """
-        pybullet = import_pybullet()
-        client = self._client
-        body = self._body
-        # The attributes are looked up once, because a rollout has thousands of steps.
-        step = pybullet.stepSimulation
-        push = pybullet.setJointMotorControl2
-        torque = pybullet.TORQUE_CONTROL
-        get_joint_state = pybullet.getJointState
-        states = []
-        for count in counts:
-            for _ in range(count):
-                if force:  # Bullet resets applied torques after each step
-                    push(body, 0, torque, force=force, physicsClientId=client)
-                step(client)
-            states.append(get_joint_state(body, 0, client)[:2])
-        return states
+        p = import_pybullet()
+        if force:
+            p.setJointMotorControl2(
+                self._body, 0, p.TORQUE_CONTROL, force=force, physicsClientId=self._client
+            )
+        p.stepSimulation(self._client)
+        x, w, *_ = p.getJointState(self._body, 0, self._client)
+        return x, w
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity")}

@@ -292,40 +292,6 @@ def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
     return np.full(steps.size, mean_step) if are_equal else steps
 
 
-def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, list[int]]]:
-    """Split the steps into legs in which neither the step size nor any signal changes.
-
-    Within a leg, an engine can make all steps to the next recorded state in one call.
-
-    Shapes: S steps.
-
-    Args:
-        element: batch element.
-        *signals: (S,) signals.
-
-    Returns:
-        For each leg, the index of its first step, and the numbers of steps from one recorded state
-        to the next, with the remainder to the end of the leg as the last number.
-    """
-    size = element.steps.size
-    is_new_leg = np.zeros(size, dtype=bool)
-    is_new_leg[:1] = True
-    for values in (element.steps, *signals):
-        is_new_leg[1:] |= values[1:size] != values[: size - 1]
-    # The engine is stopped at the beginning of each leg and where a state is recorded.
-    stops = is_new_leg.copy()
-    stops[element.recorded_steps[element.recorded_steps < size]] = True
-    stop_steps = np.flatnonzero(stops)
-    counts = np.diff(stop_steps, append=size).tolist()
-    begins_leg = is_new_leg[stop_steps].tolist()
-    legs: list[tuple[int, list[int]]] = []
-    for first_step, count, is_first in zip(stop_steps.tolist(), counts, begins_leg, strict=True):
-        if is_first:
-            legs.append((first_step, []))
-        legs[-1][1].append(count)
-    return legs
-
-
 def resolve_time_step(time_step: float | None, system: type[System]) -> float:
     """Return the longest step in seconds: the given one, or the default of the system's kind.
 

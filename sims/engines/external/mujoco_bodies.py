@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sims.core.mujoco_import import disable_step_profiler
@@ -112,7 +112,6 @@ class MujocoJoint:
         self._world = world
         self._load = module.load
         self._gravity = module.gravity
-        self.open_loop: bool = module.OPEN_LOOP
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, in its initial state."""
@@ -123,10 +122,9 @@ class MujocoJoint:
         self._force = self._data.qfrc_applied
         self._step = import_mujoco().mj_step
 
-    def set_step(self, step: float, inertia: float, damping: float) -> bool:
-        """Set step (s), inertia and damping; return False if MuJoCo cannot represent them."""
+    def set_step(self, step: float, inertia: float) -> bool:
+        """Set step (s) and inertia; return False if MuJoCo cannot represent them."""
         self._model.opt.timestep = step
-        self._model.dof_damping[0] = damping
         return self._load(self._model, inertia, self._constants)
 
     def set_state(self, x: float, w: float) -> None:
@@ -145,23 +143,8 @@ class MujocoJoint:
         self._step(self._model, self._data)
         return self._x.item(), self._w.item()
 
-    def advance_freely(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """Advance by each number of steps in `counts` with a constant force or torque at the joint.
-
-        Returns:
-            Position and velocity after each count.
-        """
-        states = []
-        self._force[0] = force
-        for count in counts:
-            # The count is zero where `joint` has already made the step, with another input.
-            if count:
-                self._step(self._model, self._data, count)
-            states.append((self._x.item(), self._w.item()))
-        return states
-
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity")}
 
 
 class MujocoMover:
@@ -224,14 +207,6 @@ class MujocoMover:
         self._step(self._model, self._data)
         self._force[:] = 0.0
         return self._x.tolist(), self._w.tolist()
-
-    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
-        """Advance by each number of steps in `counts` under gravity alone; return the states."""
-        states: list[BallState] = []
-        for count in counts:
-            self._step(self._model, self._data, count)
-            states.append((self._x.tolist(), self._w.tolist()))
-        return states
 
     def __getstate__(self) -> dict[str, Any]:
         return {

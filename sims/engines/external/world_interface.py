@@ -25,12 +25,6 @@ Constants = Mapping[str, float]
 class JointWorldModule(Protocol):
     """World module of a one-coordinate system: a body on one hinge or guide."""
 
-    OPEN_LOOP: bool
-    """True if the drive depends on the inputs alone.
-
-    If True, the engine runs on its own while the inputs are constant.
-    """
-
     def gravity(self, constants: Constants, /) -> Callable[[float], float]:
         """Return a function from position to the generalised force of the engine's own gravity.
 
@@ -159,9 +153,6 @@ def describe_missing_members(module: ModuleType, protocol: type) -> str:
     for part in reversed(protocol.__mro__):
         if part in (object, Generic, Protocol):
             continue
-        for name in inspect.get_annotations(part):
-            if not isinstance(getattr(module, name, None), bool):
-                return f"has no {name} = True or False"
         for name, function in vars(part).items():
             if not name.startswith("_") and not _accepts_arguments(
                 getattr(module, name, None), function
