@@ -453,7 +453,7 @@ class RunEvaluator:
         simulated = self.simulate(
             np.repeat(theta, runs, axis=0),
             np.tile(np.arange(runs), sets),
-            states.reshape(sets * runs, -1),
+            states.reshape(sets * runs, states.shape[2]),
             share,
         )
         return simulated.reshape(sets, runs, *simulated.shape[1:])

@@ -71,6 +71,14 @@ def test_cached_elements_equal_the_simulation():
     np.testing.assert_array_equal(there.get_sample_mask(0.5).sum(axis=(1, 2)), [40, 90])
 
 
+def test_no_sets_of_parameters_give_no_simulations():
+    """A robot without free parameters displaces none for its central differences."""
+    there = evaluator(recording(runs=2, seconds=0.5, rate=50))
+    theta = np.empty((0, len(there.parameters)))
+    simulated = there.simulate_all_runs(theta, there.initial_state_guesses)
+    assert simulated.shape == (0, *there.observed.shape)
+
+
 def test_a_later_clock_changes_nothing():
     made = recording(runs=1, seconds=1, rate=50, noise=["0.003"])
     run = made.runs[0]
