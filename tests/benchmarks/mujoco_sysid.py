@@ -24,7 +24,7 @@ from time import perf_counter
 
 import numpy as np
 
-from examples.robot import make_log
+from tests.example_logs import robot_arm
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robot"
@@ -37,10 +37,10 @@ CASES = ("mass", "friction", "late")
 
 def late_table(samples):
     """Return the recording of an arm whose elbow command arrives some samples late."""
-    straight = make_log.table(0.0).splitlines()
-    rows, arm = [straight[0]], make_log.Arm()
-    for number in make_log.RUNS:
-        torques = make_log.torques_of(number)
+    straight = robot_arm.table(0.0).splitlines()
+    rows, arm = [straight[0]], robot_arm.Arm()
+    for number in robot_arm.RUNS:
+        torques = robot_arm.torques_of(number)
         late = torques.copy()
         late[samples:, 1], late[:samples, 1] = torques[:-samples, 1], torques[0, 1]
         moved = arm.simulate(np.zeros(4), late) - arm.simulate(np.zeros(4), torques)
@@ -63,8 +63,8 @@ def prepare(case, folder):
         model = model.replace(STATED, HEAVY)
     (folder / "arm2.xml").write_text(model)
     tables = {
-        "mass": lambda: make_log.table(0.0),
-        "friction": make_log.table,
+        "mass": lambda: robot_arm.table(0.0),
+        "friction": robot_arm.table,
         "late": lambda: late_table(2),
     }
     (folder / "log.csv").write_text(tables[case]())

@@ -21,8 +21,8 @@ import numpy as np
 import pybullet_data
 from mujoco import rollout
 
-from examples.robot import make_log
 from sims.robot.parsing.read_model_file import read_robot
+from tests.example_logs import robot_arm
 
 ROOT = Path(__file__).resolve().parents[2]
 ARM = ROOT / "examples" / "robot" / "arm2.xml"
@@ -108,7 +108,7 @@ def shift(errors, fine):
 def smooth_cases():
     """Yield by name a model and its runs: initial positions and commands."""
     motors = read_robot(ARM).spec.compile()
-    arm = [(np.zeros(2), make_log.torques_of(run)) for run in make_log.RUNS[:RUNS]]
+    arm = [(np.zeros(2), robot_arm.torques_of(run)) for run in robot_arm.RUNS[:RUNS]]
     yield "arm2, motors", motors, arm
     for frequency in (20, 60):
         held = [commands(2, run, 0.6) for run in range(RUNS)]
@@ -155,10 +155,10 @@ def friction():
     columns = [(name, step) for name in ("Euler", "RK4") for step in (0.002, 0.0005)]
     print("\n| friction, N m | setting | " + " | ".join(f"{n} {1e3 * s:g}" for n, s in columns))
     print("|---|---|" + "---|" * len(columns))
-    runs = [(np.zeros(2), make_log.torques_of(run)) for run in make_log.RUNS[:RUNS]]
-    clean = [make_log.Arm().simulate(np.zeros(4), torques) for _, torques in runs]
+    runs = [(np.zeros(2), robot_arm.torques_of(run)) for run in robot_arm.RUNS[:RUNS]]
+    clean = [robot_arm.Arm().simulate(np.zeros(4), torques) for _, torques in runs]
     for limit in (0.03, 0.15, 0.5):
-        arm = replace(make_log.Arm(), friction=limit)
+        arm = replace(robot_arm.Arm(), friction=limit)
         true = [arm.simulate(np.zeros(4), torques) for _, torques in runs]
         still = np.mean([np.abs(np.diff(positions[:, 1])) < 1e-9 for positions in true])
         for name, setting in FRICTIONS.items():

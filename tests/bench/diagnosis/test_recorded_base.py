@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from bench.cli.main import main
 from bench.diagnosis.explain import explain
-from examples.drone import make_log
 from sims.core.simulator import InputError
+from tests.example_logs import drone
 from tests.exams.robot_files import write_robot_recording
 
-EXAMPLE = Path(make_log.__file__).parent
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "drone"
 
 QUADROTOR = """<mujoco model="quadrotor">
   <option timestep="0.002" integrator="RK4"/>
@@ -117,7 +117,7 @@ def test_the_weak_rotor_of_the_example_is_named_and_written_into_the_file(tmp_pa
     assert verdict["verdict"] == "named"
     assert (cause["effect"], cause["alternatives"]) == ("input.gain@m3", [])
     number = cause["coefficients"]["coefficient"]["value"]
-    assert number == pytest.approx(make_log.EFFICIENCY[2] - 1.0, abs=1e-3)
+    assert number == pytest.approx(drone.EFFICIENCY[2] - 1.0, abs=1e-3)
     model = mujoco.MjModel.from_xml_path(str(out / "extended.xml"))
     assert model.jnt_type.tolist() == [mujoco.mjtJoint.mjJNT_FREE]
     thrusts = model.actuator_gear[:, 2] * model.actuator_gainprm[:, 0]
@@ -148,7 +148,7 @@ def test_an_unstable_flight_is_explained_in_short_pieces(tmp_path):
 
 
 def test_the_log_of_the_example_is_what_its_script_writes(tmp_path):
-    written = make_log.write_log(tmp_path).read_text().splitlines()
+    written = drone.write_log(tmp_path).read_text().splitlines()
     stored = (EXAMPLE / "log.csv").read_text().splitlines()
     assert written[0] == stored[0]
     tables = [

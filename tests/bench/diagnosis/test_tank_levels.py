@@ -4,8 +4,6 @@ Its script makes the recording and agrees with its simulator. Explain finds the 
 no rim in a recording without one.
 """
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -13,6 +11,7 @@ from bench.core.plugin_registries import load_plugins, simulators
 from bench.diagnosis.explain import explain
 from sims.core.simulator import Scenario
 from tests.conftest import PLUGINS
+from tests.example_logs import overflowing_tanks
 
 EXAMPLES = PLUGINS.parents[1] / "examples"
 RECORDING = EXAMPLES / "tanks" / "overflow.csv"
@@ -22,12 +21,9 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 @pytest.fixture
 def log_script():
-    """Load the script that makes the recording, and register the example's simulator."""
-    spec = importlib.util.spec_from_file_location("tanks_log", EXAMPLES / "tanks" / "make_log.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    """Return the script that makes the recording, and register the example's simulator."""
     load_plugins([EXAMPLES / "tanks.py"])
-    return script
+    return overflowing_tanks
 
 
 def test_the_recording_is_what_the_script_makes(log_script, tmp_path):

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from examples.robot import make_log
 from sims.core.simulator import Scenario
 from sims.core.toml_validation import read_toml
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
+from tests.example_logs import robot_arm
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "robot"
 
@@ -42,8 +42,8 @@ def test_without_friction_it_moves_as_mujoco_moves_the_model(step, tolerance):
     assert model.opt.timestep == 0.002
     model.opt.timestep = step
     initial = np.array([0.4, -0.3, 1.0, -2.0])
-    own = make_log.Arm().simulate(initial, make_log.torques_of(1))
-    simulated = rolled(model, initial, make_log.torques_of(1), make_log.RATE)
+    own = robot_arm.Arm().simulate(initial, robot_arm.torques_of(1))
+    simulated = rolled(model, initial, robot_arm.torques_of(1), robot_arm.RATE)
     assert np.all(np.ptp(own, axis=0) > 0.8)
     np.testing.assert_allclose(own, simulated, rtol=0, atol=tolerance)
 
@@ -51,17 +51,17 @@ def test_without_friction_it_moves_as_mujoco_moves_the_model(step, tolerance):
 def test_its_elbow_stops_where_dry_friction_stops_it():
     """With a practically fixed shoulder and no gravity: a parabola, then rest."""
     friction, speed = 0.03, 0.5
-    arm = make_log.Arm(armature=(1e9, 0.005), damping=(0, 0), gravity=0.0, friction=friction)
+    arm = robot_arm.Arm(armature=(1e9, 0.005), damping=(0, 0), gravity=0.0, friction=friction)
     inertia = 0.009 + 0.8 * 0.15**2 + 0.005
     elbow = arm.simulate(np.array([0, 0, 0, speed]), np.zeros((100, 2)))[:, 1]
-    time = np.minimum(np.arange(100) / make_log.RATE, speed * inertia / friction)
+    time = np.minimum(np.arange(100) / robot_arm.RATE, speed * inertia / friction)
     np.testing.assert_allclose(elbow, speed * time - friction / inertia * time**2 / 2, atol=1e-8)
     assert len(set(elbow[60:])) == 1
 
 
 @pytest.mark.parametrize(("torque", "moves"), [(0.0299, False), (0.0301, True)])
 def test_its_elbow_sticks_until_the_force_exceeds_its_friction(torque, moves):
-    arm = make_log.Arm(gravity=0.0, friction=0.03)
+    arm = robot_arm.Arm(gravity=0.0, friction=0.03)
     positions = arm.simulate(np.zeros(4), np.tile([0.0, torque], (50, 1)))
     assert np.any(positions) == moves
 
@@ -73,16 +73,16 @@ def test_dry_friction_in_mujoco_sticks_as_it_does_there():
     kind = make_robot_simulator(read_robot(EXAMPLE / "arm2.xml"))
     effect = "friction.coulomb@elbow"
     simulator = kind(observe=["q.shoulder", "q.elbow"], effects=[effect])
-    torques = make_log.torques_of(1)
+    torques = robot_arm.torques_of(1)
     inputs = {"u.m_shoulder": torques[:, 0], "u.m_elbow": torques[:, 1]}
-    scenario = Scenario(np.arange(len(torques)) / make_log.RATE, {}, inputs)
-    simulated = simulator.simulate(np.array([[make_log.FRICTION]]), scenario)[0]
-    true = make_log.Arm(friction=make_log.FRICTION).simulate(np.zeros(4), torques)
+    scenario = Scenario(np.arange(len(torques)) / robot_arm.RATE, {}, inputs)
+    simulated = simulator.simulate(np.array([[robot_arm.FRICTION]]), scenario)[0]
+    true = robot_arm.Arm(friction=robot_arm.FRICTION).simulate(np.zeros(4), torques)
     assert np.sqrt(np.mean((simulated - true) ** 2)) < 0.9e-4
 
 
 def test_the_log_is_what_the_script_makes():
-    head, made = numbers(make_log.table())
+    head, made = numbers(robot_arm.table())
     shipped_head, shipped = numbers((EXAMPLE / "log.csv").read_text())
     assert head == shipped_head
     np.testing.assert_allclose(shipped, made, rtol=0, atol=1.5e-5)  # one unit of the last digit
@@ -92,8 +92,8 @@ def test_the_log_says_what_the_script_did():
     said = read_toml(EXAMPLE / "log.toml")
     head, rows = numbers((EXAMPLE / "log.csv").read_text())
     assert set(head[2:]) == {*said["channels"], *said["inputs"]}
-    assert {channel["noise"] for channel in said["channels"].values()} == {make_log.NOISE}
+    assert {channel["noise"] for channel in said["channels"].values()} == {robot_arm.NOISE}
     assert [set(rows[:, 0]), said["runs"]] == [
-        set(make_log.RUNS),
+        set(robot_arm.RUNS),
         {"5": {"held_out": True}, "6": {"held_out": True}},
     ]

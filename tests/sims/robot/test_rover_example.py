@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.diagnosis.explain import explain
-from examples.rover import make_rover_log
+from tests.example_logs import rover
 
-EXAMPLE = Path(make_rover_log.__file__).parent
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "rover"
 
 
 def read_angles(poses):
@@ -18,17 +18,17 @@ def read_angles(poses):
 
 
 def test_the_log_is_that_of_the_script(tmp_path):
-    assert make_rover_log.write_log(tmp_path).read_bytes() == (EXAMPLE / "log.csv").read_bytes()
+    assert rover.write_log(tmp_path).read_bytes() == (EXAMPLE / "log.csv").read_bytes()
 
 
 def test_wheels_roll_without_slip():
     """The pose is the integral of the wheels' speeds, by the kinematics of a differential drive."""
-    times, _, rows = make_rover_log.drive(1)
-    turned = rows[-1, 7:] * make_rover_log.RADIUS
+    times, _, rows = rover.drive(1)
+    turned = rows[-1, 7:] * rover.RADIUS
     yaw = np.unwrap(read_angles(rows)[:, 0])
-    assert yaw[-1] == pytest.approx((turned[1] - turned[0]) / make_rover_log.TRACK, abs=1e-9)
+    assert yaw[-1] == pytest.approx((turned[1] - turned[0]) / rover.TRACK, abs=1e-9)
     forward = np.gradient(rows[:, :2], times, axis=0)
-    speed = np.gradient(rows[:, 7:], times, axis=0).sum(axis=1) * make_rover_log.RADIUS / 2
+    speed = np.gradient(rows[:, 7:], times, axis=0).sum(axis=1) * rover.RADIUS / 2
     directions = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     np.testing.assert_allclose((forward * directions).sum(axis=1)[5:-5], speed[5:-5], atol=2e-4)
 
@@ -36,8 +36,8 @@ def test_wheels_roll_without_slip():
 def test_it_moves_as_mujoco_moves_the_model_with_a_dragging_bearing():
     """Contacts of MuJoCo creep, so that wheels slip by millimetres in three seconds."""
     model = mujoco.MjModel.from_xml_path(str(EXAMPLE / "rover.xml"))
-    model.dof_damping[model.joint("left").dofadr[0]] = make_rover_log.DAMPING[0]
-    _, commands, rows = make_rover_log.drive(2)
+    model.dof_damping[model.joint("left").dofadr[0]] = rover.DAMPING[0]
+    _, commands, rows = rover.drive(2)
     data = mujoco.MjData(model)
     data.qpos[:] = rows[0]
     poses = []

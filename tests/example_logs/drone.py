@@ -1,4 +1,4 @@
-"""Make this example's recording again: `python examples/drone/make_log.py FOLDER`.
+"""Make the recording of examples/drone again: `python -m tests.example_logs.drone FOLDER`.
 
 The "real" quadrotor is a rigid body, whose Newton-Euler equations SciPy integrates; MuJoCo is not
 used. A controller flies it along slow waves. Rotor 3 gives a tenth less thrust than commanded,

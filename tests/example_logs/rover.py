@@ -1,4 +1,4 @@
-"""Make this example's recording again: `python examples/rover/make_rover_log.py FOLDER`.
+"""Make the recording of examples/rover again: `python -m tests.example_logs.rover FOLDER`.
 
 The "real" rover is a differential drive whose wheels roll without slip. SciPy integrates its
 equations of motion (R. Siegwart et al., Autonomous Mobile Robots, 2011, chapter 3); MuJoCo is not

@@ -1,4 +1,4 @@
-"""Make overflow.csv and overflow.toml: ``python examples/tanks/make_log.py``.
+"""Make the recording of examples/tanks again: `python -m tests.example_logs.overflowing_tanks`.
 
 The recording shows two tanks, of which the upper one overflows at a low rim; with --clean,
 clean.csv is written, in which the rim is out of reach. SciPy's LSODA integrates the tanks from one
@@ -106,4 +106,5 @@ def write(path, rim=RIM, seed=2):
 
 if __name__ == "__main__":
     clean = "--clean" in sys.argv
-    write(Path(__file__).parent / ("clean.csv" if clean else "overflow.csv"), 1.0 if clean else RIM)
+    folder = Path(__file__).resolve().parents[2] / "examples" / "tanks"
+    write(folder / ("clean.csv" if clean else "overflow.csv"), 1.0 if clean else RIM)

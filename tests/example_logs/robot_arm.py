@@ -1,4 +1,4 @@
-"""Make this example's recording again: `python examples/robot/make_log.py FOLDER`.
+"""Make the recording of examples/robot again: `python -m tests.example_logs.robot_arm FOLDER`.
 
 The "real" arm is given here by the equations of motion of two links in a plane, which SciPy
 integrates from event to event. MuJoCo is not used. The elbow has dry friction, which can stick; the

@@ -1,0 +1,1 @@
+"""Scripts that made the logs of examples/, with equations of motion of their own."""
