@@ -35,17 +35,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from methods.learning.library_isolation import deterministic_training
+from methods.learning.network_training import (
+    INITIAL_WEIGHT_LIMIT,
+    TrainingMonitor,
+    Weights,
+    compute_cosine_rates,
+    minimise_loss,
+    train_weights,
+)
 from methods.tuner import Array, TrainingSimulator
-
-if TYPE_CHECKING:
-    import torch
-
 
 _SIGMA_ZERO = 0.01
 """Constant s0 in (3): differences far below those of the training give equal tokens."""
@@ -289,11 +292,6 @@ def make_ordered_histories(count: int, window: int) -> HistoryIndices:
     )
 
 
-_INITIAL_WEIGHT_LIMIT = 1.7
-"""Limit of initial weights times the root of the number of inputs of a layer.
-
-It gives a variance close to 1 / inputs.
-"""
 _RESIDUAL_WEIGHT_FACTOR = 0.3
 """Factor of the initial weights of layers whose output is added to another value.
 
@@ -325,122 +323,64 @@ class TrainingHistories(NamedTuple):
         return [torch.as_tensor(array, dtype=torch.float32) for array in self]
 
 
-class HistoryValidationMonitor(NamedTuple):
-    """Held-out data, and a callback for the losses.
-
-    Attributes:
-        material: held-out data.
-        epoch: called with the epoch from 1, the number of epochs, training and held-out loss.
-    """
-
-    material: TrainingHistories
-    epoch: Callable[[int, int, float, float], None]
-
-
 def train_history_transformer(
     material: TrainingHistories,
     draw_histories: Callable[[np.random.Generator], HistoryIndices],
     design: HistoryTransformerDesign,
     rng: np.random.Generator,
-    watched: HistoryValidationMonitor | None = None,
+    watched: TrainingMonitor[TrainingHistories] | None = None,
 ) -> dict[str, Array]:
-    """Train the weights by Adam, on the CPU; equal generators give bit-identical weights.
+    """Train the weights by Adam; equal generators give bit-identical weights.
+
+    The learning rate falls to zero along half a cosine.
 
     Args:
         material: training data.
         draw_histories: function that draws the histories of a batch.
         design: design of the network and of its training.
         rng: seeds the initial weights and all random draws; global random state is not changed.
-        watched: held-out data and callback for the losses, without the penalty; the weights do not
-            depend on it.
+        watched: held-out data and callback for the losses.
 
     Returns:
         Weight arrays as in `get_weight_shapes`.
     """
     import torch
 
-    with deterministic_training(), torch.enable_grad():
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        shapes_by_name = get_weight_shapes(
-            material.shown.shape[-1], material.parameters.shape[-1], design
+    def get_gain(name: str) -> float:
+        gain = INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
+        return gain * _RESIDUAL_WEIGHT_FACTOR if name.startswith(_RESIDUAL_LAYERS) else gain
+
+    def fit(weights: Weights, _: object) -> None:
+        tensors = material.to_tensors()
+        monitor = None
+        if watched is not None:
+            parts = watched.held_out.to_tensors()
+
+            def compute_held_out_loss() -> Any:
+                # A separate random stream keeps the training independent of the evaluation.
+                histories = draw_histories(np.random.default_rng(0))
+                return _compute_loss(weights, design, parts, histories)
+
+            monitor = TrainingMonitor(compute_held_out_loss, watched.epoch)
+        # torch's weight_decay is the gradient of half of it times the squared norm.
+        decay = 2.0 * design.weight_decay
+        optimiser: Any = torch.optim.Adam(
+            list(weights.values()), design.rate, weight_decay=decay, fused=True
         )
-        initial_weights = _draw_initial_weights(shapes_by_name, generator)
-        _minimise_loss(initial_weights, material, draw_histories, design, rng, watched)
-        return {name: v.detach().numpy().astype(np.float64) for name, v in initial_weights.items()}
+        count = len(tensors[0])
+        minimise_loss(
+            optimiser,
+            compute_cosine_rates(design.rate, design.epochs),
+            design.epochs,
+            lambda: np.split(rng.permutation(count), range(design.batch, count, design.batch)),
+            lambda batch: _compute_loss(
+                weights, design, [part[batch] for part in tensors], draw_histories(rng)
+            ),
+            monitor,
+        )
 
-
-def _draw_initial_weights(
-    shapes_by_name: dict[str, tuple[int, ...]], generator: torch.Generator
-) -> dict[str, Any]:
-    """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
-
-    Layers whose output is added to another value (names that begin with one of `_RESIDUAL_LAYERS`)
-    get a smaller gain.
-
-    Args:
-        shapes_by_name: shape of each array.
-        generator: torch's random generator.
-    """
-    import torch
-
-    initial_weights: dict[str, Any] = {}
-    for name, shape in shapes_by_name.items():
-        gain = _INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
-        if name.startswith(_RESIDUAL_LAYERS):
-            gain *= _RESIDUAL_WEIGHT_FACTOR
-        limit = gain / shape[0] ** 0.5
-        uniform = torch.rand(shape, generator=generator) * 2 - 1
-        initial_weights[name] = (uniform * limit).requires_grad_()
-    return initial_weights
-
-
-def _minimise_loss(
-    w: dict[str, Any],
-    material: TrainingHistories,
-    draw_histories: Callable[[np.random.Generator], HistoryIndices],
-    design: HistoryTransformerDesign,
-    rng: np.random.Generator,
-    monitor: HistoryValidationMonitor | None,
-) -> None:
-    """Minimise the loss with Adam; the weights are changed in place.
-
-    The learning rate falls to zero along half a cosine.
-
-    Args:
-        w: weights as tensors, by name.
-        material: training simulations.
-        draw_histories: draws the histories of one batch.
-        design: sizes and learning settings of the network.
-        rng: draws the batches.
-        monitor: gets the losses on training and held-out data after each epoch; None for none.
-    """
-    import torch
-
-    tensors = material.to_tensors()
-    watched_parts = monitor and monitor.material.to_tensors()
-    # torch's weight_decay is the gradient of half of it times the squared norm.
-    decay = 2.0 * design.weight_decay
-    optimiser: Any = torch.optim.Adam(list(w.values()), design.rate, weight_decay=decay, fused=True)
-    for epoch in range(design.epochs):
-        rate_factor = 0.5 + 0.5 * float(np.cos(np.pi * epoch / design.epochs))
-        for group in optimiser.param_groups:
-            group["lr"] = design.rate * rate_factor
-        order = rng.permutation(len(tensors[0]))
-        losses = []
-        for first in range(0, len(order), design.batch):
-            batch = order[first : first + design.batch]
-            optimiser.zero_grad()
-            error = _compute_loss(w, design, [part[batch] for part in tensors], draw_histories(rng))
-            error.backward()
-            optimiser.step()
-            losses.append(error.detach())
-        if monitor and watched_parts:
-            # A separate random stream keeps the training independent of the evaluation.
-            histories = draw_histories(np.random.default_rng(0))
-            with torch.no_grad():
-                held_out = float(_compute_loss(w, design, watched_parts, histories))
-                training = float(torch.stack(losses).mean())
-            monitor.epoch(epoch + 1, design.epochs, training, held_out)
+    shapes = get_weight_shapes(material.shown.shape[-1], material.parameters.shape[-1], design)
+    return train_weights(shapes, get_gain, rng, fit)
 
 
 def _compute_loss(

@@ -10,6 +10,7 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig
+from methods.learning.network_training import TrainingMonitor
 from methods.learning.training_data import TrainingData, generate_training_data
 from methods.tuner import Array, Task, TrainingSimulator, Tuner
 
@@ -230,20 +231,6 @@ def check_shapes(
     return {name: arrays[name] for name in expected}
 
 
-@dataclass(frozen=True)
-class TrainingMonitor:
-    """Monitor of the training of one network.
-
-    Attributes:
-        held_out: simulations that are used for evaluation only.
-        epoch: called after each epoch with its number from 1, the number of epochs, training loss
-            and held-out loss.
-    """
-
-    held_out: TrainingData
-    epoch: Callable[[int, int, float, float], None]
-
-
 _UNIT_RANGE = np.array([[0.0], [1.0]])
 """Corners of the unit cube, a training range in any number of dimensions."""
 
@@ -297,7 +284,7 @@ class NoiseMatchedTuner(Tuner, Generic[Learner]):
         data: TrainingData,
         rng: np.random.Generator,
         training_range: Array,
-        monitor: TrainingMonitor | None,
+        monitor: TrainingMonitor[TrainingData] | None,
     ) -> Learner:
         """Train the network for one noise level.
 

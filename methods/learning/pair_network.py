@@ -17,15 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from methods.learning.library_isolation import deterministic_training
+from methods.learning.network_training import (
+    INITIAL_WEIGHT_LIMIT,
+    TrainingMonitor,
+    Weights,
+    compute_cosine_rates,
+    minimise_loss,
+    train_weights,
+)
 from methods.tuner import Array
-
-if TYPE_CHECKING:
-    import torch
 
 LAYER_NAMES = ("proposed", "target", "joined", "output")
 """Names of the fully connected layers.
@@ -37,11 +41,6 @@ _SOFTPLUS_AT_ZERO = float(np.log(2.0))
 """Softplus at zero; it is subtracted, so that a unit with input zero has output zero."""
 _LOSS_SCALE = 30.0
 """Divisor of relative squared errors; for Adam only their ratio to the penalty matters."""
-_INITIAL_WEIGHT_LIMIT = 1.7
-"""Limit of initial weights times the root of the number of inputs of a layer.
-
-It gives a variance close to 1 / inputs.
-"""
 _LEARNING_RATE_DECAY = 0.99
 """Factor by which the published learning rate decreases in each epoch."""
 
@@ -172,29 +171,18 @@ class PairInputs(NamedTuple):
     target: Array
 
 
-class PairValidationMonitor(NamedTuple):
-    """Held-out data, and a callback for the losses.
-
-    Attributes:
-        rows: input rows of the held-out data.
-        parameters: (scenarios, m, dim) parameters of the held-out data.
-        epoch: called with the epoch from 1, the number of epochs, training and held-out loss.
-    """
-
-    rows: PairInputs
-    parameters: Array
-    epoch: Callable[[int, int, float, float], None]
-
-
 def train_pair_network(
     rows: PairInputs,
     parameters: Array,
     design: PairNetworkDesign,
     rng: np.random.Generator,
     alone: bool = False,
-    watched: PairValidationMonitor | None = None,
+    watched: TrainingMonitor[tuple[PairInputs, Array]] | None = None,
 ) -> dict[str, Array]:
-    """Train the weights by Eq. 1 on the CPU; equal generators give bit-identical weights.
+    """Train the weights by Eq. 1; equal generators give bit-identical weights.
+
+    The method is Adam with a learning rate that falls along half a cosine, or as published plain
+    gradient descent with a rate that falls exponentially.
 
     Args:
         rows: input rows of both sides.
@@ -203,31 +191,49 @@ def train_pair_network(
         rng: seeds the initial weights and the order; global random state is not changed.
         alone: True to learn parameters from the target alone, with a proposed input of zero (the
             direct regressor).
-        watched: held-out data and callback for the losses, without the penalty on the weights; the
-            weights do not depend on it.
+        watched: input rows and parameters of held-out data, with a callback for the losses.
 
     Returns:
         Weight arrays as in `get_weight_shapes`.
     """
     import torch
 
-    # Layers this small do not use a GPU well: an H100 takes 1.6 to 2.7 times as long as its host.
-    with deterministic_training(), torch.enable_grad():
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
-        weights = _draw_initial_weights(inputs, parameters.shape[-1], design, generator)
-        _run_optimiser(
-            _make_loss(design, weights, alone),
-            list(weights.values()),
-            _convert_to_tensors(rows, parameters),
-            design,
-            generator,
-            watched,
+    def get_gain(name: str) -> float:
+        if not design.adam:
+            return 1.0
+        return INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
+
+    def fit(weights: Weights, generator: Any) -> None:
+        x, target_rows, y = _convert_to_tensors(rows, parameters)
+        loss = _make_loss(design, weights, alone)
+        monitor = None
+        if watched is not None:
+            held_out = _convert_to_tensors(*watched.held_out)
+            monitor = TrainingMonitor(lambda: loss(*held_out), watched.epoch)
+        rates = [design.rate * _LEARNING_RATE_DECAY**epoch for epoch in range(design.epochs)]
+        kind: Any = torch.optim.SGD
+        if design.adam:
+            kind, rates = torch.optim.Adam, compute_cosine_rates(design.rate, design.epochs)
+
+        def draw_batches() -> Any:
+            order: Any = torch.randperm(len(x), generator=generator)
+            return order.split(design.batch)
+
+        values = list(weights.values())
+        minimise_loss(
+            kind(values, lr=design.rate),
+            rates,
+            design.epochs,
+            draw_batches,
+            lambda batch: loss(x[batch], target_rows[batch], y[batch]),
+            monitor,
+            # The penalty is in the loss and not torch's option, so that it is Eq. 1 for Adam too.
+            lambda: design.weight_decay * sum((v**2).sum() for v in values),
         )
-        trained: dict[str, Array] = {}
-        for name, weight in weights.items():
-            trained[name] = weight.detach().cpu().numpy().astype(np.float64)
-        return trained
+
+    inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
+    shapes = get_weight_shapes(inputs, design.width, parameters.shape[-1])
+    return train_weights(shapes, get_gain, rng, fit)
 
 
 def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
@@ -244,34 +250,6 @@ def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, 
     is_shared = rows.target is rows.proposed
     target = proposed if is_shared else tensor(rows.target)
     return proposed, target, tensor(parameters)
-
-
-def _draw_initial_weights(
-    inputs: tuple[int, int], dim: int, design: PairNetworkDesign, generator: torch.Generator
-) -> dict[str, Any]:
-    """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero.
-
-    Args:
-        inputs: numbers of inputs of the proposed and of the target side.
-        dim: number of parameters.
-        design: design of the network.
-        generator: torch's random generator.
-    """
-    import torch
-
-    weights: dict[str, Any] = {}
-    fan_in = 1
-    for name, shape in get_weight_shapes(inputs, design.width, dim).items():
-        is_weight = name.endswith("weight")
-        # A layer's bias follows its weights and has the same number of inputs.
-        fan_in = shape[0] if is_weight else fan_in
-        gain = 1.0
-        if design.adam:
-            gain = _INITIAL_WEIGHT_LIMIT if is_weight else 0.0
-        limit = gain / fan_in**0.5
-        uniform = torch.rand(shape, generator=generator) * 2 - 1
-        weights[name] = (uniform * limit).requires_grad_()
-    return weights
 
 
 def _make_loss(
@@ -335,54 +313,3 @@ def _make_loss(
         return squares.mean()
 
     return objective
-
-
-def _run_optimiser(
-    loss: Callable[[Any, Any, Any], Any],
-    weights: list[Any],
-    data: tuple[Any, Any, Any],
-    design: PairNetworkDesign,
-    generator: torch.Generator,
-    monitor: PairValidationMonitor | None,
-) -> None:
-    """Minimise the loss (3) by gradient descent; the weights are changed in place.
-
-    The method is Adam with a learning rate that falls along half a cosine, or as published plain
-    gradient descent with a rate that falls exponentially.
-
-    Args:
-        loss: loss of one batch.
-        weights: weights as tensors.
-        data: the tensors of `_convert_to_tensors`.
-        design: sizes and learning settings of the network.
-        generator: draws the batches.
-        monitor: gets the losses on training and held-out data after each epoch; None for none.
-    """
-    import torch
-
-    x, target_rows, y = data
-    held_out = monitor and _convert_to_tensors(monitor.rows, monitor.parameters)
-    kind = torch.optim.Adam if design.adam else torch.optim.SGD
-    optimiser: Any = kind(weights, lr=design.rate)
-    for epoch in range(design.epochs):
-        rate_factor = _LEARNING_RATE_DECAY**epoch
-        if design.adam:
-            rate_factor = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs)
-        for group in optimiser.param_groups:
-            group["lr"] = design.rate * float(rate_factor)
-        order = torch.randperm(len(x), generator=generator)
-        losses = []
-        for first in range(0, len(x), design.batch):
-            batch = order[first : first + design.batch]
-            optimiser.zero_grad()
-            error = loss(x[batch], target_rows[batch], y[batch])
-            # The penalty is in the loss and not torch's option, so that it is Eq. 1 for Adam too.
-            penalty = design.weight_decay * sum((v**2).sum() for v in weights)
-            (error + penalty).backward()
-            optimiser.step()
-            losses.append(error.detach())
-        if monitor and held_out:
-            with torch.no_grad():
-                training_loss = float(torch.stack(losses).mean())
-                held_out_loss = float(loss(*held_out))
-            monitor.epoch(epoch + 1, design.epochs, training_loss, held_out_loss)

@@ -9,15 +9,14 @@ from typing import ClassVar
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig, InputFeatures, fill_gaps
+from methods.learning.network_training import TrainingMonitor
 from methods.learning.noise_matched_networks import (
     NoiseMatchedTuner,
-    TrainingMonitor,
     check_shapes,
 )
 from methods.learning.pair_network import (
     PairInputs,
     PairNetworkDesign,
-    PairValidationMonitor,
     estimate_difference,
     get_weight_shapes,
     train_pair_network,
@@ -54,7 +53,7 @@ class TrainedPairNetwork:
         rng: np.random.Generator,
         reading: FeatureConfig,
         alone: bool,
-        monitor: TrainingMonitor | None,
+        monitor: TrainingMonitor[TrainingData] | None,
     ) -> TrainedPairNetwork:
         """Choose the inputs, and train the network on them.
 
@@ -76,7 +75,7 @@ class TrainedPairNetwork:
         if monitor is not None:
             held_out = monitor.held_out
             rows = _compute_input_rows(proposed, features, held_out)
-            validation_monitor = PairValidationMonitor(rows, held_out.parameters, monitor.epoch)
+            validation_monitor = TrainingMonitor((rows, held_out.parameters), monitor.epoch)
         rows = _compute_input_rows(proposed, features, data)
         weights = train_pair_network(rows, data.parameters, design, rng, alone, validation_monitor)
         return cls(design, features, weights, proposed)
@@ -233,7 +232,7 @@ class PairTuner(NoiseMatchedTuner[TrainedPairNetwork]):
         data: TrainingData,
         rng: np.random.Generator,
         training_range: Array,  # noqa: ARG002 - the network learns differences of parameters
-        monitor: TrainingMonitor | None,
+        monitor: TrainingMonitor[TrainingData] | None,
     ) -> TrainedPairNetwork:
         """Train the network for one noise level; see `NoiseMatchedTuner`."""
         return TrainedPairNetwork.train(

@@ -30,7 +30,6 @@ import numpy as np
 from methods.learning.history_transformer import (
     HistoryIndices,
     HistoryTransformerDesign,
-    HistoryValidationMonitor,
     TrainingHistories,
     draw_binary_search,
     get_weight_shapes,
@@ -40,9 +39,9 @@ from methods.learning.history_transformer import (
     train_history_transformer,
 )
 from methods.learning.input_features import FeatureConfig, InputFeatures
+from methods.learning.network_training import TrainingMonitor
 from methods.learning.noise_matched_networks import (
     NoiseMatchedTuner,
-    TrainingMonitor,
     check_shapes,
 )
 from methods.learning.training_data import TrainingData
@@ -190,7 +189,7 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
         data: TrainingData,
         rng: np.random.Generator,
         training_range: Array,
-        monitor: TrainingMonitor | None,
+        monitor: TrainingMonitor[TrainingData] | None,
     ) -> TrainedHistoryNetwork:
         """Train a transformer on histories of simulated tuning runs, for one noise level.
 
@@ -204,7 +203,7 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
         validation_monitor = None
         if monitor is not None:
             held_out = _build_training_histories(features, monitor.held_out, training_range)
-            validation_monitor = HistoryValidationMonitor(held_out, monitor.epoch)
+            validation_monitor = TrainingMonitor(held_out, monitor.epoch)
         design = self.make_network_design()
         material = _build_training_histories(features, data, training_range)
         per_scenario = data.parameters.shape[1]
