@@ -137,6 +137,7 @@ class ProgressDisplay:
         self._busy = False
         self._waiting: list[str] = []
         self._has_timer = False
+        self._is_stop_requested = False
 
     def __enter__(self) -> ProgressDisplay:
         """Start the timer that redraws the live line, where signals can be used.
@@ -174,6 +175,30 @@ class ProgressDisplay:
         if not self._busy:
             with self._block_timer_writes():
                 self._draw_lines()
+
+    @contextmanager
+    def handle_interrupts(self) -> Iterator[dict[str, Any]]:
+        """Let the first Ctrl-C request a stop of the search; the second one interrupts as usual.
+
+        Returns:
+            Context that gives the arguments with which a search reports to this display: `say`,
+            `stop` and `listener`.
+        """
+        # Python handles signals in the main thread only. SIGINT stays ignored if it is ignored, as
+        # for background jobs of a shell.
+        is_main = threading.current_thread() is threading.main_thread()
+        if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._request_stop)
+        try:
+            yield {"say": self.note, "stop": lambda: self._is_stop_requested, "listener": self}
+        finally:
+            if is_main and signal.getsignal(signal.SIGINT) == self._request_stop:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _request_stop(self, *_: object) -> None:
+        self._is_stop_requested = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.note("stopping with the results so far; Ctrl-C again stops at once")
 
     @contextmanager
     def paused(self) -> Iterator[None]:

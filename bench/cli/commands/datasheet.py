@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields
 
-from bench.cli.interrupt_handler import InterruptHandler
 from bench.cli.output import CommandResult, PrintLine
 from bench.cli.shared_options import (
     add_options,
@@ -52,9 +51,8 @@ def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> Comman
     # Check this before the work, which may take minutes.
     check_folder_empty(options.out)
     display = ProgressDisplay(options.budget, silent=options.json)
-    with display, InterruptHandler(display.note) as interrupts:
-        settings = collect_options(options, DatasheetOptions)
-        settings |= {"say": display.note, "stop": interrupts.is_stop_requested, "listener": display}
+    with display, display.handle_interrupts() as arguments:
+        settings = collect_options(options, DatasheetOptions) | arguments
         sheet = check_options(DatasheetOptions, settings)
         if sheet.explained is None:
             check_joint_exists(options.recordings, sheet)

@@ -41,7 +41,6 @@ def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         proposal.
     """
     from bench.api.design import DesignOptions, design
-    from bench.cli.interrupt_handler import InterruptHandler
     from bench.cli.progress_display import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
     from sims.core.files import check_absent
@@ -49,13 +48,11 @@ def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     load_plugins(options.plugin)
     check_absent([options.out])
     display = ProgressDisplay(silent=options.json, hint=False)
-    with display, InterruptHandler(display.note) as interrupts:
+    with display, display.handle_interrupts() as arguments:
         proposed = design(
             options.recordings,
             **collect_options(options, DesignOptions),
-            say=display.note,
-            stop=interrupts.is_stop_requested,
-            listener=display,
+            **arguments,
         )
     print_line(str(proposed.explanation))
     for line in proposed.lines():

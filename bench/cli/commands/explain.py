@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.cli.interrupt_handler import InterruptHandler
 from bench.cli.output import (
     EXIT_INTERRUPTED,
     EXIT_OK,
@@ -114,13 +113,11 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         check_folder_empty(options.out)
     started = get_utc_time()
     with ProgressDisplay(options.budget, silent=options.json) as display:
-        with InterruptHandler(display.note) as interrupts:
+        with display.handle_interrupts() as arguments:
             explanation = explain(
                 options.recordings,
                 **collect_options(options, ExplainOptions),
-                say=display.note,
-                stop=interrupts.is_stop_requested,
-                listener=display,
+                **arguments,
             )
         display.finish("drawing the figures and writing the report")
         folder = options.out or make_timestamped_path(
@@ -201,7 +198,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         display.completed(finished_count / len(logs))
 
     display = ProgressDisplay(silent=options.json, hint=False)
-    with display, InterruptHandler(display.note) as interrupts:
+    with display, display.handle_interrupts() as arguments:
         display.stage("explaining each recording", len(logs))
         pool = make_cluster_pool(options.cluster) or make_pool(
             min(options.jobs or count_available_cores(), len(logs))
@@ -214,7 +211,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
                 settings,
                 pool,
                 print_finished_recording,
-                interrupts.is_stop_requested,
+                arguments["stop"],
             )
     return _report_batch(options, output_folder, started, logs, log_results, print_line)
 
