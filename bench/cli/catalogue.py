@@ -16,9 +16,7 @@ from bench.cli.output import EXIT_CODES, JsonDocument
 from sims.core.plain_values import append_unit, format_unit
 
 if TYPE_CHECKING:
-    from sims.robot.robot_model import RobotModel
     from sims.robot.robot_simulator import RobotSimulator
-    from sims.robot.robot_system import RobotSystem
 
 _OPTION_TYPES = {
     "_StoreTrueAction": "flag",
@@ -291,16 +289,6 @@ CATALOGUE_SECTIONS: dict[str, Callable[[], list[JsonDocument]]] = {
 """Sections of the catalogue in addition to commands and places of a robot, by name."""
 
 
-def format_catalogue(section: str) -> list[str]:
-    """Return the lines of one section of the catalogue.
-
-    Args:
-        section: One of `bench.cli.catalogue.CATALOGUE_SECTIONS`, e.g. tuners, simulators or
-            schemas.
-    """
-    return format_documents(section, CATALOGUE_SECTIONS[section]())
-
-
 def format_documents(section: str, documents: list[JsonDocument]) -> list[str]:
     """Format given documents of a section of the catalogue."""
     format_entry = _LAID_OUT.get(section, _format_plain_entry)
@@ -404,32 +392,6 @@ _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {
 }
 
 
-def format_places(model: Path) -> Iterator[str]:
-    """Yield lines about a model file's places and signals, and the effects that can act there.
-
-    A place is a joint, actuator, body or sensor at which an effect can act.
-
-    Args:
-        model: MJCF or URDF file of a robot.
-    """
-    from bench.core.plugin_registries import make_robot_simulator
-    from bench.logs.recording_summary import format_robot_summary
-
-    kind = cast("type[RobotSimulator]", make_robot_simulator(model))
-    yield from format_robot_summary(kind)
-    yield from _format_joints(kind.robot)
-    yield from _format_actuators(kind)
-    for body in kind.robot.bodies:
-        links = f", with {', '.join(body.aliases)}" if body.aliases else ""
-        yield f"  {'body':9} {body.name:24} {body.mass:.4g} kg{links}"
-    for signal in kind.inputs:
-        yield f"  {'input':9} {signal.name:24} {format_unit(signal.unit)}"
-    for channel in kind.channels:
-        yield f"  {'channel':9} {channel.name:24} {format_unit(channel.unit):9} {channel.says}"
-    yield from _format_effects_by_place(kind.system)
-    yield f"  --free also takes MuJoCo's words: {', '.join(kind.system.list_mujoco_words())}"
-
-
 def list_places(model: Path) -> JsonDocument:
     """Build the JSON document of the places of a model file.
 
@@ -440,9 +402,14 @@ def list_places(model: Path) -> JsonDocument:
     """
     from bench.core.plugin_registries import make_robot_simulator
     from bench.logs.recording_summary import format_robot_summary
+    from sims import effects
 
     kind = cast("type[RobotSimulator]", make_robot_simulator(model))
-    effects_by_kind = list_effects_by_place_kind(kind.system)
+    effects_by_kind: dict[str, list[str]] = {}
+    for name in effects.list_names():
+        effect = effects.get_effect(name)
+        if kind.system.placed(effect):
+            effects_by_kind.setdefault(effect.at, []).append(name)
     return {
         "model": model,
         "about": list(format_robot_summary(kind)),
@@ -464,48 +431,36 @@ def list_places(model: Path) -> JsonDocument:
     }
 
 
-def _format_joints(robot: RobotModel) -> Iterator[str]:
-    """Yield a line for each joint of a robot: kind, and range of motion and effort if limited."""
-    for joint in robot.joints:
-        limits = "" if joint.range is None else _format_range(joint.range, joint.unit)
-        effort = (
-            ""
-            if joint.effort is None
-            else append_unit(f", effort {joint.effort:g}", joint.force_unit)
-        )
-        yield f"  {'joint':9} {joint.name:24} {joint.kind}{limits}{effort}"
+def format_places(places: JsonDocument) -> Iterator[str]:
+    """Yield lines about a model file's places and signals, and the effects that can act there.
 
-
-def _format_actuators(kind: type[RobotSimulator]) -> Iterator[str]:
-    """Yield a line for each actuator of a robot: kind, the driven joint and the control range."""
-    units = {channel.name: channel.unit for channel in kind.inputs}
-    for a in kind.robot.actuators:
-        limits = "" if a.range is None else _format_range(a.range, units.get(f"u.{a.name}", ""))
-        yield f"  {'actuator':9} {a.name:24} {a.kind} on {a.joint or 'no joint'}{limits}"
-
-
-def _format_range(limits: tuple[float, float], unit: str) -> str:
-    return append_unit(f", {limits[0]:.4g} to {limits[1]:.4g}", unit)
-
-
-def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
-    """Yield a line for each kind of place with the effects that can act there."""
-    for kind, names in list_effects_by_place_kind(system).items():
+    Args:
+        places: Document of `list_places`.
+    """
+    yield from places["about"]
+    for joint in places["joints"]:
+        limits = _format_range(joint["range"], joint["unit"])
+        effort = f", effort {joint['effort']:g}" if joint["effort"] is not None else ""
+        effort = append_unit(effort, joint["effort_unit"]) if effort else ""
+        yield f"  {'joint':9} {joint['name']:24} {joint['kind']}{limits}{effort}"
+    units = {signal["name"]: signal["unit"] for signal in places["inputs"]}
+    for actuator in places["actuators"]:
+        limits = _format_range(actuator["range"], units.get(f"u.{actuator['name']}", ""))
+        target = f"{actuator['kind']} on {actuator['joint'] or 'no joint'}"
+        yield f"  {'actuator':9} {actuator['name']:24} {target}{limits}"
+    for body in places["bodies"]:
+        links = f", with {', '.join(body['aliases'])}" if body["aliases"] else ""
+        yield f"  {'body':9} {body['name']:24} {body['mass']:.4g} kg{links}"
+    for signal in places["inputs"]:
+        yield f"  {'input':9} {signal['name']:24} {format_unit(signal['unit'])}"
+    for channel in places["channels"]:
+        unit = format_unit(channel["unit"])
+        yield f"  {'channel':9} {channel['name']:24} {unit:9} {channel['says']}"
+    for kind, names in places["effects"].items():
         location = "of the world" if kind == "world" else f"at a {kind}, as {names[0]}@NAME or @*"
         yield f"  effects {location.replace('a actuator', 'an actuator')}: {', '.join(names)}"
+    yield f"  --free also takes MuJoCo's words: {', '.join(places['free'])}"
 
 
-def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]]:
-    """Return the names of effects that can act on a robot, by the kind of their places.
-
-    Returns:
-        Effect names by kind of place, such as joint or body.
-    """
-    from sims import effects
-
-    names_by_kind: dict[str, list[str]] = {}
-    for name in effects.list_names():
-        effect = effects.get_effect(name)
-        if system.placed(effect):
-            names_by_kind.setdefault(effect.at, []).append(name)
-    return names_by_kind
+def _format_range(limits: tuple[float, float] | None, unit: str) -> str:
+    return append_unit(f", {limits[0]:.4g} to {limits[1]:.4g}", unit) if limits else ""

@@ -44,7 +44,6 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         The JSON document of the command, and its exit code (0).
     """
     from bench.cli import catalogue
-    from bench.cli.catalogue import format_documents
     from bench.cli.main import build_parser
     from bench.core.plugin_registries import load_plugins
     from sims.core.simulator import InputError
@@ -53,11 +52,10 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     if (options.what == "places") != (options.model is not None):
         raise InputError("list places and --model FILE go together")
     if options.model is not None:
-        from bench.cli import catalogue
-
-        for line in catalogue.format_places(options.model):
+        places = catalogue.list_places(options.model)
+        for line in catalogue.format_places(places):
             print_line(line)
-        return CommandResult({"places": catalogue.list_places(options.model)})
+        return CommandResult({"places": places})
     if options.what is None:
         if not options.json:
             raise InputError(f"expected one of {', '.join(_LISTS)}; with --json all are listed")
@@ -66,7 +64,7 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         documents = catalogue.list_commands(build_parser())
     else:
         documents = catalogue.CATALOGUE_SECTIONS[options.what]()
-    for line in format_documents(options.what, documents):
+    for line in catalogue.format_documents(options.what, documents):
         print_line(line)
     return CommandResult({options.what: documents})
 

@@ -176,12 +176,12 @@ def test_model_files_are_found_in_packages_and_in_the_folder_of_robots(tmp_path,
 
 
 def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypatch):
-    from bench.cli.catalogue import format_catalogue
+    from bench.cli.catalogue import list_experiments
 
     monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "pybullet_data", None)
-    listed = {line.split()[0]: line for line in format_catalogue("experiments")}
+    listed = {line.split()[0]: line for line in format_documents("experiments", list_experiments())}
     assert listed["robot-so101"].split(maxsplit=1)[1].startswith("needs `simgap download so101`.")
     assert "skipped: needs pybullet_data, not installed" in listed["robot-iiwa"]
     assert not [line for line in listed.values() if "skipped" in line and "iiwa" not in line]
