@@ -73,18 +73,6 @@ _MAX_PATH_LENGTH = 1000
 """Maximum length of a path in characters."""
 
 
-class ManifestMismatch(NamedTuple):
-    """A difference between an archive and its manifest.
-
-    Attributes:
-        file: Path in the archive's folder.
-        says: What was expected, and what was found.
-    """
-
-    file: str
-    says: str
-
-
 def write_archive(
     archive: Path, name: str, files: Mapping[str, Path], metadata: Mapping[str, Any]
 ) -> None:
@@ -146,7 +134,7 @@ class UnpackedArchive(NamedTuple):
 
     folder: Path
     manifest: dict[str, Any]
-    mismatches: list[ManifestMismatch]
+    mismatches: list[VerificationFailure]
 
 
 @contextmanager
@@ -318,7 +306,7 @@ def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
 
 def _compare_with_manifest(
     manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
-) -> Iterator[ManifestMismatch]:
+) -> Iterator[VerificationFailure]:
     """Yield files that are missing, added, or different from the manifest.
 
     Args:
@@ -330,19 +318,21 @@ def _compare_with_manifest(
         for listed_file in manifest["files"]
     }
     if len(listed_files) < len(manifest["files"]):
-        yield ManifestMismatch(MANIFEST_FILE, "expected each file once, found one listed twice")
+        yield VerificationFailure(
+            MANIFEST_FILE, 0, "expected each file once, found one listed twice"
+        )
     for path in sorted({*listed_files, *unpacked}):
         if path not in unpacked:
-            yield ManifestMismatch(path, "expected it, as the manifest lists it; found none")
+            yield VerificationFailure(path, 0, "expected it, as the manifest lists it; found none")
         elif path not in listed_files:
-            yield ManifestMismatch(
-                path, "expected no file that the manifest does not list; found this one"
+            yield VerificationFailure(
+                path, 0, "expected no file that the manifest does not list; found this one"
             )
         elif listed_files[path] != unpacked[path]:
             (size, digest), (found_size, found_digest) = listed_files[path], unpacked[path]
             expected = f"{size} bytes with SHA-256 {digest[:12]}"
-            yield ManifestMismatch(
-                path, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
+            yield VerificationFailure(
+                path, 0, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
             )
 
 
@@ -529,79 +519,109 @@ def _format_explain_command(folder: Path) -> str:
     return shlex.join(words)
 
 
-class ArchiveVerification(NamedTuple):
-    """Result of verifying an archive.
+class Verification(NamedTuple):
+    """Result of verifying a folder of results, or an archive of one.
 
     Attributes:
-        archive: metadata of the archive.
-        doubts: files that differ from the manifest; if there are any, nothing else is verified.
         comparisons: result for each comparison in it.
         explanation: result for the explanation in it.
+        archive: metadata of the archive; None for a folder.
+        doubts: files of the archive that differ from its manifest; if there are any, nothing else
+            is verified.
     """
 
-    archive: dict[str, Any]
-    doubts: list[VerificationFailure]
     comparisons: list[VerificationResult]
     explanation: ExplanationVerification | None
+    archive: dict[str, Any] | None = None
+    doubts: Sequence[VerificationFailure] = ()
 
     @property
     def is_consistent(self) -> bool:
         """True if there is no verification failure."""
-        has_no_doubts = not self.doubts and all(
-            comparison.is_consistent for comparison in self.comparisons
-        )
+        has_no_doubts = not self.doubts and all(part.is_consistent for part in self.comparisons)
         return has_no_doubts and not (self.explanation and self.explanation.doubts)
 
     def to_document(self) -> dict[str, Any]:
-        """Convert the result of verifying an archive to a JSON document."""
-        comparisons = [comparison.to_document() for comparison in self.comparisons]
-        explanation = self.explanation.to_document() if self.explanation else None
-        archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
-        parts = {"archive": archive, "comparisons": comparisons, "explanation": explanation}
-        return {"follows": self.is_consistent, **parts}
+        """Convert the result to a JSON document."""
+        archive = self.archive
+        if archive is not None:
+            archive = {**archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
+        return {
+            "follows": self.is_consistent,
+            "archive": archive,
+            "comparisons": [part.to_document() for part in self.comparisons],
+            "explanation": self.explanation.to_document() if self.explanation else None,
+        }
 
 
-def verify_archive(
-    archive: Path, print_line: PrintLine, plugins: Sequence[str] = (), every: bool = False
-) -> ArchiveVerification:
-    """Verify that an archive matches its manifest, and verify the results in it.
+def verify_results(
+    path: Path, print_line: PrintLine, plugins: Sequence[str] = (), every: bool = False
+) -> Verification:
+    """Verify the results in a folder or in an archive, which must match its manifest.
 
     Args:
-        archive: archive written by `write_bundle`, possibly elsewhere.
+        path: folder of a comparison, a sweep or an explanation, or archive of `write_bundle`.
         print_line: prints a line.
-        plugins: plugin files to load; those that the archive names or contains are never run.
+        plugins: plugin files to load; those that an archive names or contains are never run.
         every: whether to repeat every simulation instead of a sample.
 
     Raises:
-        InputError: the file is not such an archive, or is unsafe to unpack.
+        InputError: the path has no results, or an archive is unsafe to unpack.
     """
-    with unpack_archive(archive) as unpacked:
-        description = _describe_archive(archive, unpacked)
-        count, size = description["files"], description["bytes"]
-        print_line(
-            f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
-            f"{size} bytes"
+    if path.is_file():
+        with unpack_archive(path) as unpacked:
+            return _verify_archive(path, unpacked, print_line, plugins, every)
+    if (path / VERDICT_FILE).is_file():
+        return Verification([], _verify_explanation(path, path, print_line))
+    folders = list_study_folders(path)
+    return Verification([verify_comparison(f, print_line, plugins, every) for f in folders], None)
+
+
+def _verify_archive(
+    archive: Path,
+    unpacked: UnpackedArchive,
+    print_line: PrintLine,
+    plugins: Sequence[str],
+    every: bool,
+) -> Verification:
+    """Verify that an archive matches its manifest, and verify the results in it.
+
+    Args:
+        archive: archive, possibly written elsewhere.
+        unpacked: its content.
+        print_line: prints a line.
+        plugins: plugin files to load.
+        every: whether to repeat every simulation instead of a sample.
+    """
+    description = _describe_archive(archive, unpacked)
+    count, size = description["files"], description["bytes"]
+    print_line(
+        f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
+        f"{size} bytes"
+    )
+    if unpacked.mismatches:
+        print_failures(unpacked.mismatches, archive, print_line)
+        return Verification([], None, description, unpacked.mismatches)
+    print_line(
+        f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
+    )
+    if description["kind"] == "explanation":
+        explanation = _verify_explanation(unpacked.folder, archive, print_line)
+        return Verification([], explanation, description)
+    comparisons = [
+        verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
+            folder=archive / part.relative_to(unpacked.folder.parent)
         )
-        doubts = [
-            VerificationFailure(mismatch.file, 0, mismatch.says) for mismatch in unpacked.mismatches
-        ]
-        if doubts:
-            print_failures(doubts, archive, print_line)
-            return ArchiveVerification(description, doubts, [], None)
-        print_line(
-            f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
-        )
-        if description["kind"] == "explanation":
-            explained = verify_extended_model(unpacked.folder, print_line)
-            print_failures(explained.doubts, archive, print_line)
-            return ArchiveVerification(description, [], [], explained)
-        verifications = [
-            verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
-                folder=archive / part.relative_to(unpacked.folder.parent)
-            )
-            for part in _list_comparison_folders(unpacked.folder)
-        ]
-        return ArchiveVerification(description, [], verifications, None)
+        for part in _list_comparison_folders(unpacked.folder)
+    ]
+    return Verification(comparisons, None, description)
+
+
+def _verify_explanation(folder: Path, name: Path, print_line: PrintLine) -> ExplanationVerification:
+    """Verify an explanation, and print its failures; `name` is its folder or archive in them."""
+    verification = verify_extended_model(folder, print_line)
+    print_failures(verification.doubts, name, print_line)
+    return verification
 
 
 def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict
 from bench.schemas import find_violations
-from bench.studies.comparison_verification import VerificationFailure, print_failures
+from bench.studies.comparison_verification import VerificationFailure
 from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
@@ -53,20 +53,6 @@ class ExplanationVerification(NamedTuple):
         """Convert the result of verifying an explanation to a JSON document."""
         doubts = [doubt._asdict() for doubt in self.doubts]
         return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
-
-
-def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerification:
-    """Verify that the files of an explanation are valid and consistent.
-
-    If the folder contains the recording, the held-out error is computed again.
-
-    Args:
-        folder: folder of the explanation.
-        print_line: prints a line.
-    """
-    verification = verify_extended_model(folder, print_line)
-    print_failures(verification.doubts, folder, print_line)
-    return verification
 
 
 def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVerification:

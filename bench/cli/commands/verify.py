@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
 from bench.cli.shared_options import add_plugin_option, parse_path
 
 
@@ -35,27 +35,9 @@ def _run_verify(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a number does
         not follow from the others.
     """
-    from bench.studies.archive_bundle import verify_archive
-    from bench.studies.comparison_verification import verify_comparison
-    from bench.studies.explanation_verification import VERDICT_FILE, verify_explanation
-    from bench.studies.study import list_study_folders
+    from bench.studies.archive_bundle import verify_results
 
-    if options.run.is_file():
-        archived = verify_archive(options.run, print_line, options.plugin, options.all)
-        return CommandResult(
-            archived.to_document(), EXIT_OK if archived.is_consistent else EXIT_PROBLEMS_FOUND
-        )
-    document: JsonDocument = {"archive": None, "comparisons": [], "explanation": None}
-    if (options.run / VERDICT_FILE).is_file():
-        document["explanation"] = verify_explanation(options.run, print_line).to_document()
-        follows = document["explanation"]["follows"]
-    else:
-        parts = [
-            verify_comparison(part, print_line, options.plugin, options.all)
-            for part in list_study_folders(options.run)
-        ]
-        document["comparisons"] = [part.to_document() for part in parts]
-        follows = all(part.is_consistent for part in parts)
+    verification = verify_results(options.run, print_line, options.plugin, options.all)
     return CommandResult(
-        {"follows": follows, **document}, EXIT_OK if follows else EXIT_PROBLEMS_FOUND
+        verification.to_document(), EXIT_OK if verification.is_consistent else EXIT_PROBLEMS_FOUND
     )
