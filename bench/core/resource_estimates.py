@@ -20,7 +20,8 @@ FORCE_HINT = "or insist with --force (force=True in Python)"
 """End of messages about checks that the user can skip."""
 MAX_STEPS_PER_SIMULATION = 1e9
 """Maximum number of steps of one simulation; the fastest engine takes hours for them."""
-MAX_TOTAL_SECONDS = 30 * 86400.0
+_DAY_SECONDS = 86400.0
+MAX_TOTAL_SECONDS = 30 * _DAY_SECONDS
 """Maximum duration of work in seconds."""
 MIN_STEP_SECONDS = 1e-7
 """Minimum duration of a time step in seconds."""
@@ -32,8 +33,6 @@ BYTES_PER_NUMBER = 8
 """Size of a number in bytes."""
 _CONTAINER_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
 """File in which Linux states the memory limit of a container."""
-DAYS_PER_YEAR = 365.25
-"""Mean length of a year in days."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +42,10 @@ class MachineResources:
     Attributes:
         memory: memory in bytes.
         disk: free disk space in bytes.
-        files: number of files that can be created.
     """
 
     memory: float = math.inf
     disk: float = math.inf
-    files: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,6 @@ class ResourceNeed:
         change: what to change to need less.
         memory: memory in bytes.
         disk: disk space in bytes.
-        files: number of files.
         steps: number of time steps in one simulation.
         seconds: duration in seconds.
     """
@@ -69,14 +65,13 @@ class ResourceNeed:
     change: str
     memory: float = 0.0
     disk: float = 0.0
-    files: float = 0.0
     steps: float = 0.0
     seconds: float = 0.0
 
     def find_excess(self, machine: MachineResources) -> str:
         """Describe the first need that exceeds the machine; empty if none does.
 
-        The needs are memory, disk, number of files, time steps of one simulation, and total time.
+        The needs are memory, disk, time steps of one simulation, and total time.
         """
         for required, available, unit in (
             (self.memory, machine.memory, "of memory"),
@@ -84,16 +79,14 @@ class ResourceNeed:
         ):
             if required > available:
                 return f"{format_bytes(required)} {unit}, where there are {format_bytes(available)}"
-        if self.files > machine.files:
-            return f"{self.files:.3g} files, where there is space for {machine.files:.3g}"
         if self.steps > MAX_STEPS_PER_SIMULATION:
             return (
                 f"{self.steps:.3g} steps in one simulation, "
                 f"where {MAX_STEPS_PER_SIMULATION:g} take hours"
             )
         if self.seconds > MAX_TOTAL_SECONDS:
-            longest_text = _format_long_duration(MAX_TOTAL_SECONDS)
-            return f"{_format_long_duration(self.seconds)}, where {longest_text} are allowed"
+            days = MAX_TOTAL_SECONDS / _DAY_SECONDS
+            return f"{self.seconds / _DAY_SECONDS:.3g} days, where {days:g} are allowed"
         return ""
 
 
@@ -128,7 +121,7 @@ def get_machine_resources(folder: Path | None = None) -> MachineResources:
         disk = float(shutil.disk_usage(place).free)
     except OSError:
         disk = math.inf
-    return MachineResources(_read_memory_limit(), disk, _count_free_inodes(place))
+    return MachineResources(_read_memory_limit(), disk)
 
 
 def count_available_cores() -> int:
@@ -154,16 +147,6 @@ def _read_memory_limit() -> float:
     return min(limit for limit in limits if limit > 0)
 
 
-def _count_free_inodes(place: Path) -> float:
-    """Return the number of files that can still be created (free inodes); infinite if unknown."""
-    try:
-        free = os.statvfs(place).f_favail
-    except (AttributeError, OSError):
-        return math.inf
-    # File systems that create inodes on demand report 0.
-    return float(free) or math.inf
-
-
 def format_bytes(count: float) -> str:
     """Format a number of bytes with a unit."""
     for unit in ("B", "kB", "MB", "GB", "TB", "PB"):
@@ -171,8 +154,3 @@ def format_bytes(count: float) -> str:
             return f"{count:.3g} {unit}"
         count /= 1000
     return f"{count:.3g} EB"
-
-
-def _format_long_duration(seconds: float) -> str:
-    days = seconds / 86400
-    return f"{days:.3g} days" if days < 1000 else f"{days / DAYS_PER_YEAR:.3g} years"

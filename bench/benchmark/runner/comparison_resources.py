@@ -37,8 +37,6 @@ _RUN_MEMORY = 500
 """Memory of a planned run in bytes: its request, its id and its status."""
 _RUN_SECONDS = 5e-4
 """Time to score and store a run, in seconds."""
-_RUNS_PER_PART = 1000
-"""Number of runs that share a file while a comparison is running."""
 _WORKER_BYTES = 30e6
 """Memory of a worker process in bytes that is not shared with other processes."""
 _MAX_CLUSTER_WORKERS = 10_000
@@ -122,7 +120,7 @@ def check_comparison_size(
 ) -> None:
     """Raise an error for a comparison that is not feasible on this machine.
 
-    Memory, disk space, number of files and duration are estimated before the first run. A recording
+    Memory, disk space and duration are estimated before the first run. A recording
     is checked for anomalies too, since a comparison on damaged data would waste the time.
 
     Args:
@@ -152,7 +150,7 @@ def check_comparison_size(
 def estimate_comparison_need(
     experiment: Experiment, jobs: int = 2, cluster: bool = False
 ) -> ResourceNeed:
-    """Estimate the memory, disk space, files and seconds that an experiment needs.
+    """Estimate the memory, disk space and seconds that an experiment needs.
 
     There is one run for each tuner, target and seed; a run simulates as often as its budget allows,
     and stores one row for each simulation and one for the start. The needs are sums of these counts
@@ -208,7 +206,6 @@ def estimate_comparison_need(
         _suggest_reduction(counts),
         memory=memory,
         disk=row_count * _ROW_DISK,
-        files=runs / _RUNS_PER_PART,
         steps=quantities.steps,
         seconds=seconds,
     )
@@ -243,7 +240,6 @@ def check_training_size(
         f" samples and {sizes.steps:.3g} steps,",
         _suggest_reduction({"seeds": seeds, "training_budget": budget, "steps": sizes.steps}),
         memory=budget * sizes.observation + sizes.steps * BYTES_PER_STEP,
-        files=seeds,
         steps=sizes.steps,
         seconds=seeds * (_MIN_TRAINING_SECONDS + budget * sizes.simulation),
     )
