@@ -19,7 +19,8 @@ from sims.core.toml_validation import (
 )
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun
-from sims.recording.log_formats.log_files import LogFile, read_log
+from sims.recording.log_formats.log_columns import LogFile
+from sims.recording.log_formats.log_files import read_log
 
 MAX_REPEATED = 0.05
 """Maximum share of a log's stamps that may repeat the previous one; their rows are left out."""

@@ -26,7 +26,8 @@ from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, InputError, Simulator
 from sims.recording.column_mapping import list_mapped_files
 from sims.recording.log_formats.lerobot_dataset import range_scale
-from sims.recording.log_formats.log_files import LogFile, read_log
+from sims.recording.log_formats.log_columns import LogFile
+from sims.recording.log_formats.log_files import read_log
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import read_meta
 

@@ -14,7 +14,8 @@ from bench.logs.importing.import_result import MAX_NAMES, ImportResult
 from sims.core.simulator import Array, InputError
 from sims.recording.log_formats.hdf5_and_parquet import is_hdf5, list_run_paths
 from sims.recording.log_formats.lerobot_dataset import is_dataset
-from sims.recording.log_formats.log_files import LOG_SUFFIXES, LogFile, list_logs, read_log
+from sims.recording.log_formats.log_columns import LogFile
+from sims.recording.log_formats.log_files import LOG_SUFFIXES, list_logs, read_log
 from sims.recording.log_formats.ros_bags import BAG_SUFFIXES, is_bag
 
 TABLE_ENDINGS = tuple(ending for ending in LOG_SUFFIXES if ending not in (".txt", ".dat"))

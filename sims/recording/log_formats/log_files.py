@@ -7,12 +7,10 @@ the third entry of a column that holds a list or a vector in each row. Nothing i
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +19,7 @@ from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_and_parquet, lerobot_dataset, ros_bags
 from sims.recording.log_formats.column_names import arrays_by_name
 from sims.recording.log_formats.hdf5_and_parquet import make_unreadable_error, read_numeric_columns
+from sims.recording.log_formats.log_columns import LogFile
 from sims.recording.log_formats.ros_bags import TIME_COLUMN
 from sims.recording.log_formats.text_table import read_text_table
 
@@ -40,106 +39,6 @@ LOG_SUFFIXES = (
 """File name endings of the files that can be read."""
 MAX_FILE_BYTES = 2_000_000_000
 """Maximum size of a file in bytes, because its content must fit into memory."""
-_LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
-
-
-class FileVersion(NamedTuple):
-    """Version of a file, as a cache key: path, time of last change (ns) and size (bytes)."""
-
-    path: Path
-    changed: int
-    size: int
-
-
-@dataclass(frozen=True)
-class LogFile:
-    """Columns of one log.
-
-    Attributes:
-        path: Path of the log.
-        columns: Numbers by column name, (T,) or (T, k), NaN where missing; columns without numbers
-            are left out.
-        texts: Names of the columns without numbers.
-        rows: Word for a row in messages, such as "row" or "message".
-        units: Unit of each column for which a row of the file states one.
-        unlisted: Columns that `list_columns` leaves out, because another one holds the same numbers
-            under the name of their joint.
-        named: Whether the file names its columns.
-        first: Number of the first row in the file, for messages.
-    """
-
-    path: Path
-    columns: Mapping[str, Array]
-    texts: tuple[str, ...] = ()
-    rows: str = "row"
-    units: Mapping[str, str] = field(default_factory=dict)
-    unlisted: frozenset[str] = frozenset()
-    named: bool = True
-    first: int = 2
-
-    def get_column(self, name: str) -> Array:
-        """Return one column (T,), or one entry of a column of lists, such as ``position[2]``.
-
-        Raises:
-            InputError: There is no such column; the message is one line.
-        """
-        if name in self.columns:
-            values = self.columns[name]
-            if values.ndim == 1:
-                return values
-            last = values.shape[1] - 1
-            entries = f"its entries are {name}[0] to {name}[{last}]"
-            raise InputError(f"{self.path}: column '{name}' contains lists; {entries}")
-        base, place = self._find_column(name)
-        values = self.columns[base]
-        if place is None and values.ndim == 1:
-            return values
-        if place is None or values.ndim == 1 or place >= values.shape[1]:
-            raise self._make_missing_column_error(name)
-        return make_read_only(values[:, place])
-
-    def _find_column(self, name: str) -> tuple[str, int | None]:
-        """Find a column regardless of case, and the index into its lists if the name has one.
-
-        `position[2]` is entry 2 of a list column, unless a column has this very name.
-
-        Args:
-            name: Name as a description or a user wrote it.
-
-        Returns:
-            Name in the file, and the index of the list entry, else None.
-        """
-        match = _LIST_ENTRY_PATTERN.fullmatch(name)
-        for base, entry in (
-            ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
-        ):
-            matches = [
-                column for column in self.columns if column.strip().lower() == base.strip().lower()
-            ]
-            if base in self.columns:
-                return base, entry
-            if len(matches) == 1:
-                return matches[0], entry
-        raise self._make_missing_column_error(name)
-
-    def _make_missing_column_error(self, name: str) -> InputError:
-        """Return the error for a column that does not exist, or that holds text."""
-        if name in self.texts:
-            return InputError(f"{self.path}: column '{name}': expected numbers, found text")
-        column_list = ", ".join(self.list_columns()) or "none"
-        return InputError(f"{self.path}: unknown column '{name}'; there are: {column_list}")
-
-    def list_columns(self) -> list[str]:
-        """List all numeric columns; columns of lists by their entries."""
-        column_names = []
-        for name, values in self.columns.items():
-            if name in self.unlisted:
-                continue
-            if values.ndim == 1:
-                column_names.append(name)
-            else:
-                column_names += [f"{name}[{k}]" for k in range(values.shape[1])]
-        return column_names
 
 
 def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
@@ -159,25 +58,19 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
     path = Path(path)
     bag = ros_bags.split_bag_path(path)
     if bag is not None:
-        file_stat = bag[0].stat()
-        stamp = FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size)
-        log = _read_topic(stamp, columns_to_read)
+        log = _read_files([bag[0]], _read_topic, path, *bag, columns_to_read)
         column_names = {name.lower() for name in log.columns}
         # The error for a missing column lists all columns of the log.
         if {name.strip().lower() for name in columns_to_read} <= column_names:
             return log
-        return _read_topic(stamp)
+        return _read_files([bag[0]], _read_topic, path, *bag)
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:
-        file_stats = [file.stat() for file in lerobot_dataset.list_episode_files(*episode)]
-        changed = max(file_stat.st_mtime_ns for file_stat in file_stats)
-        return _read_episode(
-            FileVersion(path, changed, sum(file_stat.st_size for file_stat in file_stats))
-        )
+        files = lerobot_dataset.list_episode_files(*episode)
+        return _read_files(files, _read_episode, path, *episode)
     group = hdf5_and_parquet.group_of(path)
     if group is not None:
-        file_stat = group[0].stat()
-        return _read_group(FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size))
+        return _read_files([group[0]], _read_group, path, *group)
     if ros_bags.is_bag(path):
         topics = ", ".join(ros_bags.list_topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {topics}")
@@ -186,55 +79,45 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
     if suffix not in _READERS:
         kinds = ", ".join(LOG_SUFFIXES)
         raise InputError(f"{path}: expected a log that ends in one of {kinds}, found '{suffix}'")
-    file_stat = path.stat()
-    if file_stat.st_size > MAX_FILE_BYTES:
-        raise InputError(f"{path}: has {file_stat.st_size / 1e9:.1f} GB; at most 2 are read")
-    return _read_cached(FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size))
+    file_size = path.stat().st_size
+    if file_size > MAX_FILE_BYTES:
+        raise InputError(f"{path}: has {file_size / 1e9:.1f} GB; at most 2 are read")
+    return _read_files([path], _READERS[suffix], path)
 
 
-@lru_cache(maxsize=8)
-def _read_topic(stamp: FileVersion, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
-    """Read a topic of a bag; cached by file version.
-
-    Args:
-        stamp: version of the bag, whose path names the topic.
-        columns_to_read: columns that hold text, and are read too.
-    """
-    bag = ros_bags.split_bag_path(stamp.path)
-    assert bag is not None  # the caller checked the path
-    columns = ros_bags.read_topic(*bag, columns_to_read)
-    if (len(columns) < 2 and not columns_to_read) or not columns[TIME_COLUMN].size:
-        raise InputError(f"{stamp.path}: expected messages with numbers, found none")
-    return LogFile(stamp.path, columns, (), "message")
-
-
-@lru_cache(maxsize=8)
-def _read_episode(stamp: FileVersion) -> LogFile:
-    """Read an episode of a dataset; cached by file version."""
-    episode = lerobot_dataset.split_episode_path(stamp.path)
-    assert episode is not None  # the caller checked the path
-    columns, texts = lerobot_dataset.read_episode(*episode)
-    return LogFile(stamp.path, columns, tuple(texts), "frame")
-
-
-@lru_cache(maxsize=8)
-def _read_group(stamp: FileVersion) -> LogFile:
-    """Read a group of an HDF5 file; cached by file version."""
-    group = hdf5_and_parquet.group_of(stamp.path)
-    assert group is not None  # the caller checked the path
-    return _make_array_log(stamp.path, *hdf5_and_parquet.read_group(*group))
-
-
-@lru_cache(maxsize=8)
-def _read_cached(stamp: FileVersion) -> LogFile:
-    """Read a log file; cached by file version, because logs are requested column by column.
+def _read_files(
+    files: Iterable[Path], read: Callable[..., LogFile], path: Path, *arguments: Any
+) -> LogFile:
+    """Read a log, or take it from the cache if none of its files has changed.
 
     Args:
-        stamp: Path with size and modification time; a changed file is read again.
+        files: Files that hold the log.
+        read: Function that reads it.
+        path: Path of the log, the first argument of the function.
+        arguments: Further arguments of the function.
     """
-    path = stamp.path
+    file_stats = [file.stat() for file in files]
+    changed = max(file_stat.st_mtime_ns for file_stat in file_stats)
+    size = sum(file_stat.st_size for file_stat in file_stats)
+    return _read_version(changed, size, read, path, *arguments)
+
+
+@lru_cache(maxsize=16)
+def _read_version(
+    changed: int, size: int, read: Callable[..., LogFile], path: Path, *arguments: Any
+) -> LogFile:
+    """Read a log; cached by the version of its files, because logs are requested by column.
+
+    Args:
+        changed: Time of the last change of its files in nanoseconds.
+        size: Their size in bytes.
+        read: Function that reads the log.
+        path: Path of the log, the first argument of the function.
+        arguments: Further arguments of the function.
+    """
+    del changed, size  # part of the cache key
     try:
-        log = _READERS[path.suffix.lower()](path)
+        log = read(path, *arguments)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     lengths = {len(values) for values in log.columns.values()}
@@ -243,25 +126,32 @@ def _read_cached(stamp: FileVersion) -> LogFile:
     return log
 
 
-# -- tables of text
+def _read_topic(
+    path: Path, bag: Path, topic: str, columns_to_read: frozenset[str] = frozenset()
+) -> LogFile:
+    """Read a topic of a bag.
+
+    Args:
+        path: Path of the log, which names the topic.
+        bag: Path of the bag.
+        topic: Name of the topic in the bag.
+        columns_to_read: Columns to store; all if empty.
+    """
+    columns = ros_bags.read_topic(bag, topic, columns_to_read)
+    if (len(columns) < 2 and not columns_to_read) or not columns[TIME_COLUMN].size:
+        raise InputError(f"{path}: expected messages with numbers, found none")
+    return LogFile(path, columns, (), "message")
 
 
-def _read_text_table(path: Path) -> LogFile:
-    """Read a text table of any layout as a log."""
-    table = read_text_table(path)
-    return LogFile(
-        path,
-        table.columns,
-        table.texts,
-        "row",
-        table.units,
-        table.unlisted,
-        table.named,
-        table.first,
-    )
+def _read_episode(path: Path, dataset: Path, episode: int) -> LogFile:
+    """Read an episode of a LeRobot dataset."""
+    columns, texts = lerobot_dataset.read_episode(dataset, episode)
+    return LogFile(path, columns, tuple(texts), "frame")
 
 
-# -- arrays
+def _read_group(path: Path, file: Path, group: str) -> LogFile:
+    """Read a group of an HDF5 file."""
+    return _make_array_log(path, *hdf5_and_parquet.read_group(file, group))
 
 
 def _read_npz(path: Path) -> LogFile:
@@ -270,17 +160,15 @@ def _read_npz(path: Path) -> LogFile:
     Arrays of texts may name the entries of the others, for example the joints.
     """
     columns: dict[str, Array] = {}
-    texts = []
-    names: dict[str, list[str]] = {}
+    texts: dict[str, list[str]] = {}
     try:
         # Opened here, because numpy does not close a file that is not an archive.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays.files:
                 values = arrays[name]
                 if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:
-                    texts.append(name)
-                    if values.dtype.kind == "U" and values.ndim == 1:
-                        names[name] = values.tolist()
+                    is_text_list = values.dtype.kind == "U" and values.ndim == 1
+                    texts[name] = values.tolist() if is_text_list else []
                 else:
                     columns[name] = make_read_only(values.astype(np.float64))
     except (ValueError, EOFError, KeyError, OSError) as error:
@@ -288,8 +176,7 @@ def _read_npz(path: Path) -> LogFile:
         raise InputError(f"{path}: not an archive of arrays of numbers: {reason}") from None
     except Exception as error:  # numpy raises many kinds of errors
         raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
-    named_columns, unlisted = arrays_by_name(columns, names)
-    return LogFile(path, {**columns, **named_columns}, tuple(texts), "entry", unlisted=unlisted)
+    return _make_array_log(path, columns, texts)
 
 
 def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
@@ -304,12 +191,7 @@ def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list
     Returns:
         The log. Its messages call a row "entry" and count from 0. A matrix whose columns are named
         so can still be read, but is left out of lists of columns.
-
-    Raises:
-        InputError: the file has no array of numbers.
     """
-    if not columns:
-        raise InputError(f"{path}: expected columns of numbers, found none")
     named_columns, unlisted = arrays_by_name(
         columns, {name: name_list for name, name_list in texts.items() if name_list}
     )
@@ -340,10 +222,10 @@ def _read_parquet(path: Path) -> LogFile:
 
 
 _READERS: Mapping[str, Callable[[Path], LogFile]] = {
-    ".csv": _read_text_table,
-    ".tsv": _read_text_table,
-    ".txt": _read_text_table,
-    ".dat": _read_text_table,
+    ".csv": read_text_table,
+    ".tsv": read_text_table,
+    ".txt": read_text_table,
+    ".dat": read_text_table,
     ".npz": _read_npz,
     ".parquet": _read_parquet,
     ".pt": _read_torch_file,

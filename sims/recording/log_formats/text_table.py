@@ -14,7 +14,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from sims.recording.log_formats.column_names import (
     read_unit,
 )
 from sims.recording.log_formats.hdf5_and_parquet import MAX_COLUMNS
+from sims.recording.log_formats.log_columns import LogFile
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Possible separators of the cells of a table; a blank means any number of blanks."""
@@ -55,6 +56,7 @@ class Layout:
     """Layout of a text table.
 
     Attributes:
+        path: Path of the table.
         encoding: Encoding of the text.
         separator: One of `SEPARATORS`.
         names: Names of the columns; empty if the file has none.
@@ -64,6 +66,7 @@ class Layout:
         width: Number of cells per row.
     """
 
+    path: Path
     encoding: str
     separator: str
     names: tuple[str, ...]
@@ -102,14 +105,23 @@ def find_layout(path: Path) -> Layout:
         names = _parse_header(lines[n - 1], separator, width, columns)
         if names is not None:
             units = {names[column]: unit for column, unit in units_by_column.items()}
-            return Layout(encoding, separator, names, units, n, first_data_line or n + 1, width)
+            return Layout(
+                path, encoding, separator, names, units, n, first_data_line or n + 1, width
+            )
     if not first_data_line:
         first_line = format_value(lines[0].strip())
         raise InputError(f"{path}: expected a header and rows of numbers, found {first_line}")
     rows_above = [n for n in rows_above if not COMMENT.match(lines[n - 1])]
     if not rows_above and (column_numbers := _make_column_numbers(rows, first_data_line)):
         return Layout(
-            encoding, separator, column_numbers, {}, first_data_line, first_data_line + 1, width
+            path,
+            encoding,
+            separator,
+            column_numbers,
+            {},
+            first_data_line,
+            first_data_line + 1,
+            width,
         )
     if rows_above and len(rows[rows_above[-1]]) > 1 and width > 1:
         n = rows_above[-1]
@@ -117,7 +129,7 @@ def find_layout(path: Path) -> Layout:
             f"{path}, row {n}: expected {width} names, one for each cell of row "
             f"{first_data_line}, found {len(rows[n])}; give each column a name"
         )
-    return Layout(encoding, separator, (), {}, 0, first_data_line, width)
+    return Layout(path, encoding, separator, (), {}, 0, first_data_line, width)
 
 
 def _read_first_lines(path: Path) -> tuple[str, list[str]]:
@@ -344,52 +356,35 @@ BOOLEAN_VALUES = {"true": 1.0, "false": 0.0}
 """Number for each text of a boolean, such as whether a drive is enabled."""
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """Columns of a text table.
+def read_text_table(path: Path) -> LogFile:
+    """Read a text table of any layout as a log.
 
-    Attributes:
-        columns: Numeric columns by name, (T,) or (T, k), NaN where a cell is missing.
-        texts: Names of the columns that hold text.
-        units: Unit of each column for which a row of the table states one.
-        unlisted: Columns that are also available under the name of their joint.
-        named: Whether the file names its columns.
-        first: Line of the first data row, counted from 1.
-    """
-
-    columns: Mapping[str, Array]
-    texts: tuple[str, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    unlisted: frozenset[str] = frozenset()
-    named: bool = True
-    first: int = 2
-
-
-def read_text_table(path: Path) -> TextTable:
-    """Read a text table and find its layout (separator, header, rows of units) automatically.
+    The layout (separator, header, row of units) is found automatically.
 
     Raises:
         InputError: The file is not a table, or a cell does not fit its column; the one-line message
             states the row.
     """
     layout = find_layout(path)
-    cells = _read_cells(path, layout)
+    named_cells = zip(_make_unique_names(layout), _read_cells(layout), strict=True)
+    text_columns = [_TextColumn(layout, name, cells) for name, cells in named_cells]
+    # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
+    commas = any(column.has_decimal_commas for column in text_columns)
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
-    kinds = [_CellKind(column, layout.separator) for column in cells]
-    # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
-    commas = any(kind.has_decimal_commas for kind in kinds)
-    for name, kind in zip(_make_unique_names(layout), kinds, strict=True):
-        values = kind.numbers(path, layout, name, commas)
+    for column in text_columns:
+        values = column.convert_to_numbers(commas)
         if values is None:
-            texts[name] = kind.texts.tolist()
+            texts[column.name] = column.texts.tolist()
         else:
-            columns[name] = make_read_only(values)
+            columns[column.name] = make_read_only(values)
     named_columns, unlisted = name_numbered_columns(columns, texts)
     list_columns, replaced = name_list_entries(columns, texts)
-    return TextTable(
+    return LogFile(
+        path,
         {**columns, **named_columns, **list_columns},
         tuple(texts),
+        "row",
         layout.units,
         unlisted | replaced,
         bool(layout.names),
@@ -416,14 +411,13 @@ def _make_unique_names(layout: Layout) -> list[str]:
     return result
 
 
-def _read_cells(path: Path, layout: Layout) -> list[Any]:
+def _read_cells(layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
     The file is read in the detected encoding, or as Windows-1252. Columns that are empty throughout
     at the end are dropped.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
 
     Raises:
@@ -434,7 +428,7 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
     separator = r"\s+" if layout.separator == " " else layout.separator
     for encoding in (layout.encoding, "cp1252"):
         try:
-            with path.open(encoding=encoding, newline="") as file:
+            with layout.path.open(encoding=encoding, newline="") as file:
                 # A quotation mark in a note above the header must not swallow the rows.
                 for _ in range(layout.first - 1):
                     next(file, "")
@@ -452,33 +446,33 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
         except pandas.errors.EmptyDataError:
             return [np.array([], dtype=object)] * layout.width
         except (pandas.errors.ParserError, ValueError) as error:
-            raise _find_uneven_row(path, layout) or _make_split_error(path, layout, error) from None
+            raise _find_uneven_row(layout) or _make_split_error(layout, error) from None
     else:
-        raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8")
+        raise InputError(f"{layout.path}: expected UTF-8 text; save it as UTF-8")
     comment = table[0].str.match(COMMENT.pattern)
     if comment.any():
         table = table[~comment.to_numpy(dtype=bool)]
     # pandas fills up rows that are too short.
-    if (table[table.columns[-1]].fillna("") == "").any() and (
-        fault := _find_uneven_row(path, layout)
-    ):
+    if (table[table.columns[-1]].fillna("") == "").any() and (fault := _find_uneven_row(layout)):
         raise fault
     while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
         table = table.iloc[:, :-1]
     if table.shape[1] > MAX_COLUMNS:
-        raise InputError(f"{path}: expected at most {MAX_COLUMNS} columns, found {table.shape[1]}")
+        raise InputError(
+            f"{layout.path}: expected at most {MAX_COLUMNS} columns, found {table.shape[1]}"
+        )
     if table.shape[1] != layout.width:
         raise InputError(
-            f"{path}, row {layout.first}: expected {layout.width} cells, found {table.shape[1]}"
+            f"{layout.path}, row {layout.first}: expected {layout.width} cells, "
+            f"found {table.shape[1]}"
         )
     return [table[name].fillna("").to_numpy(dtype=object) for name in table.columns]
 
 
-def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputError:
+def _make_split_error(layout: Layout, error: Exception) -> InputError:
     """Make the error for a file whose rows pandas cannot split.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
         error: error of pandas.
     """
@@ -486,28 +480,27 @@ def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputErro
     if quote_match:
         row = layout.first + int(quote_match[1])
         return InputError(
-            f"{path}, row {row}: a quotation mark opens a cell and none closes it; close or "
+            f"{layout.path}, row {row}: a quotation mark opens a cell and none closes it; close or "
             "delete it"
         )
     return InputError(
-        f"{path}, row {layout.first}: expected rows of {layout.width} cells between commas, "
+        f"{layout.path}, row {layout.first}: expected rows of {layout.width} cells between commas, "
         "semicolons, tabs or blanks; save the file as CSV"
     )
 
 
-def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
+def _find_uneven_row(layout: Layout) -> InputError | None:
     """Make the error for the first row with a wrong number of cells; None if all rows are even.
 
     Empty cells at the end of a row do not count. The message distinguishes an open quotation mark,
     a log that ends within a row, and any other row.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
     """
     line = layout.first
     try:
-        for line, last_line, row in _iterate_rows(path, layout):
+        for line, last_line, row in _iterate_rows(layout):
             filled = len(row)
             while filled > layout.width and not row[filled - 1].strip():
                 filled -= 1
@@ -515,33 +508,32 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
                 continue
             if last_line > line:
                 return InputError(
-                    f"{path}, row {line}: a quotation mark opens a cell that ends in row "
+                    f"{layout.path}, row {line}: a quotation mark opens a cell that ends in row "
                     f"{last_line}; close or delete it"
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
-            if filled < layout.width and line >= _find_last_line(path, layout):
+            if filled < layout.width and line >= _find_last_line(layout):
                 remedy = "the log is truncated there: delete this row"
             return InputError(
-                f"{path}, row {line}: expected {layout.width} cells {reference}, found {filled}; "
-                f"{remedy}"
+                f"{layout.path}, row {line}: expected {layout.width} cells {reference}, "
+                f"found {filled}; {remedy}"
             )
     except csv.Error:  # such as a cell of more than 131,072 characters
         return InputError(
-            f"{path}, row {line + 1}: expected cells of numbers or short texts, found a cell that "
-            "is too long; is a quotation mark not closed?"
+            f"{layout.path}, row {line + 1}: expected cells of numbers or short texts, "
+            "found a cell that is too long; is a quotation mark not closed?"
         )
     return None
 
 
-def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
+def _iterate_rows(layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
     """Iterate over the data rows with their first and last lines; skip comments and blank lines.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
     """
-    with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
+    with layout.path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
             for line, text in enumerate(file, start=1):
                 if line >= layout.first and text.strip() and not COMMENT.match(text):
@@ -558,28 +550,26 @@ def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[s
             last_line = last
 
 
-def _find_last_line(path: Path, layout: Layout) -> int:
+def _find_last_line(layout: Layout) -> int:
     """Return the line of the last data row.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
     """
     last = 0
-    for line, *_ in _iterate_rows(path, layout):
+    for line, *_ in _iterate_rows(layout):
         last = line
     return last
 
 
-def _find_line(path: Path, layout: Layout, record: int) -> int:
+def _find_line(layout: Layout, record: int) -> int:
     """Return the line of a data row, counted from 1 as in an editor.
 
     Args:
-        path: path of the file.
         layout: layout of the table.
         record: number of the data row, counted from 0 without comments and blank lines.
     """
-    for number, (line, *_) in enumerate(_iterate_rows(path, layout)):
+    for number, (line, *_) in enumerate(_iterate_rows(layout)):
         if number == record:
             return line
     return layout.first + record
@@ -589,17 +579,23 @@ MAX_SAMPLED_CELLS = 1000
 """Maximum number of cells with commas per column inspected to distinguish text from numbers."""
 
 
-class _CellKind:
-    """Cells of one column and the kind of numbers that they hold."""
+class _TextColumn:
+    """Cells of one column of a text table and the kind of numbers that they hold."""
 
-    def __init__(self, cells: Any, separator: str) -> None:
+    def __init__(self, layout: Layout, name: str, cells: Any) -> None:
         """Find out whether commas in a column are decimal commas or thousands separators.
 
         If most of the sampled cells with a comma are not numbers, the column holds lists or
         text, and its commas have no meaning. `filled` are the cells that are not empty.
+
+        Args:
+            layout: Layout of the table.
+            name: Name of the column.
+            cells: (T,) text of each cell.
         """
         import pandas
 
+        self.layout, self.name = layout, name
         self.cells = cells
         self.series = pandas.Series(cells, dtype=object).astype(str).str.strip()
         self.texts = self.series.to_numpy(dtype=object)
@@ -615,7 +611,7 @@ class _CellKind:
         self.has_commas = True
         has_several_commas = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
         self.is_thousands = bool(has_several_commas.any())
-        if separator != ",":
+        if self.layout.separator != ",":
             self.has_decimal_commas = not self.is_thousands
         else:
             # Three digits after a comma may be a group of thousands, unless other cells show
@@ -623,16 +619,13 @@ class _CellKind:
             groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
             self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
 
-    def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
-        """Convert the cells of one column of a text log to numbers.
+    def convert_to_numbers(self, commas: bool) -> Array | None:
+        """Convert the cells to numbers.
 
         The first cell decides the kind: Boolean values, lists, dates or numbers. If more than half
         of the cells are no numbers, the column counts as text.
 
         Args:
-            path: Path of the table, for messages.
-            layout: Layout of the table.
-            name: Name of the column, for messages.
             commas: Whether another column of the file has decimal commas.
 
         Returns:
@@ -651,19 +644,18 @@ class _CellKind:
             if bool(((self.series == "") | switches.notna()).all()):
                 return np.asarray(switches, dtype=np.float64)
         if NUMBERS.fullmatch(first) and is_numeric(first):
-            return self._convert_lists(path, layout, name)
+            return self._convert_lists()
         if INSTANT.fullmatch(first):
-            return self._convert_dates(path, layout, name)
+            return self._convert_dates()
         texts = self.series
         if self.has_commas:
             if self.has_decimal_commas or (commas and not self.is_thousands):
-                texts = self._convert_decimal_commas(path, layout, name)
+                texts = self._convert_decimal_commas()
             elif self.is_thousands:
                 texts = texts.str.replace(",", "", regex=False)
             else:
                 row = int(np.flatnonzero(texts.str.contains(",", regex=False))[0])
-                raise self._make_cell_error(
-                    path, layout, name, row, "a number with a decimal point",
+                raise self._make_cell_error(row, "a number with a decimal point",
                     "; its comma may divide decimals or thousands",
                 )  # fmt: skip
         values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
@@ -674,17 +666,12 @@ class _CellKind:
             return result
         if bad_rows.size > 0.5 * len(self.filled):
             return None
-        raise self._make_cell_error(path, layout, name, int(bad_rows[0]), "a number")
+        raise self._make_cell_error(int(bad_rows[0]), "a number")
 
-    def _convert_decimal_commas(self, path: Path, layout: Layout, name: str) -> Any:
+    def _convert_decimal_commas(self) -> Any:
         """Return the cells with decimal points instead of decimal commas.
 
         Points before groups of three digits are removed if some cell has both marks.
-
-        Args:
-            path: path of the file, for messages.
-            layout: layout of the table.
-            name: name of the column.
 
         Raises:
             InputError: points without commas leave the meaning of a cell open.
@@ -700,20 +687,13 @@ class _CellKind:
                 row = int(points.index.to_numpy()[points.to_numpy().argmax()])
                 note = "; other cells of this column have decimal commas"
                 if not grouped[points].all():
-                    raise self._make_cell_error(path, layout, name, row, "a decimal comma", note)
-                raise self._make_cell_error(
-                    path, layout, name, row, "a number without a point", note
-                )
+                    raise self._make_cell_error(row, "a decimal comma", note)
+                raise self._make_cell_error(row, "a number without a point", note)
             texts = self.series
         return texts.str.replace(",", ".", n=1, regex=False)
 
-    def _convert_dates(self, path: Path, layout: Layout, name: str) -> Array | None:
+    def _convert_dates(self) -> Array | None:
         """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970.
-
-        Args:
-            path: path of the file, for messages.
-            layout: layout of the table.
-            name: name of the column.
 
         Raises:
             InputError: a cell is not a time.
@@ -725,22 +705,15 @@ class _CellKind:
         is_instant = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
         if not is_instant.all():
             row = int(np.flatnonzero(~is_instant)[0])
-            raise self._make_cell_error(
-                path, layout, name, row, f"an instant as {self.filled.iloc[0]}"
-            )
+            raise self._make_cell_error(row, f"an instant as {self.filled.iloc[0]}")
         stamps = pandas.to_datetime(
             texts.where(texts != "", None), utc=True, format="ISO8601", errors="coerce"
         )
         nanoseconds = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
         return np.where(stamps.isna().to_numpy(), np.nan, nanoseconds * 1e-9)
 
-    def _convert_lists(self, path: Path, layout: Layout, name: str) -> Array:
+    def _convert_lists(self) -> Array:
         """Convert cells such as ``[0.1, 0.2]`` to an array (T, k): T cells with k numbers each.
-
-        Args:
-            path: path of the file, for messages.
-            layout: layout of the table.
-            name: name of the column.
 
         Raises:
             InputError: a cell is not a list, or has another length than the first one.
@@ -758,27 +731,23 @@ class _CellKind:
                     if number_lists
                     else "a list of numbers"
                 )
-                raise self._make_cell_error(path, layout, name, cell_index, expected)
+                raise self._make_cell_error(cell_index, expected)
             number_lists.append(number_list)
         return np.array(number_lists, dtype=np.float64).reshape(len(number_lists), -1)
 
-    def _make_cell_error(
-        self, path: Path, layout: Layout, name: str, record: int, expected: str, note: str = ""
-    ) -> InputError:
+    def _make_cell_error(self, record: int, expected: str, note: str = "") -> InputError:
         """Make the error for a cell that does not fit its column.
 
         Args:
-            path: path of the file.
-            layout: layout of the table.
-            name: name of the column.
             record: number of the data row, counted from 0.
             expected: expected content in words.
             note: addition at the end of the message.
         """
-        line = _find_line(path, layout, record)
+        line = _find_line(self.layout, record)
         cell_text = format_value(self.cells[record])
         return InputError(
-            f"{path}, row {line}, column {name}: expected {expected}, found {cell_text}{note}"
+            f"{self.layout.path}, row {line}, column {self.name}: expected {expected}, "
+            f"found {cell_text}{note}"
         )
 
 

@@ -1,0 +1,103 @@
+"""Columns of a log, by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sims.core.simulator import Array, InputError, make_read_only
+
+_LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """Columns of one log.
+
+    Attributes:
+        path: Path of the log.
+        columns: Numbers by column name, (T,) or (T, k), NaN where missing; columns without numbers
+            are left out.
+        texts: Names of the columns without numbers.
+        rows: Word for a row in messages, such as "row" or "message".
+        units: Unit of each column for which a row of the file states one.
+        unlisted: Columns that `list_columns` leaves out, because another one holds the same numbers
+            under the name of their joint.
+        named: Whether the file names its columns.
+        first: Number of the first row in the file, for messages.
+    """
+
+    path: Path
+    columns: Mapping[str, Array]
+    texts: tuple[str, ...] = ()
+    rows: str = "row"
+    units: Mapping[str, str] = field(default_factory=dict)
+    unlisted: frozenset[str] = frozenset()
+    named: bool = True
+    first: int = 2
+
+    def get_column(self, name: str) -> Array:
+        """Return one column (T,), or one entry of a column of lists, such as ``position[2]``.
+
+        Raises:
+            InputError: There is no such column; the message is one line.
+        """
+        if name in self.columns:
+            values = self.columns[name]
+            if values.ndim == 1:
+                return values
+            last = values.shape[1] - 1
+            entries = f"its entries are {name}[0] to {name}[{last}]"
+            raise InputError(f"{self.path}: column '{name}' contains lists; {entries}")
+        base, place = self._find_column(name)
+        values = self.columns[base]
+        if place is None and values.ndim == 1:
+            return values
+        if place is None or values.ndim == 1 or place >= values.shape[1]:
+            raise self._make_missing_column_error(name)
+        return make_read_only(values[:, place])
+
+    def _find_column(self, name: str) -> tuple[str, int | None]:
+        """Find a column regardless of case, and the index into its lists if the name has one.
+
+        `position[2]` is entry 2 of a list column, unless a column has this very name.
+
+        Args:
+            name: Name as a description or a user wrote it.
+
+        Returns:
+            Name in the file, and the index of the list entry, else None.
+        """
+        match = _LIST_ENTRY_PATTERN.fullmatch(name)
+        for base, entry in (
+            ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
+        ):
+            matches = [
+                column for column in self.columns if column.strip().lower() == base.strip().lower()
+            ]
+            if base in self.columns:
+                return base, entry
+            if len(matches) == 1:
+                return matches[0], entry
+        raise self._make_missing_column_error(name)
+
+    def _make_missing_column_error(self, name: str) -> InputError:
+        """Return the error for a column that does not exist, or that holds text."""
+        if name in self.texts:
+            return InputError(f"{self.path}: column '{name}': expected numbers, found text")
+        column_list = ", ".join(self.list_columns()) or "none"
+        return InputError(f"{self.path}: unknown column '{name}'; there are: {column_list}")
+
+    def list_columns(self) -> list[str]:
+        """List all numeric columns; columns of lists by their entries."""
+        column_names = []
+        for name, values in self.columns.items():
+            if name in self.unlisted:
+                continue
+            if values.ndim == 1:
+                column_names.append(name)
+            else:
+                column_names += [f"{name}[{k}]" for k in range(values.shape[1])]
+        return column_names
