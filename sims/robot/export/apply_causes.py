@@ -38,6 +38,7 @@ from sims.robot.export.mjcf_attributes import (
     INTEGER_ATTRIBUTES,
     AttributeStatement,
     Fields,
+    Kind,
     ModelElement,
     copy_model_fields,
     find_differing_statements,
@@ -308,7 +309,7 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
         The changed mujoco.MjSpec, and the compiled model.
     """
     spec, model = robot.spec.copy(), robot.compiled
-    by_id = SpecElements(spec, robot)
+    elements = _index_spec_elements(spec)
     tolerance = 0.0
     for _ in range(MAX_CORRECTION_ROUNDS):
         # 1. Differences.
@@ -317,7 +318,7 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
             return spec, model
         # 2. Changes.
         for statement in statements:
-            set_attributes(by_id.get_element(statement.element), statement)
+            set_attributes(elements[statement.element], statement)
         if any(statement.element.kind == "body" for statement in statements):
             _keep_masses(spec, target_values)
         model, tolerance = spec.compile(), ROUNDING_TOLERANCE
@@ -345,33 +346,28 @@ def _keep_masses(spec: Any, target_values: Fields) -> None:
         spec.compiler.settotalmass = float(target_values["body_mass"].sum())
 
 
-class SpecElements:
-    """The elements of a spec by their numbers in the compiled model."""
+def _index_spec_elements(spec: Any) -> dict[ModelElement, Any]:
+    """Return the elements of a spec by those of the compiled model.
 
-    def __init__(self, spec: Any, robot: RobotModel) -> None:
-        """Index the joints, bodies, actuators, geoms and pairs of a spec, after a compilation.
-
-        Args:
-            spec: Editable model of MuJoCo (`MjSpec`).
-            robot: Robot whose compiled model has the same elements.
-        """
-        self.spec = spec
-        # Elements have numbers only after compilation.
-        spec.compile()
-        self.joints = {joint.id: joint for joint in spec.joints}
-        self.bodies = {body.id: body for body in spec.bodies}
-        self.actuators = {actuator.id: actuator for actuator in spec.actuators}
-        self.geoms = {geom.id: geom for geom in spec.geoms}
-        self.pairs = {pair.id: pair for pair in spec.pairs}
-        self.robot = robot
-
-    def get_element(self, element: ModelElement) -> Any:
-        """Return the spec's element for an element of the compiled model."""
-        if element.kind == "option":
-            return self.spec.option
-        of_kind = {"joint": self.joints, "actuator": self.actuators, "pair": self.pairs}
-        of_kind["geom"] = self.geoms
-        return of_kind.get(element.kind, self.bodies)[element.id]
+    Args:
+        spec: Editable model of MuJoCo (`MjSpec`).
+    """
+    # Elements have numbers only after compilation.
+    spec.compile()
+    elements_by_kind: dict[Kind, Any] = {
+        "joint": spec.joints,
+        "body": spec.bodies,
+        "frame": spec.bodies,
+        "actuator": spec.actuators,
+        "geom": spec.geoms,
+        "pair": spec.pairs,
+    }
+    elements = {
+        ModelElement(kind, element.id): element
+        for kind, of_kind in elements_by_kind.items()
+        for element in of_kind
+    }
+    return elements | {ModelElement("option", 0): spec.option}
 
 
 def set_attributes(element: Any, statement: AttributeStatement) -> None:

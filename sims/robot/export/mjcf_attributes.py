@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from math import ceil
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -68,35 +68,6 @@ class AttributeStatement:
     insisted: bool = False
 
 
-class MjcfAttribute(NamedTuple):
-    """An MJCF attribute.
-
-    Attributes:
-        name: name in the file.
-        spec: name in an MjSpec.
-        read: reads its values from the model fields and the addresses of an element.
-    """
-
-    name: str
-    spec: str
-    read: Callable[[Fields, Any], Any]
-
-
-def _make_reader(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
-    return lambda fields, field_address: fields[name][0, getattr(field_address, address)]
-
-
-def _read_option(name: str, fields: Fields, field_address: Any) -> Any:  # noqa: ARG001
-    """Read an option of the model from its fields.
-
-    Args:
-        name: name of the option.
-        fields: fields of the model.
-        field_address: unused; all readers have the same arguments.
-    """
-    return fields[f"opt.{name}"][0]
-
-
 class FieldAddress(NamedTuple):
     """Addresses of an element in the fields of a compiled model.
 
@@ -112,96 +83,109 @@ class FieldAddress(NamedTuple):
     position: int = 0
     control: int = 0
 
+    def get_values(self, field_name: str, values: Any) -> Any:
+        """Return the values of the element in a field, whose name tells what its rows are.
 
-def _make_polynomial_reader(
-    first: str, higher_orders: str, address: str = "id"
-) -> Callable[[Fields, Any], list[float]]:
-    """Return a reader of an attribute that is a polynomial: damping or stiffness of a joint.
+        Args:
+            field_name: name of the field.
+            values: values of all elements, one row for each.
+        """
+        if field_name.startswith("opt."):
+            return values
+        rows = {"dof_": self.velocity, "qpos": self.position, "actuator_ctrl": self.control}
+        matching = (row for start, row in rows.items() if field_name.startswith(start))
+        return values[next(matching, self.id)]
 
-    MuJoCo stores its linear coefficient in the field `first` and the others in the field
-    `higher_orders`; the reader joins them. `address` names the attribute of `FieldAddress` that is
-    the row in these fields.
+
+class MjcfAttribute(NamedTuple):
+    """An MJCF attribute, and where a compiled model stores its values.
+
+    Attributes:
+        name: name in the file.
+        fields: names of the fields of the model with its values, one after another.
+        spec: name in an MjSpec.
+        column: column of its only value in the row of the element; None for all columns.
     """
 
-    def read(fields: Fields, field_address: Any) -> list[float]:
-        """Return the coefficients of the element at `field_address`, lowest order first."""
-        row = getattr(field_address, address)
-        return [fields[first][0, row], *fields[higher_orders][0, row]]
+    name: str
+    fields: tuple[str, ...]
+    spec: str
+    column: int | None = None
 
-    return read
+    def read(self, fields: Fields, address: FieldAddress) -> Values:
+        """Return the values of the element at an address."""
+        parts = [np.ravel(address.get_values(name, fields[name][0])) for name in self.fields]
+        values = tuple(np.concatenate(parts).astype(float).tolist())
+        return values if self.column is None else (values[self.column],)
 
 
+def _make_attributes(fields: Mapping[str, str], **spec_names: str) -> tuple[MjcfAttribute, ...]:
+    """Make the attributes of a kind of elements.
+
+    Args:
+        fields: names of the fields, separated by blanks, by name of the attribute.
+        spec_names: names in an MjSpec of the attributes that have another name there.
+    """
+    return tuple(
+        MjcfAttribute(name, tuple(field_names.split()), spec_names.get(name, name))
+        for name, field_names in fields.items()
+    )
+
+
+_ACTUATOR_ATTRIBUTES = (
+    *("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm"),
+    *("ctrllimited", "ctrlrange", "forcelimited", "forcerange", "delay"),
+)
 ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
-    "joint": (
-        MjcfAttribute(
-            "damping",
-            "damping",
-            _make_polynomial_reader("dof_damping", "dof_dampingpoly", "velocity"),
-        ),
-        MjcfAttribute("frictionloss", "frictionloss", _make_reader("dof_frictionloss", "velocity")),
-        MjcfAttribute("solreffriction", "solref_friction", _make_reader("dof_solref", "velocity")),
-        MjcfAttribute("solimpfriction", "solimp_friction", _make_reader("dof_solimp", "velocity")),
-        MjcfAttribute(
-            "stiffness", "stiffness", _make_polynomial_reader("jnt_stiffness", "jnt_stiffnesspoly")
-        ),
-        MjcfAttribute("springref", "springref", _make_reader("qpos_spring", "position")),
-        MjcfAttribute("armature", "armature", _make_reader("dof_armature", "velocity")),
-        MjcfAttribute("axis", "axis", _make_reader("jnt_axis")),
-        MjcfAttribute("ref", "ref", _make_reader("qpos0", "position")),
+    "joint": _make_attributes(
+        {
+            # Polynomials: the linear coefficient, and those of higher order.
+            "damping": "dof_damping dof_dampingpoly",
+            "frictionloss": "dof_frictionloss",
+            "solreffriction": "dof_solref",
+            "solimpfriction": "dof_solimp",
+            "stiffness": "jnt_stiffness jnt_stiffnesspoly",
+            "springref": "qpos_spring",
+            "armature": "dof_armature",
+            "axis": "jnt_axis",
+            "ref": "qpos0",
+        },
+        solreffriction="solref_friction",
+        solimpfriction="solimp_friction",
     ),
-    "body": (
-        MjcfAttribute("pos", "ipos", _make_reader("body_ipos")),
-        MjcfAttribute("quat", "iquat", _make_reader("body_iquat")),
-        MjcfAttribute("mass", "mass", _make_reader("body_mass")),
-        MjcfAttribute("diaginertia", "inertia", _make_reader("body_inertia")),
+    "body": _make_attributes(
+        {
+            "pos": "body_ipos",
+            "quat": "body_iquat",
+            "mass": "body_mass",
+            "diaginertia": "body_inertia",
+        },
+        pos="ipos",
+        quat="iquat",
+        diaginertia="inertia",
     ),
-    "frame": (
-        MjcfAttribute("pos", "pos", _make_reader("body_pos")),
-        MjcfAttribute("gravcomp", "gravcomp", _make_reader("body_gravcomp")),
-    ),
+    "frame": _make_attributes({"pos": "body_pos", "gravcomp": "body_gravcomp"}),
     "actuator": (
-        MjcfAttribute("dyntype", "dyntype", _make_reader("actuator_dyntype")),
-        MjcfAttribute("dynprm", "dynprm", _make_reader("actuator_dynprm")),
-        MjcfAttribute("gaintype", "gaintype", _make_reader("actuator_gaintype")),
-        MjcfAttribute("gainprm", "gainprm", _make_reader("actuator_gainprm")),
-        MjcfAttribute("biastype", "biastype", _make_reader("actuator_biastype")),
-        MjcfAttribute("biasprm", "biasprm", _make_reader("actuator_biasprm")),
-        MjcfAttribute(
-            "ctrllimited", "ctrllimited", _make_reader("actuator_ctrllimited", "control")
-        ),
-        MjcfAttribute("ctrlrange", "ctrlrange", _make_reader("actuator_ctrlrange", "control")),
-        MjcfAttribute("forcelimited", "forcelimited", _make_reader("actuator_forcelimited")),
-        MjcfAttribute("forcerange", "forcerange", _make_reader("actuator_forcerange")),
-        MjcfAttribute("delay", "delay", _make_reader("actuator_delay")),
-        MjcfAttribute("nsample", "nsample", lambda f, where: f["actuator_history"][0, where.id, 0]),
-        MjcfAttribute("interp", "interp", lambda f, where: f["actuator_history"][0, where.id, 1]),
+        *_make_attributes({name: f"actuator_{name}" for name in _ACTUATOR_ATTRIBUTES}),
+        MjcfAttribute("nsample", ("actuator_history",), "nsample", 0),
+        MjcfAttribute("interp", ("actuator_history",), "interp", 1),
     ),
-    "pair": (
-        MjcfAttribute("friction", "friction", _make_reader("pair_friction")),
-        MjcfAttribute("solref", "solref", _make_reader("pair_solref")),
-    ),
-    "geom": (MjcfAttribute("size", "size", _make_reader("geom_size")),),
-    "option": (
-        *(
-            MjcfAttribute(name, name, partial(_read_option, name))
-            for name in (*OPTION_EFFECTS.values(), "gravity")
-        ),
+    "pair": _make_attributes({"friction": "pair_friction", "solref": "pair_solref"}),
+    "geom": _make_attributes({"size": "geom_size"}),
+    "option": _make_attributes(
+        {name: f"opt.{name}" for name in (*OPTION_EFFECTS.values(), "gravity")}
     ),
     "compiler": (),
 }
 """MJCF attributes by kind of element; those of an inertial belong to its body."""
 
-_NAMES = (
-    *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
-    *("jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "dof_armature"),
-    *("jnt_axis", "qpos0", "body_pos"),
-    *("body_ipos", "body_iquat", "body_mass", "body_inertia", "body_gravcomp"),
-    *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
-    *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
-    *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
-    *("pair_friction", "pair_solref"),
-    *("geom_size", "geom_rbound", "geom_aabb", "bvh_aabb"),
-)
+_FIELD_NAMES = {
+    name
+    for attributes in ATTRIBUTES_BY_KIND.values()
+    for attribute in attributes
+    for name in attribute.fields
+} | {"geom_rbound", "geom_aabb", "bvh_aabb"}
+"""Names of the fields that store attributes, or follow from the sizes of geoms."""
 
 FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
 ANGLE_ATTRIBUTES = frozenset({"ref", "springref"})
@@ -220,10 +204,7 @@ ENUM_ATTRIBUTES: Mapping[str, str] = {
 
 def copy_model_fields(model: Any) -> Fields:
     """Copy the fields of a compiled model that store attributes."""
-    fields = {name: np.array(getattr(model, name))[None] for name in _NAMES}
-    for name in (*OPTION_EFFECTS.values(), "gravity"):
-        fields[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
-    return fields
+    return {name: np.array(attrgetter(name)(model))[None] for name in _FIELD_NAMES}
 
 
 def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
@@ -307,7 +288,7 @@ def find_differing_statements(
             present_value = attribute.read(present_values, field_address)
             target_value = attribute.read(target_values, field_address)
             if not _is_equal(present_value, target_value, tolerance):
-                values[attribute.name] = tuple(float(v) for v in np.atleast_1d(target_value))
+                values[attribute.name] = target_value
         if element.kind == "body" and values:
             # An inertial must be written with all its attributes.
             values = list_all_attributes(model, element, target_values)
@@ -328,26 +309,21 @@ def list_all_attributes(
     """
     field_address = get_field_address(model, element)
     return {
-        attribute.name: tuple(
-            float(v) for v in np.atleast_1d(attribute.read(target_values, field_address))
-        )
+        attribute.name: attribute.read(target_values, field_address)
         for attribute in ATTRIBUTES_BY_KIND[element.kind]
     }
 
 
-def _is_equal(first: Any, second: Any, tolerance: float) -> bool:
-    """Return whether two arrays are equal to within `tolerance` times the largest entry.
+def _is_equal(first: Values, second: Values, tolerance: float) -> bool:
+    """Return whether values are equal to within `tolerance` times the largest.
 
     Args:
-        first: array or number.
-        second: another one.
-        tolerance: largest difference, relative to the largest entry.
+        first: values of an attribute.
+        second: as many other ones.
+        tolerance: largest difference, relative to the largest value.
     """
-    first, second = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    if first.shape != second.shape:
-        return False
     scale = np.maximum(np.abs(first), np.abs(second)).max(initial=0.0)
-    return bool((np.abs(first - second) <= tolerance * scale).all())
+    return bool((np.abs(np.subtract(first, second)) <= tolerance * scale).all())
 
 
 def get_enum_word(name: str, value: float) -> str:
