@@ -40,6 +40,7 @@ from sims.robot.export.mjcf_attributes import (
     Fields,
     Kind,
     ModelElement,
+    UnstatableCauseError,
     copy_model_fields,
     find_differing_statements,
     find_missing_statements,
@@ -156,14 +157,15 @@ def apply_causes(
         before = {name: values.copy() for name, values in target_values.items()}
         places_in_series = {applied.place for applied in applied_causes if _is_in_series(applied)}
         # The elements in series at a place are written once, with the first of their causes.
-        remark = _write_cause(
-            target_values, robot, cause, series if cause.place not in places_in_series else {}
-        )
-        if remark and not remark.startswith("+"):
-            notes.append(f"{cause.format(recording)}: not in the file: {remark}")
+        try:
+            remark = _write_cause(
+                target_values, robot, cause, series if cause.place not in places_in_series else {}
+            )
+        except UnstatableCauseError as reason:
+            notes.append(f"{cause.format(recording)}: not in the file: {reason}")
             continue
         applied_causes.append(cause)
-        note = f"{cause.effect}: {remark[1:]}" if remark else _find_note(robot, cause)
+        note = f"{cause.effect}: {remark}" if remark else _find_note(robot, cause)
         if note and note not in notes:
             notes.append(note)
         changed_elements = [
@@ -241,16 +243,16 @@ def _write_cause(
     cause: FittedCause,
     series: Mapping[str, SeriesElement],
 ) -> str | None:
-    """Write a cause into the fields of the model; return None, or a note or reason for the user.
-
-    A text that begins with + is a note about a cause that was written. Any other text is the reason
-    why a model file cannot state the cause.
+    """Write a cause into the fields of the model; return a note for the user, or None.
 
     Args:
         target_values: fields of the model, changed in place.
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         cause: effect at a place with its fitted coefficients.
         series: elements in series, by place, that are not yet written.
+
+    Raises:
+        UnstatableCauseError: a model file cannot state the cause.
     """
     # A coupling is an element of the robot, which has been added before.
     if cause.effect == COUPLING_EFFECT:
@@ -258,9 +260,9 @@ def _write_cause(
     if is_gravity_compensated(cause.effect, cause.numbers):
         for body in robot.bodies:
             target_values["body_gravcomp"][0, body.id] = 1.0
-        return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is unchanged"
+        return "gravity is compensated: the bodies have gravcomp = 1, and gravity is unchanged"
     if cause.effect in GEOMETRY_EFFECTS and _is_in_frame(robot, cause):
-        return "its element is within a <frame>, or made by another element"
+        raise UnstatableCauseError("its element is within a <frame>, or made by another element")
     if cause.effect in MODEL_FIELD_EFFECTS:
         MODEL_FIELD_EFFECTS[cause.effect].write(
             target_values, robot, cause.place, cause.coefficients[:, None]
@@ -273,8 +275,8 @@ def _write_cause(
     if cause.effect in COMMAND_WRITERS:
         return COMMAND_WRITERS[cause.effect](target_values, robot, cause)
     if cause.effect.startswith(("sensor.", "clock.")):
-        return "a model file does not state sensor errors"
-    return "MuJoCo has no such element"
+        raise UnstatableCauseError("a model file does not state sensor errors")
+    raise UnstatableCauseError("MuJoCo has no such element")
 
 
 def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:

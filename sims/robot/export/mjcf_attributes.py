@@ -342,11 +342,9 @@ def get_enum_word(name: str, value: float) -> str:
     return {"rk4": "RK4", "euler": "Euler"}.get(text, text)
 
 
-UnstatableReason = str | None
-"""Reason why a cause cannot be written; None if it is written.
+class UnstatableCauseError(Exception):
+    """A model file cannot state a cause; the message states the reason as a clause."""
 
-A text that begins with ``+`` is a note about a cause that is written.
-"""
 
 MIN_GAIN_FACTOR = 1e-12
 """Minimum factor 1 + a, since a gain error cannot reverse the sign of a command."""
@@ -443,31 +441,28 @@ def _get_command_scaling(robot: RobotModel) -> Any:
 _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
-def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_input_gain(actuator: _Actuator, a: float) -> None:
     """Write an error a of the input gain into the actuator.
 
     The actuator's gain is multiplied by 1 + a (1). Its control range is divided by the same factor,
     since the range limits the command before the gain here, but after it in reality (2).
 
     Args:
-        fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        actuator: actuator whose fields are changed.
+        a: error of the gain.
     """
-    actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not can_scale:
-        return _NOT_LINEAR
+        raise UnstatableCauseError(_NOT_LINEAR)
     if 1.0 + a < MIN_GAIN_FACTOR:
-        return "a control range cannot express a factor of zero or less"
+        raise UnstatableCauseError("a control range cannot express a factor of zero or less")
     low, high = actuator.limits()
     actuator.limit(low / (1.0 + a), high / (1.0 + a))  # (2)
     actuator.gain[0] *= 1.0 + a  # (1)
     actuator.command[0] *= 1.0 + a
-    return None
 
 
-def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_input_bias(actuator: _Actuator, b: float) -> None:
     """Write an input bias b into the actuator: a constant force, and a shifted control range.
 
     With the command u and an input gain 1 + a that is in the fields already (`input_factor`), the
@@ -475,22 +470,19 @@ def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     limits of its control are shifted by -b / (1 + a) (2). The gain in the fields is g (1 + a).
 
     Args:
-        fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        actuator: actuator whose fields are changed.
+        b: bias, in the unit of the control.
     """
-    actuator, (b,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if not actuator.linear:
-        return _NOT_LINEAR
+        raise UnstatableCauseError(_NOT_LINEAR)
     input_factor, _ = actuator.command
     low, high = actuator.limits()
     actuator.limit(low - b / input_factor, high - b / input_factor)  # (2)
     actuator.shift(float(actuator.gain[0] / input_factor * b))  # (1)
     actuator.command[1] += b
-    return None
 
 
-def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_saturation(actuator: _Actuator, s: float) -> None:
     """Write a saturation of the input at ±s as a narrower control range of the actuator.
 
     The input is w = clip((1 + a) u + b, -s, s) for the command u, with a gain error a and a bias b
@@ -499,84 +491,74 @@ def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     effect, as in the simulation.
 
     Args:
-        fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        actuator: actuator whose fields are changed.
+        s: limit of the input.
     """
-    actuator, (s,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if s <= 0:
-        return None
+        return
     if not actuator.linear:
-        return _NOT_LINEAR
+        raise UnstatableCauseError(_NOT_LINEAR)
     input_factor, b = actuator.command
     low, high = actuator.limits()
     low, high = max(low, (-s - b) / input_factor), min(high, (s - b) / input_factor)
     if low >= high:
-        return "the control range would be empty"
+        raise UnstatableCauseError("the control range would be empty")
     actuator.limit(low, high)  # (2)
-    return None
 
 
-def _write_delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_delay(actuator: _Actuator, delay: float) -> str | None:
     """Write an input delay in seconds into the actuator's delay and history buffer.
 
-    The returned text begins with +, which marks a note about a cause that was written.
+    Return a note about it.
 
     Args:
-        fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        actuator: actuator whose fields are changed.
+        delay: delay in seconds.
     """
-    actuator, (delay,) = _Actuator(fields, robot, cause.place), cause.coefficients
-    step = float(fields["opt.timestep"][0])
+    step = float(actuator.fields["opt.timestep"][0])
     if delay == 0:
         return None
     if delay < 0:
-        return "a negative delay is not possible"
-    if fields["actuator_delay"][0, actuator.id] > 0:
-        return "the file states a delay already"
-    fields["actuator_delay"][0, actuator.id] = delay
+        raise UnstatableCauseError("a negative delay is not possible")
+    if actuator.fields["actuator_delay"][0, actuator.id] > 0:
+        raise UnstatableCauseError("the file states a delay already")
+    actuator.fields["actuator_delay"][0, actuator.id] = delay
     # MuJoCo interpolates linearly between past controls. This equals the mean, over a step, of
     # delayed controls that are constant over their steps.
-    fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
+    actuator.fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
     delay_note = "" if delay >= step else f", delays it by a whole step, {step:g} s"
     return (
-        f"+MuJoCo takes a control that is delayed for 0 before the first one{delay_note} "
+        f"MuJoCo takes a control that is delayed for 0 before the first one{delay_note} "
         "(mj_initCtrlHistory sets another)"
     )
 
 
-def _write_lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_lag(actuator: _Actuator, lag: float) -> str | None:
     """Write a first-order lag of the input as an exact activation filter (FILTEREXACT) of MuJoCo.
 
-    `lag` is the time constant in seconds. The returned text begins with +, which marks a note
-    about a cause that was written.
+    `lag` is the time constant in seconds. Return a note about it.
 
     Args:
-        fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficients.
+        actuator: actuator whose fields are changed.
+        lag: time constant in seconds.
     """
     import mujoco
 
-    actuator, (lag,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if lag <= 0:
         return None
     if not (actuator.direct and actuator.fixed and actuator.single):
-        return "its actuator has dynamics already"
-    fields["actuator_dyntype"][0, actuator.id] = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-    parameters = fields["actuator_dynprm"][0, actuator.id]
+        raise UnstatableCauseError("its actuator has dynamics already")
+    actuator.fields["actuator_dyntype"][0, actuator.id] = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    parameters = actuator.fields["actuator_dynprm"][0, actuator.id]
     parameters[:] = 0.0
     parameters[0] = lag
     return (
-        "+MuJoCo filters the control after its range, from 0 on (set data.act to the first control)"
+        "MuJoCo filters the control after its range, from 0 on (set data.act to the first control)"
         ", and holds the filtered one over each step"
     )
 
 
-def _write_constant_force(
-    fields: Fields, robot: RobotModel, cause: FittedCause
-) -> UnstatableReason:
+def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause) -> str | None:
     """Write a constant force at a joint into the model, in N or N m.
 
     MuJoCo has no such element, so one of these is used:
@@ -585,7 +567,7 @@ def _write_constant_force(
        displacement.
     2. An actuator of the joint gets a bias, if no force limit would clip it.
 
-    Return None, a note that begins with +, or the reason why neither is possible.
+    Return a note, or None.
 
     Args:
         fields: fields of the compiled model, changed in place.
@@ -615,12 +597,14 @@ def _write_constant_force(
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:
                 actuator.shift(float(force / gear[0]))
                 return (
-                    f"+it is written as a bias of actuator {driving.name}, and is part of its force"
+                    f"it is written as a bias of actuator {driving.name}, and is part of its force"
                 )
-    return "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
+    raise UnstatableCauseError(
+        "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
+    )
 
 
-def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> None:  # noqa: ARG001
     """Write an option of the model file, such as the time step in seconds.
 
     An option that is a word in the file has MuJoCo's number of the word.
@@ -632,18 +616,37 @@ def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unst
     """
     (number,) = cause.coefficients
     fields[f"opt.{OPTION_EFFECTS[cause.effect]}"][0] = number
-    return None
 
 
-CommandWriter = Callable[[Fields, RobotModel, FittedCause], UnstatableReason]
-
-COMMAND_WRITERS: Mapping[str, CommandWriter] = {
-    **dict.fromkeys(OPTION_EFFECTS, _write_option),
+_INPUT_WRITERS: Mapping[str, Callable[[_Actuator, float], str | None]] = {
     "input.gain": _write_input_gain,
     "input.bias": _write_input_bias,
     "input.saturation": _write_saturation,
     "input.delay": _write_delay,
     "input.lag": _write_lag,
+}
+"""Writers of effects on the input of an actuator."""
+
+
+def _write_input_effect(fields: Fields, robot: RobotModel, cause: FittedCause) -> str | None:
+    """Write an effect on an input into its actuator; return a note about it, or None.
+
+    Args:
+        fields: fields of the compiled model, changed in place.
+        robot: robot as read from its model file.
+        cause: cause with its fitted coefficient.
+
+    Raises:
+        UnstatableCauseError: the actuator cannot state the effect.
+    """
+    (coefficient,) = cause.coefficients
+    actuator = _Actuator(fields, robot, cause.place)
+    return _INPUT_WRITERS[cause.effect](actuator, float(coefficient))
+
+
+COMMAND_WRITERS: Mapping[str, Callable[[Fields, RobotModel, FittedCause], str | None]] = {
+    **dict.fromkeys(OPTION_EFFECTS, _write_option),
+    **dict.fromkeys(_INPUT_WRITERS, _write_input_effect),
     "force.bias": _write_constant_force,
 }
 """Writers by effect: model changes, then effects in the order in which a command passes them."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import Array
 from sims.robot.export.apply_causes import apply_causes
+from sims.robot.export.mjcf_attributes import UnstatableCauseError
 from sims.robot.export.model_comparison import find_first_difference
 from sims.robot.export.write_model_file import (
     EQUAL_NUMBERS_TOLERANCE,
@@ -101,9 +103,11 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
 
     # 1. Original model with the causes.
     writer = UrdfWriter(robot, "")
-    urdf_causes = {
-        c.name: c.numbers for c in expand_families(robot, causes) if writer.write(c) is None
-    }
+    urdf_causes = {}
+    for cause in expand_families(robot, causes):
+        with suppress(UnstatableCauseError):
+            writer.write(cause)
+            urdf_causes[cause.name] = cause.numbers
     target_model = apply_causes(read_robot(robot.path), urdf_causes).model
     release_free_memory()
     # 2. Written URDF.

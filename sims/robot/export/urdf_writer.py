@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sims.core.simulator import Array
+from sims.robot.export.mjcf_attributes import UnstatableCauseError
 from sims.robot.export.mjcf_document import (
     XmlElement,
     XmlText,
@@ -60,13 +61,16 @@ class UrdfWriter:
         self.links = {tag.get_attribute("name"): tag for tag in top if tag.name == "link"}
         self.joints = {tag.get_attribute("name"): tag for tag in top if tag.name == "joint"}
 
-    def write(self, cause: FittedCause) -> str | None:
-        """Write a cause; return the reason if a URDF cannot express it, else None.
+    def write(self, cause: FittedCause) -> None:
+        """Write a cause.
 
         Args:
             cause: Effect at a place with its fitted numbers.
+
+        Raises:
+            UnstatableCauseError: A URDF cannot express it.
         """
-        writers_by_effect: Mapping[str, Callable[[FittedCause], str | None]] = {
+        writers_by_effect: Mapping[str, Callable[[FittedCause], None]] = {
             "drag.linear": lambda cause: self._write_dynamics(cause, "damping"),
             "friction.coulomb": lambda cause: self._write_dynamics(cause, "friction"),
             "mass.scale": self._write_mass,
@@ -78,8 +82,8 @@ class UrdfWriter:
             "payload": self._write_payload,
         }
         if cause.effect not in writers_by_effect:
-            return "a URDF cannot state it"
-        return writers_by_effect[cause.effect](cause)
+            raise UnstatableCauseError("a URDF cannot state it")
+        writers_by_effect[cause.effect](cause)
 
     def to_text(self, lines: list[str]) -> str:
         """Return the file with all changes.
@@ -92,35 +96,43 @@ class UrdfWriter:
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()
 
-    def _write_dynamics(self, cause: FittedCause, attribute: str) -> str | None:
+    def _write_dynamics(self, cause: FittedCause, attribute: str) -> None:
         """Add a cause to the damping or the friction in the dynamics element of its joint.
 
-        A missing element is added. The result is None, or the reason why the URDF cannot
-        state the cause.
+        A missing element is added.
 
         Args:
             cause: effect at a place with its fitted numbers.
             attribute: ``damping`` or ``friction``.
         """
-        joint = self.joints.get(cause.place)
-        if joint is None:
-            return _NO_JOINT
+        joint = self._find_joint(cause)
         dynamics = _get_or_add_child(joint, "dynamics")
         before = float(dynamics.get_attribute(attribute) or 0.0)
         self._add_comment(dynamics, cause)
         dynamics.new[attribute] = format_number(
             float(add_to_file_value(before, cause.coefficients[0]))
         )
-        return None
 
     def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:
         tag.before.append(cause.format(self.recording))
 
-    def _find_inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]] | None:
+    def _find_joint(self, cause: FittedCause) -> XmlElement:
+        """Return the joint at which a cause acts.
+
+        Raises:
+            UnstatableCauseError: The file has no joint of this name.
+        """
+        if cause.place not in self.joints:
+            raise UnstatableCauseError("the file has no joint of this name")
+        return self.joints[cause.place]
+
+    def _find_inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]]:
         """Return the links of a body that have a mass, with their inertials.
 
-        A link without mass, such as a frame that carries others on fixed joints, adds nothing. The
-        result is None if the mass of a link follows from its shapes, or if no link has a mass.
+        A link without mass, such as a frame that carries others on fixed joints, adds nothing.
+
+        Raises:
+            UnstatableCauseError: The mass of a link follows from its shapes, or no link has a mass.
         """
         body = self.robot.body(cause.place)
         inertials = []
@@ -130,68 +142,56 @@ class UrdfWriter:
             if inertial is not None:
                 inertials += [(name, inertial)] if _has_mass(inertial) else []
             elif link is None or _find_child(link, "collision"):
-                return None
-        return inertials or None
+                inertials = []
+                break
+        if not inertials:
+            raise UnstatableCauseError("a link of the body states no inertial")
+        return inertials
 
-    def _write_mass(self, cause: FittedCause) -> str | None:
-        """Scale mass and inertia tensor of each link in the body by 1 + c, eq. (1).
-
-        The result is None, or the reason why the URDF cannot state the cause.
-        """
+    def _write_mass(self, cause: FittedCause) -> None:
+        """Scale mass and inertia tensor of each link in the body by 1 + c, eq. (1)."""
         inertials = self._find_inertials(cause)
-        if inertials is None:
-            return "a link of the body states no inertial"
         factor = float(compute_factor(cause.coefficients[0]))
         for _, inertial in inertials:
             self._add_comment(inertial, cause)
             _scale_attributes(inertial, "mass", ("value",), factor)  # (1)
             _scale_attributes(inertial, "inertia", _TENSOR_ATTRIBUTES, factor)
-        return None
 
-    def _write_inertia_tensor(self, cause: FittedCause) -> str | None:
+    def _write_inertia_tensor(self, cause: FittedCause) -> None:
         """Scale the inertia tensor of the body's only link by 1 + c; its mass stays.
 
         A body of several links is refused: its tensor includes the distances between the
-        links, which no change of the links' own tensors would scale. The result is None, or
-        the reason for a refusal.
+        links, which no change of the links' own tensors would scale.
         """
         inertials = self._find_inertials(cause)
-        if inertials is None or len(inertials) > 1:
-            return "the body is not one link with an inertial"
+        if len(inertials) > 1:
+            raise UnstatableCauseError("the body is not one link with an inertial")
         ((_, inertial),) = inertials
         self._add_comment(inertial, cause)
         _scale_attributes(
             inertial, "inertia", _TENSOR_ATTRIBUTES, float(compute_factor(cause.coefficients[0]))
         )
-        return None
 
-    def _write_centre_of_mass(self, cause: FittedCause) -> str | None:
+    def _write_centre_of_mass(self, cause: FittedCause) -> None:
         """Move the centre of mass of each link in the body by the same vector c in metres.
 
         A body may consist of several links that are fused by fixed joints. In the frame of a link,
-        whose axes in the frame of the body are R, the vector is R' c (2). The result is None, or
-        the reason why the URDF cannot state the cause.
+        whose axes in the frame of the body are R, the vector is R' c (2).
         """
         inertials = self._find_inertials(cause)
-        if inertials is None:
-            return "a link of the body states no inertial"
         body = self.robot.body(cause.place).name
         for name, inertial in inertials:
             self._add_comment(inertial, cause)
             displacement = self._get_link_axes(name, body).T @ cause.coefficients  # (2)
             _set_vector(inertial, "origin", "xyz", _read_origin(inertial, "xyz") + displacement)
-        return None
 
-    def _write_joint_zero(self, cause: FittedCause) -> str | None:
+    def _write_joint_zero(self, cause: FittedCause) -> None:
         """Move the zero of a joint by c (rad or m).
 
         URDF cannot state a zero. It moves by c if the origin of the joint is turned by -c about its
-        axis, or moved by -c along it if the joint is prismatic (3). The result is None, or the
-        reason why the URDF cannot state the cause.
+        axis, or moved by -c along it if the joint is prismatic (3).
         """
-        joint = self.joints.get(cause.place)
-        if joint is None:
-            return _NO_JOINT
+        joint = self._find_joint(cause)
         (c,) = cause.coefficients
         self._add_comment(joint, cause)
         axis = _get_joint_axis(joint)
@@ -201,57 +201,47 @@ class UrdfWriter:
         else:
             rotated_frame = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
             _set_vector(joint, "origin", "rpy", rotated_frame.as_euler("xyz"))  # (3)
-        return None
 
-    def _write_joint_axis(self, cause: FittedCause) -> str | None:
-        """Rotate the axis of a joint by a rotation vector in radians, given in the joint's frame.
-
-        The result is None, or the reason why the URDF cannot state the cause.
-        """
-        joint = self.joints.get(cause.place)
-        if joint is None:
-            return _NO_JOINT
+    def _write_joint_axis(self, cause: FittedCause) -> None:
+        """Rotate the axis of a joint by a rotation vector in radians, in the joint's frame."""
+        joint = self._find_joint(cause)
         self._add_comment(joint, cause)
         rotation = Rotation.from_rotvec(cause.coefficients)
         _set_vector(joint, "axis", "xyz", rotation.apply(_get_joint_axis(joint)))
-        return None
 
-    def _write_link_length(self, cause: FittedCause) -> str | None:
+    def _write_link_length(self, cause: FittedCause) -> None:
         """Lengthen a link by the share c: move the joint that carries the body.
 
         With the position p of the body in the frame of its parent body (`carrier`), the joint's
         origin moves by c p. In the frame of the joint's parent link, whose axes in the parent body
-        are R (`axes`), this is R' c p (4). The result is None, or the reason why the URDF cannot
-        state the cause.
+        are R (`axes`), this is R' c p (4).
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
         joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]
         if not joints:
-            return "the file has no joint that carries the link"
+            raise UnstatableCauseError("the file has no joint that carries the link")
         carrier = model.body(int(model.body_parentid[body.id])).name
         axes = self._get_link_axes(_get_link_name(joints[0], "parent"), carrier)
         displacement = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
         self._add_comment(joints[0], cause)
         _set_vector(joints[0], "origin", "xyz", _read_origin(joints[0], "xyz") + displacement)
-        return None
 
-    def _write_payload(self, cause: FittedCause) -> str | None:
+    def _write_payload(self, cause: FittedCause) -> None:
         """Add a payload, a point mass, to a link: new mass, centre of mass, and inertia tensor.
 
         The coefficients are the mass `added_mass` in kg and its offset from the body's centre of
         mass in m. The inertia tensor is turned to the axes of the link, increased by the parallel
         axis theorem to that about the common centre of mass `middle` (5), and turned back to the
-        axes of the inertial, in which it is written. The result is None, or the reason why the URDF
-        cannot state the cause.
+        axes of the inertial, in which it is written.
         """
         body = self.robot.body(cause.place)
         link = self.links.get(body.name)
         inertial = _find_child(link, "inertial") if link else None
         if inertial is None:
-            return "the link states no inertial"
+            raise UnstatableCauseError("the link states no inertial")
         mass_tag, tensor_tag = _find_child(inertial, "mass"), _find_child(inertial, "inertia")
         if mass_tag is None or tensor_tag is None:
-            return "the link's inertial lacks a mass or an inertia"
+            raise UnstatableCauseError("the link's inertial lacks a mass or an inertia")
         mass = float(mass_tag.get_attribute("value") or 0.0)
         added_mass, *offset = cause.coefficients
         point = self.robot.compiled.body_ipos[body.id] + offset
@@ -271,7 +261,6 @@ class UrdfWriter:
         for key, value in zip(_TENSOR_ATTRIBUTES, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
         _set_vector(inertial, "origin", "xyz", middle)
-        return None
 
     def _get_link_axes(self, link: str, body: str) -> Array:
         """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
@@ -281,9 +270,6 @@ class UrdfWriter:
             axes = _compute_rotation(_read_origin(joint, "rpy")) @ axes
             link = _get_link_name(joint, "parent")
         return axes
-
-
-_NO_JOINT = "the file has no joint of this name"
 
 
 def _read_origin(tag: XmlElement, attribute: str) -> Array:

@@ -26,6 +26,7 @@ from sims.robot.export.mjcf_attributes import (
     ATTRIBUTES_BY_KIND,
     AttributeStatement,
     ModelElement,
+    UnstatableCauseError,
     Values,
     find_missing_statements,
     list_all_attributes,
@@ -254,10 +255,12 @@ def _render_urdf(
     lines = []
     fitted_causes = expand_families(robot, causes)
     for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
-        reason = writer.write(cause)
-        if reason:
+        try:
+            writer.write(cause)
+        except UnstatableCauseError as reason:
             lines.append(f"{cause.format(recording)}: not in the URDF: {reason}")
-        elif cause.effect == COULOMB and robot.friction_form == "stiff":
+            continue
+        if cause.effect == COULOMB and robot.friction_form == "stiff":
             lines.append(_SOFT_FRICTION_URDF_NOTE)
     lines = list(dict.fromkeys(lines))
     notes += lines
