@@ -26,7 +26,7 @@ from sims.core.argument_checks import Expected, Name
 from sims.core.files import hash_file
 from sims.core.plain_values import MAX_NUMBER
 from sims.core.simulator import InputError, Simulator
-from sims.core.toml_validation import check_table
+from sims.core.toml_validation import get_subtable
 from sims.recording.column_mapping import list_mapped_files
 from sims.recording.log_formats.hdf5_and_parquet import group_of
 from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
@@ -301,7 +301,7 @@ def read_frame_recording(
         meta.pop("system", None)
         meta["model"] = str(frame_description.model)
     if frame_description.constants:
-        stated_constants = check_table(name, "constants", meta.get("constants", {}))
+        stated_constants = get_subtable(name, meta, "constants")
         meta["constants"] = {**stated_constants, **frame_description.constants}
     kind = _get_simulator_class(name, meta)
     meta.setdefault("title", f"{kind.name}, {name}")

@@ -159,6 +159,20 @@ def check_table(source: Source, where: str, value: Any, words: str = "") -> dict
     return dict(check_type(source, where, value, dict, words))
 
 
+def get_subtable(source: Source, table: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return a table within a table of a file; an empty one if it is missing.
+
+    Args:
+        source: File or name with which the message begins.
+        table: Table of the file.
+        key: Key of the table in it.
+
+    Raises:
+        InputError: The value is no table.
+    """
+    return check_table(source, key, table.get(key, {}))
+
+
 def check_text(
     source: Source, where: str, value: Any, words: str = "", max_length: int = MAX_TITLE_LENGTH
 ) -> str:

@@ -15,8 +15,8 @@ from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import (
     check_finite,
     check_known_names,
-    check_table,
     check_text,
+    get_subtable,
     make_error,
     read_toml,
 )
@@ -108,7 +108,7 @@ def read_sources(
     Raises:
         InputError: The description is malformed.
     """
-    time = check_table(path, "time", meta.get("time", {}))
+    time = get_subtable(path, meta, "time")
     check_known_names(f"entry in [time] of {path}", time, TIME_KEYS)
     time_column = check_text(path, "time.column", time.get("column", "t"))
     unit = check_text(path, "time.unit", time.get("unit", "s"))
@@ -119,7 +119,7 @@ def read_sources(
     rate = _read_sampling_rate(path, time)
     signals = {name: _read_source(path, name, table) for name, table in columns.items()}
     folders, run_files = {}, {}
-    for name, run_table in check_table(path, "runs", meta.get("runs", {})).items():
+    for name, run_table in get_subtable(path, meta, "runs").items():
         if not isinstance(run_table, dict):
             continue
         if "file" in run_table:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError, make_unknown_name_error
-from sims.core.toml_validation import check_table, check_text, toml_key
+from sims.core.toml_validation import check_text, get_subtable, toml_key
 
 Mask = NDArray[np.bool_]
 Run: TypeAlias = Any
@@ -81,7 +81,7 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
         InputError: A column name is not a text, or a drive has both keys.
     """
     switches = []
-    for name, table in check_table(path, "actuators", meta.get("actuators", {})).items():
+    for name, table in get_subtable(path, meta, "actuators").items():
         keys = [key for key in SWITCH_KEYS if isinstance(table, dict) and key in table]
         if len(keys) > 1:
             raise InputError(f"{path}: actuators.{name}: expected enable or disable, found both")

@@ -18,9 +18,11 @@ from sims.core.system import System
 from sims.core.toml_validation import (
     check_finite,
     check_known_names,
+    check_name_list,
     check_table,
     check_text,
     check_type,
+    get_subtable,
     make_error,
     read_toml,
 )
@@ -177,11 +179,9 @@ def model_in(
         if "system" in meta:
             raise InputError(f"{description}: expected system or model, found both; leave one out")
         model = description.parent / check_text(description, "model", meta["model"])
-    actuators = without_switches(check_table(description, "actuators", meta.get("actuators", {})))
-    engine = dict(check_table(description, "engine", meta.get("engine", {})))
-    bases = find_recorded_bases(
-        list_channel_names(check_table(description, "channels", meta.get("channels", {})))
-    )
+    actuators = without_switches(get_subtable(description, meta, "actuators"))
+    engine = dict(get_subtable(description, meta, "engine"))
+    bases = find_recorded_bases(list_channel_names(get_subtable(description, meta, "channels")))
     if bases and not engine.get("fix_base"):
         engine["recorded_bases"] = bases
     return ModelFileReference(
@@ -191,10 +191,7 @@ def model_in(
 
 def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the robot parameters that the description leaves free."""
-    free_names = meta.get("free", [])
-    if not isinstance(free_names, list) or not all(isinstance(name, str) for name in free_names):
-        raise make_error(path, "free", 'names, as ["damping@*"]', free_names)
-    return tuple(free_names)
+    return check_name_list(path, "free", meta.get("free", []), 'names, as ["damping@*"]')
 
 
 def read_system_name(path: str | Path) -> str:
@@ -215,7 +212,7 @@ def get_description_path(table: Path) -> Path:
     A path of the description itself is returned unchanged.
 
     Raises:
-        InputError: `check_table` has no file name.
+        InputError: The path has no file name.
     """
     if not table.name:
         raise InputError(f"expected a recording's table, NAME.csv, found '{table}'")
@@ -231,7 +228,7 @@ def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str
 
     Returns:
         By channel and input: the stated unit, the factor from the numbers of the column to SI
-        units, and the stated `compute_unit_scale`, which is part of that factor.
+        units, and the stated `scale`, which is part of that factor.
 
     Raises:
         InputError: The description is missing or malformed.
@@ -308,7 +305,7 @@ def check_description(
     constants = _read_constants(path, "constants", meta.get("constants", {}), declared)
     _check_constants_possible(path, "constants", constants, declared)
     # The names of the runs are checked after the table was read (`check_run_names`).
-    run_tables = check_table(path, "runs", meta.get("runs", {}))
+    run_tables = get_subtable(path, meta, "runs")
     runs = {
         name: _read_run(path, name, run_table, declared) for name, run_table in run_tables.items()
     }
@@ -518,7 +515,7 @@ def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignal
         InputError: the description has such an input.
     """
     reasons: Mapping[str, str] = getattr(_get_system(declared), "refused_inputs", {})
-    input_tables = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
+    input_tables = dotted(get_subtable(path, meta, "inputs"), reasons)
     for name in (name for name in reasons if name in input_tables):
         raise InputError(f"{path}: input {name}: {reasons[name]}")
 
@@ -535,7 +532,7 @@ def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
         InputError: a pose is among the channels.
     """
     units = get_floating_state_units(declared)
-    channel_tables = dotted(check_table(path, "channels", meta.get("channels", {})), units)
+    channel_tables = dotted(get_subtable(path, meta, "channels"), units)
     for name in (name for name in units if name in channel_tables):
         raise InputError(
             f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
@@ -555,7 +552,7 @@ def _read_columns(
         declared: signals of this kind that the system declares.
     """
     units = {signal.name: signal.unit for signal in declared}
-    tables = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
+    tables = dotted(get_subtable(path, meta, f"{kind}s"), units)
     check_known_names(f"{kind} in {path}", tables, units)
     return {
         name: _read_column(path, kind, name, table, units[name]) for name, table in tables.items()
@@ -702,9 +699,7 @@ def _read_extra_columns(
     signals = (*_list_channels(declared), *declared.inputs)
     used_names = ["run", "t", *(signal.name for signal in signals)]
     tables: dict[str, Mapping[str, Any]] = {}
-    extra_tables = dotted(
-        check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)
-    )
+    extra_tables = dotted(get_subtable(path, meta, "extra"), get_floating_state_units(declared))
     for name, column_table in extra_tables.items():
         if name in used_names:
             remedy = "declare it as channel or input"

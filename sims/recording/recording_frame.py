@@ -14,7 +14,7 @@ import numpy as np
 
 from sims.core.plain_values import is_plausible_number, to_toml_value
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
-from sims.core.toml_validation import check_table, format_value
+from sims.core.toml_validation import format_value, get_subtable
 from sims.recording.column_mapping import SignalSource
 from sims.recording.csv_table import CsvRun, RecordingTable
 from sims.recording.drive_switches import read_switches
@@ -101,10 +101,10 @@ def build_frame_description(
         # The same dict of units may be used for frames with different columns.
         if name not in columns and name not in usual:
             raise make_unknown_name_error(f"column in units of {path}", name, columns)
-    channels = dotted(check_table(path, "channels", description.get("channels", {})), usual)
-    inputs = dotted(check_table(path, "inputs", description.get("inputs", {})), usual)
-    extra = dotted(check_table(path, "extra", description.get("extra", {})), poses)
-    time = check_table(path, "time", description.get("time", {}))
+    channels = dotted(get_subtable(path, description, "channels"), usual)
+    inputs = dotted(get_subtable(path, description, "inputs"), usual)
+    extra = dotted(get_subtable(path, description, "extra"), poses)
+    time = get_subtable(path, description, "time")
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
     switches = [switch.column for switch in read_switches(path, description)]

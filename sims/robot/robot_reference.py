@@ -18,6 +18,7 @@ from sims.core.toml_validation import (
     check_name_list,
     check_table,
     check_text,
+    get_subtable,
     make_error,
 )
 from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
@@ -141,8 +142,8 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
         source.parent / check_text(source, "model", document["model"]),
         None if digest is None else check_text(source, "digest", digest),
         check_name_list(source, "free", document.get("free", []), "a list of names"),
-        check_table(source, "actuators", document.get("actuators", {})),
-        check_table(source, "engine", document.get("engine", {})),
+        get_subtable(source, document, "actuators"),
+        get_subtable(source, document, "engine"),
         _check_numerics(source, document.get("numerics", {})),
         _check_friction_form(source, document.get("friction_form", "stiff")),
     )
