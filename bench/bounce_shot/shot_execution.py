@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,10 @@ from bench.benchmark.storage.table_schemas import (
     ColumnSpec,
 )
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_planner import compute_hoop_crossings, simulate_flights
+from bench.bounce_shot.shot_planner import compute_hoop_crossings
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.true_world import InclinedGround, simulate_shot
-from bench.bounce_shot.tuned_shots import (
-    TunedModel,
-    get_planning_constants,
-    get_planning_theta,
-    make_planning_simulator,
-)
+from bench.bounce_shot.tuned_shots import TunedModel, make_planning_model
 from sims.core.files import write_atomically
 from sims.core.plain_values import to_json_value
 from sims.core.simulator import Array, InputError
@@ -79,16 +74,8 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     if not math.isfinite(model.height):
         no_path = np.full((times.size, 3), np.nan)
         return ShotResult(False, float("nan"), float("nan"), times, no_path, no_path)
-    heights = np.array([model.height])
-    constants = get_planning_constants(settings, setup.ball.radius)
-    planned_path = simulate_flights(
-        make_planning_simulator(model),
-        get_planning_theta(model),
-        setup.scene,
-        constants,
-        heights,
-        times,
-    )[0]
+    planning_model = make_planning_model(model, settings, setup.ball.radius)
+    planned_path = planning_model.simulate_flights(setup.scene, np.array([model.height]), times)[0]
     # The true ball, friction and release, which the planner does not know.
     ground = InclinedGround(setup.scene.angle, settings.friction)
     start = (
@@ -130,19 +117,16 @@ def _find_descent_index(path: Array, height: float) -> int:
 
 
 def build_shot_rows(
-    setup: ShotSetup, settings: ShotConfig, models: list[dict[str, Any]]
+    setup: ShotSetup, settings: ShotConfig, models: Sequence[TunedModel]
 ) -> list[dict[str, Any]]:
     """Execute the shot of each method, and build the result rows.
 
     Args:
         setup: setup of the shot: its ball, drop, incline and hoop.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
-        models: fields of the tuned model of each method.
+        models: tuned model of each method.
     """
-    return [
-        _build_shot_row(setup, model, execute_shot(setup, settings, model))
-        for model in (TunedModel(**row) for row in models)
-    ]
+    return [_build_shot_row(setup, model, execute_shot(setup, settings, model)) for model in models]
 
 
 def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
@@ -157,7 +141,6 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
         model: tuned model with the plan.
         result: result of the executed shot.
     """
-    effects: Mapping[str, Any] = model.effects
     return {
         "shot": setup.name,
         "ball": setup.name.rpartition("-")[0],
@@ -171,7 +154,8 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
         "restitution": model.restitution,
         "true_restitution": setup.ball.restitution,
         "effects": "; ".join(
-            f"{name} {', '.join(f'{v:.4g}' for v in values)}" for name, values in effects.items()
+            f"{name} {', '.join(f'{v:.4g}' for v in values)}"
+            for name, values in model.effects.items()
         ),
         "simulations": model.simulations,
         "seconds": model.seconds,
@@ -211,7 +195,7 @@ def store_shot(
     folder: Path,
     setup: ShotSetup,
     settings: ShotConfig,
-    models: list[dict[str, Any]],
+    models: Sequence[TunedModel],
     visible_share: float,
 ) -> None:
     """Execute a shot with the model of every method, and store the result atomically.
@@ -224,7 +208,7 @@ def store_shot(
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
     rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]
-    document = to_json_value({"models": models, "rows": rows})
+    document = to_json_value({"models": [asdict(model) for model in models], "rows": rows})
     write_atomically(
         get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
     )

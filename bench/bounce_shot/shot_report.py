@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import pandas as pd
 
@@ -87,48 +86,32 @@ _FAILED_STATUSES = ("crashed", "timeout")
 """Failures of the method and not of its plan, which make the command fail."""
 
 
-class ReportableShotStudy(Protocol):
-    """Protocol of the studies that can be reported.
-
-    Attributes:
-        folder: result folder.
-    """
-
-    folder: Path
-
-    @property
-    def experiment(self) -> Experiment:
-        """The experiment, with the tuners that can be used here."""
-
-    @property
-    def config(self) -> ShotConfig:
-        """The [shot] table."""
-
-    @property
-    def shots(self) -> list[ShotSetup]:
-        """All planned shots."""
-
-    @property
-    def skipped_tuners(self) -> Mapping[str, str]:
-        """Reasons why tuners cannot be used here, by label."""
-
-
-def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) -> int:
+def write_report(
+    folder: Path,
+    experiment: Experiment,
+    settings: ShotConfig,
+    setups: Sequence[ShotSetup],
+    skipped_tuners: Mapping[str, str],
+    print_line: Callable[[str], None],
+) -> int:
     """Write tables, figures and HTML report from the shots that exist.
 
     It writes the tables (table, shots, status), the figures, the HTML page and an animation of one
     example, and prints the result table and the failures.
 
     Args:
-        study: the study to report.
+        folder: result folder.
+        experiment: the experiment, with the tuners that can be used here.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        setups: all planned shots.
+        skipped_tuners: reasons why tuners cannot be used here, by label.
         print_line: prints a line.
 
     Returns:
         Number of methods and shots that crashed or exceeded their time.
     """
-    folder = study.folder
     stored = {}
-    for setup in study.shots:
+    for setup in setups:
         if (shot := read_shot(folder, setup)) is not None:
             stored[setup.name] = shot
     if not stored:
@@ -138,35 +121,29 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
     for name in _NULLABLE_NUMBERS:
         # A column that is empty has no numeric type.
         shot_rows[name] = pd.to_numeric(shot_rows[name])
-    result_lines = add_trust_column(build_result_table(shot_rows), study.experiment)
-    shot_rows = add_trust_column(shot_rows, study.experiment)
-    statuses = add_trust_column(
-        _build_status_rows(shot_rows, study.skipped_tuners), study.experiment
-    )
+    result_lines = add_trust_column(build_result_table(shot_rows), experiment)
+    shot_rows = add_trust_column(shot_rows, experiment)
+    statuses = add_trust_column(_build_status_rows(shot_rows, skipped_tuners), experiment)
     for name, frame in (("table", result_lines), ("shots", shot_rows), ("status", statuses)):
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
-    pictures = draw_figures(
-        study.experiment, study.config, study.shots, stored, shot_rows, result_lines
-    )
+    pictures = draw_figures(experiment, settings, setups, stored, shot_rows, result_lines)
     figures = [
         figure_output.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
         for name, picture in pictures.items()
     ]
     write_atomically(
         folder / REPORT_FILE,
-        render_page(study.experiment, str(folder), result_lines, shot_rows, pictures),
+        render_page(experiment, str(folder), result_lines, shot_rows, pictures),
     )
-    for example in select_example_shots(study.shots, stored, shot_rows)[:1]:
-        figures.append(
-            write_animation(folder, study.config, example, stored, study.experiment.trusted)
-        )
+    for example in select_example_shots(setups, stored, shot_rows)[:1]:
+        figures.append(write_animation(folder, settings, example, stored, experiment.trusted))
     # Every new folder has an empty journal folder, which a bounce-shot study does not use.
     journal = folder / SEGMENTS_FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
     print_line("\n" + format_result_table(result_lines))
     failed = shot_rows[shot_rows["status"].isin(NO_SHOT_STATUSES)]
-    _print_failures(failed, study.skipped_tuners, print_line)
+    _print_failures(failed, skipped_tuners, print_line)
     print_line(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:
         print_line(f"figure  {figure}")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.tuner_processes import TunerSpec
@@ -48,6 +47,7 @@ from bench.bounce_shot.shot_sampling import (
     draw_shots,
     record_drop,
 )
+from bench.bounce_shot.tuned_shots import TunedModel
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
 from sims.vision import video_files
@@ -184,7 +184,9 @@ class BounceShotStudy(Study):
         """
         from bench.bounce_shot.shot_report import write_report
 
-        return write_report(self, print_line)
+        return write_report(
+            self.folder, self.experiment, self.config, self.shots, self.skipped_tuners, print_line
+        )
 
 
 class _ShotStages:
@@ -311,22 +313,17 @@ class _ShotStages:
         step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
-            self._execute_and_store(
-                index, _make_failed_models(self._experiment, error, status), 0.0
-            )
+            self._store(index, _make_failed_models(self._experiment, error, status), 0.0)
             step()
         for position, models in workers.iterate_results(calls, self._experiment.timeout):
             index = recorded[position]
             if isinstance(models, BaseException):
                 models = _make_failed_models(self._experiment, models)
-            self._execute_and_store(
-                index, models, compute_visible_share(self._paths[index], self._experiment)
-            )
+            visible_share = compute_visible_share(self._paths[index], self._experiment)
+            self._store(index, models, visible_share)
             step()
 
-    def _execute_and_store(
-        self, index: int, models: list[dict[str, Any]], visible_share: float
-    ) -> None:
+    def _store(self, index: int, models: Sequence[TunedModel], visible_share: float) -> None:
         """Execute a shot in the true world with every model, and store the result.
 
         Args:
@@ -341,7 +338,7 @@ class _ShotStages:
 
 def _make_failed_models(
     experiment: Experiment, error: BaseException, status: str = "crashed"
-) -> list[dict[str, Any]]:
+) -> list[TunedModel]:
     """Make failed models for a shot without a recording, or whose worker died or was too slow.
 
     None of them has a plan, so that the shot counts as a miss of every method.
@@ -353,14 +350,6 @@ def _make_failed_models(
     """
     if isinstance(error, TimeoutError):
         status = "timeout"
-    make_failed_model = partial(
-        tuned_shots.TunedModel,
-        effects={},
-        simulations=0,
-        seconds=math.nan,
-        status=status,
-        reason=str(error),
-    )
     labels = [entry.label for entry in experiment.tuners]
     methods = [
         tuned_shots.UNTUNED_METHOD,
@@ -368,4 +357,4 @@ def _make_failed_models(
         tuned_shots.EXPLAIN_METHOD,
         *(label + tuned_shots.EXPLAIN_SUFFIX for label in labels),
     ]
-    return [vars(make_failed_model(method=method, restitution=math.nan)) for method in methods]
+    return [TunedModel(method, math.nan, {}, 0, math.nan, status, str(error)) for method in methods]

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -23,9 +22,9 @@ from bench.benchmark.problem.recording_observations import ObservedRuns, make_sc
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_planner import ShotGeometry, ShotPlan, plan_shot
+from bench.bounce_shot.shot_planner import PlanningModel, ShotGeometry, plan_shot
 from bench.bounce_shot.shot_sampling import build_pixel_runs, make_pixel_experiment
-from sims.core.simulator import Array, InputError, Scenario
+from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.systems.ball import Ball as BallSimulator
 from sims.systems.bounce_shot import BounceShot, ShotSystem
@@ -103,7 +102,7 @@ class ShotInputs:
 
 def tune_and_plan(
     experiment: Experiment, settings: ShotConfig, inputs: ShotInputs
-) -> list[dict[str, Any]]:
+) -> list[TunedModel]:
     """Tune all methods to a recording, and plan a shot with each.
 
     Args:
@@ -112,7 +111,7 @@ def tune_and_plan(
         inputs: input of the methods.
 
     Returns:
-        Fields of a `TunedModel` for each method.
+        The tuned model of each method, with its plan.
     """
     recording = read_recording(inputs.recording, BallSimulator, whole=True)
     models = [TunedModel(UNTUNED_METHOD, _get_nominal_restitution(), {}, 0, 0.0, "done")]
@@ -133,7 +132,7 @@ def tune_and_plan(
             for model in extended_models
         ]
     radius = _get_run_constants(recording)["radius"]
-    return [asdict(_plan_shot(model, settings, inputs.scene, radius)) for model in models]
+    return [_plan_shot(model, settings, inputs.scene, radius) for model in models]
 
 
 def _get_nominal_restitution() -> float:
@@ -319,53 +318,22 @@ def select_transferable_effects(
     return carried
 
 
-def make_planning_simulator(model: TunedModel) -> BounceShot:
-    """Make the simulator in which a shot is planned, a bounce shot with the effects of a model.
+def make_planning_model(model: TunedModel, settings: ShotConfig, radius: float) -> PlanningModel:
+    """Make the model in which a shot is planned: a bounce shot with the effects of a tuned model.
 
     Args:
         model: tuned model; its effects act with fixed coefficients.
-    """
-    return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
-
-
-def get_planning_constants(settings: ShotConfig, radius: float) -> dict[str, float]:
-    """Return the constants of a ball that the planner assumes.
-
-    Args:
-        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        settings: settings of the bounce shot, from the table [shot] of the experiment; they have
+            what the planner assumes of a ball.
         radius: radius of the ball, m.
     """
-    return {
+    constants = {
         "radius": radius,
         "friction": settings.planned_friction,
         "inertia_ratio": settings.planned_inertia,
     }
-
-
-def get_planning_theta(model: TunedModel) -> Array:
-    """Return the parameters of the planning simulator, (1,): the tuned restitution."""
-    return np.array([model.restitution])
-
-
-def plan_shot_in_model(
-    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
-) -> ShotPlan:
-    """Plan a shot in a model.
-
-    Args:
-        model: simulator with the parameters that a tuner has found.
-        settings: settings of the bounce shot, from the table [shot] of the experiment.
-        scene: incline and hoop.
-        radius: radius of the ball, m.
-    """
-    constants = get_planning_constants(settings, radius)
-    return plan_shot(
-        make_planning_simulator(model),
-        get_planning_theta(model),
-        scene,
-        constants,
-        settings.heights,
-    )
+    simulator = BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
+    return PlanningModel(simulator, np.array([model.restitution]), constants)
 
 
 def _plan_shot(
@@ -384,7 +352,7 @@ def _plan_shot(
     """
     if model.status == "crashed":
         return model
-    plan = plan_shot_in_model(model, settings, scene, radius)
+    plan = plan_shot(make_planning_model(model, settings, radius), scene, settings.heights)
     if not plan.is_found and model.status in ("done", "converged"):
         return replace(
             model,

@@ -162,7 +162,7 @@ def test_the_tables_of_the_bounce_shot():
     experiment = load_experiment("bounce-shot")
     settings = read_shot_config(experiment)
     # A shot without a plan is not executed, but its row has all columns.
-    nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
+    nothing = TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan")
     (row,) = build_shot_rows(draw_shots(experiment, settings)[0], settings, [nothing])
     assert [*row, "seen", "trusted"] == list_documented_names("### `shots.csv`")
 

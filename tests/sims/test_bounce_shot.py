@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from bench.bounce_shot.shot_config import BALL_KINDS, get_ball_kind
 from bench.bounce_shot.shot_planner import (
+    PlanningModel,
     ShotGeometry,
     compute_hoop_crossings,
     compute_rim_margins,
@@ -112,12 +113,14 @@ def scene_at(height, drop=0.1, kept=1.0, radius=0.15):
     return ShotGeometry(ANGLE, landing(height, drop, kept), touching - drop, radius)
 
 
-KNOWN = {"radius": RADIUS, "friction": 0.0}
+def planned(restitution=E, friction=0.0):
+    known = {"radius": RADIUS, "friction": friction}
+    return PlanningModel(BounceShot(), np.array([restitution]), known)
 
 
 @pytest.mark.parametrize("height", [0.6, 1.3, 2.4])
 def test_planner_finds_the_height_of_the_closed_form(height):
-    found = plan_shot(BounceShot(), np.array([E]), scene_at(height), KNOWN, HEIGHTS)
+    found = plan_shot(planned(), scene_at(height), HEIGHTS)
     assert found.height == pytest.approx(height, abs=1e-3)
     assert found.rim_margin == pytest.approx(0.15, abs=1e-3)
 
@@ -127,27 +130,23 @@ def test_level_launch_and_landing_need_a_height_in_proportion_to_the_distance():
     vx, vz = launch(1.0, kept=5 / 7)
     x = 4 * vx * vz / (2 * GRAVITY)
     scene = ShotGeometry(ANGLE, 1.1, RADIUS / math.cos(ANGLE), 0.1)
-    found = plan_shot(
-        BounceShot(), np.array([E]), scene, {"radius": RADIUS, "friction": 1.0}, HEIGHTS
-    )
+    found = plan_shot(planned(friction=1.0), scene, HEIGHTS)
     assert found.height == pytest.approx(1.1 / x, abs=1e-3)
 
 
 def test_hoop_out_of_reach_is_a_plan_that_expects_to_miss_and_dead_ball_none():
     far = ShotGeometry(ANGLE, 9.0, -0.1, 0.15)
-    found = plan_shot(BounceShot(), np.array([E]), far, KNOWN, HEIGHTS)
+    found = plan_shot(planned(), far, HEIGHTS)
     assert found.is_found
     assert found.height == pytest.approx(3.0, abs=1e-9)
     assert found.rim_margin == pytest.approx(
         0.15 - (9.0 - landing(3.0, 0.1 + RADIUS / math.cos(ANGLE))), abs=1e-3
     )
-    dead = plan_shot(
-        BounceShot(), np.array([0.0]), ShotGeometry(ANGLE, 1.0, 0.2, 0.15), KNOWN, HEIGHTS
-    )
+    dead = plan_shot(planned(0.0), ShotGeometry(ANGLE, 1.0, 0.2, 0.15), HEIGHTS)
     assert not dead.is_found
     assert math.isnan(dead.rim_margin)
     with pytest.raises(InputError, match="drop heights above 0"):
-        plan_shot(BounceShot(), np.array([E]), far, KNOWN, (2.0, 1.0))
+        plan_shot(planned(), far, (2.0, 1.0))
 
 
 def test_where_a_path_comes_through_the_hoop_counts_after_its_bounce():

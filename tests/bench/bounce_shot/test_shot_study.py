@@ -251,8 +251,8 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     path = tmp_path / "drop.csv"
     record_drop(experiment, dealt, settings, path)
     made = {
-        row["method"]: TunedModel(**row)
-        for row in tune_and_plan(experiment, settings, ShotInputs("x", path, dealt.scene, {}))
+        model.method: model
+        for model in tune_and_plan(experiment, settings, ShotInputs("x", path, dealt.scene, {}))
     }
     assert list(made) == ["nominal", "least_squares", "explain"]
     assert made["nominal"].restitution == 0.5
