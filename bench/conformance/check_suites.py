@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.benchmark.runner.plugin_discovery import Plugin
 from bench.benchmark.runner.worker_pools import LocalPool
 from bench.conformance.check_base import CALL_TIMEOUT_SECONDS, Check, CheckError
-from bench.conformance.diagnoser_checks import DIAGNOSER_CHECKS, DIAGNOSER_NEEDS
-from bench.conformance.effect_checks import EFFECT_CHECKS, EFFECT_NEEDS
-from bench.conformance.simulator_checks import SIMULATOR_CHECKS, SIMULATOR_NEEDS
+from bench.conformance.diagnoser_checks import DIAGNOSER_CHECKS
+from bench.conformance.effect_checks import EFFECT_CHECKS
+from bench.conformance.simulator_checks import SIMULATOR_CHECKS
 from bench.conformance.tuner_checks import (
     TUNER_CHECKS,
-    TUNER_NEEDS,
     check_same_run_in_other_processes,
 )
 from bench.core.diagnoser import Diagnoser
@@ -33,22 +32,17 @@ if TYPE_CHECKING:
     import pytest
 
 
-SUITES: dict[str, tuple[Check, ...]] = {
+SUITES: dict[str, Mapping[Check, tuple[Check, ...]]] = {
     "tuner": TUNER_CHECKS,
     "simulator": SIMULATOR_CHECKS,
     "effect": EFFECT_CHECKS,
     "diagnoser": DIAGNOSER_CHECKS,
 }
-NEEDS: Mapping[Check, tuple[Check, ...]] = {
-    **TUNER_NEEDS,
-    **SIMULATOR_NEEDS,
-    **EFFECT_NEEDS,
-    **DIAGNOSER_NEEDS,
-}
-"""For each check, the checks that must pass for it to be meaningful.
+"""Checks of each kind of subject, each with those that must pass for it to be meaningful.
 
 One cause then gives one failure.
 """
+_NEEDS = {check: needed for suite in SUITES.values() for check, needed in suite.items()}
 
 _BASES: dict[str, type] = {
     "tuner": Tuner,
@@ -73,7 +67,7 @@ def failed_need(check: Check, failed: Collection[Check]) -> Check | None:
     Returns:
         The failed check, or None.
     """
-    for needed_check in NEEDS.get(check, ()):
+    for needed_check in _NEEDS[check]:
         if needed_check in failed:
             return needed_check
         if (root := failed_need(needed_check, failed)) is not None:
@@ -81,8 +75,8 @@ def failed_need(check: Check, failed: Collection[Check]) -> Check | None:
     return None
 
 
-def get_suite(subject: type) -> tuple[Check, ...]:
-    """Return the checks for a class.
+def get_suite(subject: type) -> Mapping[Check, tuple[Check, ...]]:
+    """Return the checks for a class, each with those that it needs.
 
     Raises:
         InputError: the class is not a tuner, simulator, effect or diagnoser.
@@ -163,18 +157,33 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
 
 _MULTIPROCESS_CHECKS = (check_same_run_in_other_processes,)
 """Checks that start worker processes themselves."""
-_EXPECTED_FAILURE_PREFIX = "known: "
-"""Prefix of the line of a check that fails on purpose."""
-_NOT_APPLICABLE_PREFIX = "not applicable: "
-"""Prefix of the line of a check that does not apply to the subject."""
-_LEFT_OUT = "not tested: "
-"""Prefix of the line of a check that was not run."""
-_OUTCOMES = {
-    _EXPECTED_FAILURE_PREFIX: ("known", "known "),
-    _NOT_APPLICABLE_PREFIX: ("not applicable", "-     "),
-    _LEFT_OUT: ("not tested", "-     "),
+_OUTCOME_LABELS = {
+    "passed": "ok    ",
+    "failed": "FAILED",
+    "known": "known ",
+    "not applicable": "-     ",
+    "not tested": "-     ",
 }
-"""Outcome for programs and label for people, by the prefix of a line."""
+"""Label for people by outcome."""
+
+
+class CheckResult(NamedTuple):
+    """Result of a check.
+
+    Attributes:
+        outcome: ``passed``, ``failed``, ``known`` for a failure that the subject announces, ``not
+            applicable`` or ``not tested``.
+        reason: what failed, or why the check was not run; empty if it passed.
+    """
+
+    outcome: str
+    reason: str = ""
+
+    @property
+    def says(self) -> str:
+        """Outcome, if it is neither passed nor failed, and reason."""
+        is_run = self.outcome in ("passed", "failed")
+        return self.reason if is_run else f"{self.outcome}: {self.reason}"
 
 
 class SuiteResult(NamedTuple):
@@ -184,28 +193,28 @@ class SuiteResult(NamedTuple):
         name: name of the subject.
         kind: tuner, simulator, effect or diagnoser.
         qualified: qualified name of its class.
-        lines: line of each check by its title; empty if the check passed.
+        results: result of each check by its title.
     """
 
     name: str
     kind: str
     qualified: str
-    lines: dict[str, str]
+    results: dict[str, CheckResult]
 
     @property
     def has_passed(self) -> bool:
         """True if no check failed."""
-        return all(_classify_line(line)[0] != "failed" for line in self.lines.values())
+        return all(result.outcome != "failed" for result in self.results.values())
 
     def to_document(self) -> dict[str, Any]:
         """Convert the results of the conformance checks to a JSON document.
 
-        Each check has its title, its outcome (passed, failed, not tested, not applicable) and the
-        line that was printed.
+        Each check has its title, its outcome (passed, failed, known, not tested, not applicable)
+        and the line that was printed.
         """
         checks = [
-            {"check": title, "outcome": _classify_line(line)[0], "says": line.strip()}
-            for title, line in self.lines.items()
+            {"check": title, "outcome": result.outcome, "says": result.says}
+            for title, result in self.results.items()
         ]
         return {
             "name": self.name,
@@ -233,33 +242,37 @@ def _get_subject(kind: str, name: str) -> Any:
     return {registry.kind: registry for registry in REGISTRIES}[kind].get(name)
 
 
-def run_check(kind: str, name: str, place: int) -> str:
+def run_check(kind: str, name: str, check: Check) -> CheckResult:
     """Run one check in this process.
 
     Args:
         kind: kind of the subject.
         name: name of the subject.
-        place: index of the check in its suite.
-
-    Returns:
-        Description of the failure, or an empty text.
+        check: the check.
     """
-    check, subject = SUITES[kind][place], _get_subject(kind, name)
+    subject = _get_subject(kind, name)
     known_failure = getattr(subject, "known_failures", {}).get(check.__name__)
     try:
         outcome = check(subject)
     except CheckError as error:
-        return f"{_EXPECTED_FAILURE_PREFIX}{known_failure}" if known_failure else str(error)
+        return CheckResult("known", known_failure) if known_failure else _make_failure(error)
     except InputError as error:
-        return str(error)
+        return _make_failure(error)
     except Exception as error:
         location = _describe_raise_location(error)
-        return f"expected no exception; found {type(error).__name__}: {error}; {location}"
+        return _make_failure(
+            f"expected no exception; found {type(error).__name__}: {error}; {location}"
+        )
     if known_failure:
-        return (
+        return _make_failure(
             f"expected to fail ({known_failure}); found that it passes; see {name}.known_failures"
         )
-    return f"{_NOT_APPLICABLE_PREFIX}{outcome.reason}" if outcome else ""
+    return CheckResult("not applicable", outcome.reason) if outcome else CheckResult("passed")
+
+
+def _make_failure(reason: object) -> CheckResult:
+    """Make the result of a failed check, with the further lines of its reason indented."""
+    return CheckResult("failed", str(reason).strip().replace("\n", "\n        "))
 
 
 def _describe_raise_location(error: Exception) -> str:
@@ -285,12 +298,13 @@ def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], Non
     """
     kind = find_part_kind(name)
     subject = _get_subject(kind, name)
-    lines = {}
-    for check, line in _run_all_checks(kind, name, plugins):
-        lines[title_of(check)] = line
-        error_text = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
-        print_line(f"{_classify_line(line)[1]}  {title_of(check)}{error_text}")
-    checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
+    results = {}
+    for check, result in _run_all_checks(kind, name, plugins):
+        results[title_of(check)] = result
+        line = result.reason if result.outcome == "known" else result.says
+        error_text = f"\n        {line}" if line else ""
+        print_line(f"{_OUTCOME_LABELS[result.outcome]}  {title_of(check)}{error_text}")
+    checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", results)
     print_line(f"{kind} {name} ({checked.qualified}): {_summarise_checks(checked)}")
     return checked
 
@@ -299,12 +313,12 @@ def _summarise_checks(checked: SuiteResult) -> str:
     """Summarise how many checks failed and how many were not run.
 
     Args:
-        checked: Result of all checks of one subject, with one printed line per check.
+        checked: Result of all checks of one subject.
 
     Returns:
         One line, such as "2 of 14 checks failed, 3 not applicable".
     """
-    outcomes = [_classify_line(line)[0] for line in checked.lines.values()]
+    outcomes = [result.outcome for result in checked.results.values()]
     unrun_counts = {
         outcome: outcomes.count(outcome) for outcome in ("not tested", "not applicable")
     }
@@ -317,16 +331,10 @@ def _summarise_checks(checked: SuiteResult) -> str:
     return f"all {checked_count} checks passed{other_counts}"
 
 
-def _classify_line(line: str) -> tuple[str, str]:
-    """Return outcome and label of the check with a line; an empty line is a passed check."""
-    for prefix, outcome_and_label in _OUTCOMES.items():
-        if line.startswith(prefix):
-            return outcome_and_label
-    return ("failed", "FAILED") if line else ("passed", "ok    ")
-
-
-def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
-    """Run the checks one after another, and yield each with its line (empty if it passed).
+def _run_all_checks(
+    kind: str, name: str, plugins: Sequence[str]
+) -> Iterator[tuple[Check, CheckResult]]:
+    """Run the checks one after another, and yield each with its result.
 
     After two checks that were killed or whose process died, no more checks are run.
 
@@ -339,43 +347,41 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
     lost_workers = 0
     with LocalPool(1) as pool:
         pool.load_plugins([Plugin(path) for path in plugins])
-        for place, check in enumerate(SUITES[kind]):
+        for check in SUITES[kind]:
             failed_check = failed_need(check, failed)
             if failed_check is not None:
-                line = f"{_LEFT_OUT}needs '{title_of(failed_check)}'"
+                result = CheckResult("not tested", f"needs '{title_of(failed_check)}'")
             elif lost_workers == 2 or (lost_workers and check in _MULTIPROCESS_CHECKS):
-                line = f"{_LEFT_OUT}the process of other checks ended or was killed"
+                result = CheckResult(
+                    "not tested", "the process of other checks ended or was killed"
+                )
             elif check in _MULTIPROCESS_CHECKS:
                 # This check runs the subject in this process too; earlier checks have shown that
                 # this is safe.
-                line = run_check(kind, name, place)
+                result = run_check(kind, name, check)
             else:
                 ((_, end),) = pool.iterate_results(
-                    [(run_check, (kind, name, place))], CALL_TIMEOUT_SECONDS
+                    [(run_check, (kind, name, check))], CALL_TIMEOUT_SECONDS
                 )
                 lost_workers += isinstance(end, Exception) and not isinstance(end, InputError)
-                line = _format_check_end(end)
-            if _classify_line(line)[0] == "failed":
+                result = end if isinstance(end, CheckResult) else _describe_lost_check(end)
+            if result.outcome == "failed":
                 failed.append(check)
-            yield check, line.strip().replace("\n", "\n        ")
+            yield check, result
 
 
-def _format_check_end(end: Any) -> str:
-    """Return the line of a check that ran in a worker process.
+def _describe_lost_check(error: Exception) -> CheckResult:
+    """Return the result of a check that has not ended in its worker process.
 
     Args:
-        end: Result of the process: the finished line of the check, or the exception that ended it.
-
-    Returns:
-        The line to print: an error line if the check timed out, the input was wrong, or the process
-        died.
+        error: Timeout, wrong input, or the death of the process.
     """
-    if isinstance(end, TimeoutError):
-        return (
+    if isinstance(error, TimeoutError):
+        return _make_failure(
             f"expected an end within {CALL_TIMEOUT_SECONDS:g} s; found none; see what it waits for"
         )
-    if isinstance(end, InputError):
-        return str(end)
-    if isinstance(end, Exception):
-        return f"expected the process to survive; found {type(end).__name__}: {end}; see its output"
-    return str(end)
+    if isinstance(error, InputError):
+        return _make_failure(error)
+    return _make_failure(
+        f"expected the process to survive; found {type(error).__name__}: {error}; see its output"
+    )

@@ -341,19 +341,14 @@ def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | Non
     return None
 
 
-DIAGNOSER_CHECKS: tuple[Check, ...] = (
-    check_answers,
-    check_names_what_there_is,
-    check_same_answer_again,
-    check_leaves_the_recording_alone,
-    check_leaves_global_chance_alone,
-    check_keeps_to_its_budget,
-    check_takes_missing_samples,
-    check_learns_within_its_budget,
-)
-"""All checks of diagnosers, in the order in which they run."""
-
-DIAGNOSER_NEEDS: Mapping[Check, tuple[Check, ...]] = dict.fromkeys(
-    DIAGNOSER_CHECKS[1:], (check_answers,)
-)
-"""For each check, the checks that must pass for it to be meaningful."""
+DIAGNOSER_CHECKS: Mapping[Check, tuple[Check, ...]] = {
+    check_answers: (),
+    check_names_what_there_is: (check_answers,),
+    check_same_answer_again: (check_answers,),
+    check_leaves_the_recording_alone: (check_answers,),
+    check_leaves_global_chance_alone: (check_answers,),
+    check_keeps_to_its_budget: (check_answers,),
+    check_takes_missing_samples: (check_answers,),
+    check_learns_within_its_budget: (check_answers,),
+}
+"""Checks in the order in which they run, each with those that must pass for it to be meaningful."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
 from bench.conformance.robot_place_checks import (
-    PLACE_CHECKS,
+    check_batch_independence,
     check_family_is_the_sum_of_its_members,
     check_it_acts_at_its_place_alone,
     check_lanes_of_a_robot_are_independent,
@@ -287,21 +287,13 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
     """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
-        simulator, scenario = _make_simulator_with_effect(host, effect), _make_scenario(host.system)
+        simulator = _make_simulator_with_effect(host, effect)
         # Shares of the ranges of the parameters.
         parameter_sets = np.concatenate(
             [_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)]
         )
-        batch_result = simulator.simulate(parameter_sets, scenario)
-        single_results = np.concatenate(
-            [simulator.simulate(parameter_set[None], scenario) for parameter_set in parameter_sets]
-        )
-        check(
-            is_bitwise_equal(batch_result, single_results),
-            "bitwise equal results alone and in a batch",
-            "others",
-            effect.__name__,
-        )
+        scenario = _make_scenario(host.system)
+        check_batch_independence(simulator, parameter_sets, scenario, effect.__name__)
     return None if hosts else NO_SUPPORTING_SYSTEM
 
 
@@ -333,16 +325,8 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | 
 
 NO_SUPPORTING_SYSTEM = NotApplicable("no registered system supports it")
 
-EFFECT_CHECKS: tuple[Check, ...] = (
-    check_declaration_is_complete,
-    check_contribution_is_nothing_at_zero,
-    check_it_shows_and_stays_finite,
-    check_lanes_are_independent,
-    check_impossible_hosts_are_refused,
-    *PLACE_CHECKS,
-)
-
-EFFECT_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+EFFECT_CHECKS: Mapping[Check, tuple[Check, ...]] = {
+    check_declaration_is_complete: (),
     check_contribution_is_nothing_at_zero: (check_declaration_is_complete,),
     check_it_shows_and_stays_finite: (check_declaration_is_complete,),
     check_lanes_are_independent: (check_declaration_is_complete,),
@@ -362,4 +346,4 @@ EFFECT_NEEDS: Mapping[Check, tuple[Check, ...]] = {
         check_lanes_are_independent,
     ),
 }
-"""For each check, the checks that must pass for it to be meaningful."""
+"""Checks in the order in which they run, each with those that must pass for it to be meaningful."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
+from bench.conformance.check_base import CheckError, NotApplicable, check, is_bitwise_equal
 from bench.conformance.sample_subjects import (
     OBSERVED_CHANNELS,
     list_effect_places,
@@ -22,7 +22,7 @@ from sims.core.effect import (
     ModelValueEffect,
     Sensor,
 )
-from sims.core.simulator import Array, InputError
+from sims.core.simulator import Array, InputError, Scenario, Simulator
 
 NO_PLACE = NotApplicable("a robot has no place for it")
 _TESTED_RANGE_SHARES = (0.3, 0.9)
@@ -213,22 +213,33 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
             row[:, start:end] = _make_coefficients(effect_class, share)
             parameter_rows.append(row)
         start = end
-    lanes = np.concatenate(parameter_rows)
-    batch_result = simulator.simulate(lanes, make_scenario())
-    single_results = np.concatenate(
-        [simulator.simulate(row, make_scenario()) for row in parameter_rows]
-    )
-    reversed_result = simulator.simulate(lanes[::-1], make_scenario())[::-1]
-    is_same = is_bitwise_equal(batch_result, single_results) and is_bitwise_equal(
-        batch_result, np.ascontiguousarray(reversed_result)
-    )
-    check(
-        is_same,
-        "bitwise equal results alone, in a batch and in any order",
-        "others",
-        effect.__name__,
+    check_batch_independence(
+        simulator, np.concatenate(parameter_rows), make_scenario(), effect.__name__
     )
     return None if classes else NO_PLACE
+
+
+def check_batch_independence(
+    simulator: Simulator, parameter_sets: Array, scenario: Scenario, location: str
+) -> None:
+    """Check that a simulation depends neither on the others of its batch nor on their order.
+
+    Args:
+        simulator: simulator with the effect.
+        parameter_sets: (n, P) parameters.
+        scenario: run to simulate.
+        location: where the author of the effect should look.
+
+    Raises:
+        CheckError: the observations are not equal bit for bit.
+    """
+    batch_result = simulator.simulate(parameter_sets, scenario)
+    single_results = [simulator.simulate(row[None], scenario) for row in parameter_sets]
+    reversed_result = simulator.simulate(parameter_sets[::-1], scenario)[::-1]
+    is_same = is_bitwise_equal(batch_result, np.concatenate(single_results)) and is_bitwise_equal(
+        batch_result, np.ascontiguousarray(reversed_result)
+    )
+    check(is_same, "bitwise equal results alone, in a batch and in any order", "others", location)
 
 
 def _make_coefficients(effect: type[Effect], share: float) -> Array:
@@ -343,12 +354,3 @@ def _find_forced_coordinates(
     else:
         force = effect.force(c, moment)
     return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
-
-
-PLACE_CHECKS: tuple[Check, ...] = (
-    check_places_are_declared,
-    check_nothing_at_zero_at_a_place,
-    check_it_acts_at_its_place_alone,
-    check_family_is_the_sum_of_its_members,
-    check_lanes_of_a_robot_are_independent,
-)
