@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from bench.benchmark.isolation.isolation_layers import RunEndedError, import_resource_module
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
@@ -46,6 +46,7 @@ from bench.benchmark.runner.worker_pools import (
     WorkerDiedError,
     make_pool,
 )
+from bench.benchmark.storage.run_journal import RunJournal
 from bench.benchmark.storage.run_status import RunStatus
 from bench.core.plugin_registries import PartUnavailableError, Registry, effects, simulators, tuners
 from sims.core.simulator import InputError
@@ -62,28 +63,8 @@ def no_progress(_title: str, _steps: int) -> Callable[[], None]:
     return lambda: None
 
 
-class RunSink(Protocol):
-    """Storage of finished runs by their index in the plan.
-
-    Attributes:
-        statuses: status of each stored run.
-    """
-
-    statuses: dict[int, RunStatus]
-
-    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
-        """Store the rows and the status of a finished run.
-
-        Args:
-            place: index of the run in the plan.
-            columns: rows of runs.parquet.
-            status: status of the run.
-        """
-        ...
-
-
 class MemoryRunSink:
-    """Storage of finished runs in memory."""
+    """Storage of finished runs in memory, by their index in the plan."""
 
     def __init__(self) -> None:
         self.columns: dict[int, Mapping[str, Any]] = {}
@@ -120,7 +101,7 @@ class ExperimentRun:
     """
 
     problem: TuningProblem
-    run_sink: RunSink = field(default_factory=MemoryRunSink)
+    run_sink: MemoryRunSink | RunJournal = field(default_factory=MemoryRunSink)
     plan: list[PlannedRun] = field(default_factory=list)
     trainings: dict[tuple[str, int], TrainingResult] = field(default_factory=dict)
     spectra: dict[str, InformationSpectrum] = field(default_factory=dict)
