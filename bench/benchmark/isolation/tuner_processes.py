@@ -44,7 +44,7 @@ from bench.benchmark.isolation.message_channel import (
     pack_arrays,
     to_printable,
 )
-from methods.tuner import Array, Evaluation, Proposal, Task
+from methods.tuner import Array, Proposal, Task, TunerGenerator
 from sims.core.files import lock_file
 from sims.engines.compiled import machine_code as compiled
 
@@ -593,42 +593,29 @@ class IsolatedRun:
     stream: NDArray[np.uint32]
     seconds: float
 
-    def tune(self, task: Task, _: np.random.Generator) -> IsolatedSteps:
-        """Start the run; its random numbers are drawn in the isolated process.
+    def tune(self, task: Task, _: np.random.Generator) -> TunerGenerator:
+        """Run the tuner; its random numbers are drawn in the isolated process.
+
+        The process starts the tuner when it has got the task. When the generator is closed while
+        the tuner waits for an evaluation, the tuner is closed, too, and the process may serve
+        another run.
 
         Args:
-            task: task of the target.
+            task: task of the target; its budget is limited to 2^62, so that it fits into an int64.
             _: not used.
+
+        Yields:
+            Points to simulate.
+
+        Returns:
+            Reason for which the tuner has stopped.
+
+        Raises:
+            RunEndedError: a message is not valid, the process failed, or the time limit was
+                reached.
         """
-        return IsolatedSteps(self.tuner.child, task, self.stream, self.seconds)
-
-
-class IsolatedSteps:
-    """Run of an isolated tuner, with the methods of the generator `tuner.TunerGenerator`."""
-
-    def __init__(
-        self, child: IsolatedProcess, task: Task, stream: NDArray[np.uint32], seconds: float
-    ) -> None:
-        """Prepare the run; the process gets the task with the first `next`.
-
-        `_deadline` is the end of the whole run, `_farewell` the seconds allowed for closing the
-        tuner. `_waits` is True while the process waits for an evaluation. `_limit` is the maximum
-        size of a proposal message in bytes: 8 per float64, for all points of the budget and a
-        recommendation.
-        """
-        self._child, self._task, self._stream = child, task, stream
-        self._deadline = perf_counter() + seconds
-        self._farewell = min(seconds, _CLOSE_TIMEOUT_SECONDS)
-        self._affinity_controller = AffinityController()
-        self._waits = False
-        self._limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
-
-    def __next__(self) -> Array | Proposal:
-        """Send the task to the process, which starts the tuner, and return the first proposal.
-
-        The budget is limited to 2^62, so that it fits into an int64.
-        """
-        task = self._task
+        child, deadline = self.tuner.child, perf_counter() + self.seconds
+        affinity_controller = AffinityController()
         packed_arrays = pack_arrays(
             {
                 "start": task.start,
@@ -639,74 +626,77 @@ class IsolatedSteps:
                 "lengths": np.array(task.lengths, dtype=np.int64),
                 "initial": task.scene.initial,
                 "inputs": task.scene.inputs,
-                "stream": self._stream.astype(np.int64),
+                "stream": self.stream.astype(np.int64),
             }
         )
-        self._child.send(b"T", *packed_arrays, deadline=self._deadline)
-        return self._receive_answer()
+        child.send(b"T", *packed_arrays, deadline=deadline)
+        try:
+            while True:
+                answer = self._receive_answer(task, deadline)
+                if isinstance(answer, str):
+                    return answer
+                try:
+                    evaluation = yield answer
+                except GeneratorExit:
+                    self._close_tuner()
+                    raise
+                child.send(
+                    b"E",
+                    evaluation.proposals.tobytes(),
+                    evaluation.losses.tobytes(),
+                    evaluation.observations.tobytes(),
+                    # They tell the process on which processor to run.
+                    flags=affinity_controller.record_exchange(),
+                    size=len(evaluation.losses),
+                    deadline=deadline,
+                )
+        finally:
+            affinity_controller.release_affinity()
 
-    def send(self, evaluation: Evaluation) -> Array | Proposal:
-        """Send an evaluation to the tuner, and return its next proposal.
-
-        It has the losses and observations of the last proposal. The flags tell the process on which
-        processor to run, see `AffinityController`.
-        """
-        flags = self._affinity_controller.record_exchange()
-        # False until the next proposal: if this fails, the process has been ended.
-        self._waits = False
-        self._child.send(
-            b"E",
-            evaluation.proposals.tobytes(),
-            evaluation.losses.tobytes(),
-            evaluation.observations.tobytes(),
-            flags=flags,
-            size=len(evaluation.losses),
-            deadline=self._deadline,
-        )
-        return self._receive_answer()
-
-    def _receive_answer(self) -> Array | Proposal:
-        """Receive the tuner's answer: points to simulate (A), or the end of its run (S).
+    def _receive_answer(self, task: Task, deadline: float) -> Array | Proposal | str:
+        """Receive the tuner's answer: points to simulate (A), or the reason of its end (S).
 
         The body of a message ``A`` is [recommended point (dim,), if flags is 1] and then n points
         (n, dim), with n in the field `size`. Any other message ends the process, because code of a
         tuner may send any bytes.
 
+        Args:
+            task: task of the target.
+            deadline: end of the whole run.
+
         Raises:
-            StopIteration: the tuner has stopped; the value is its reason.
             RunEndedError: the message is not valid, the process failed, or the time limit was
                 reached.
         """
-        message = self._child.receive(max(self._limit, MAX_TEXT_BYTES), self._deadline)
+        child = self.tuner.child
+        # 8 bytes per float64, for all points of the budget and a recommendation.
+        limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
+        message = child.receive(max(limit, MAX_TEXT_BYTES), deadline)
         if message.kind == b"S":
-            raise StopIteration(message.to_text())
-        dim, point_count = self._task.dim, message.size
+            return message.to_text()
+        dim, point_count = task.dim, message.size
         try:
             coordinates = message.to_array()
         except ProtocolError as error:
-            raise self._child.fail_with_protocol_error(str(error)) from None
+            raise child.fail_with_protocol_error(str(error)) from None
         recommends = message.flags == 1
         if (
             message.kind != b"A"
             or not point_count
             or coordinates.size != (point_count + recommends) * dim
         ):
-            raise self._child.fail_with_protocol_error("it requested no points")
-        # The tuner now waits for the evaluation of these points.
-        self._waits = True
+            raise child.fail_with_protocol_error("it requested no points")
         if recommends:
             return Proposal(coordinates[dim:].reshape(point_count, dim), coordinates[:dim])
         return coordinates.reshape(point_count, dim)
 
-    def close(self) -> None:
-        """End the run; the process may serve another one.
+    def _close_tuner(self) -> None:
+        """Close the tuner, which waits for an evaluation.
 
         Raises:
             RunEndedError: the tuner failed while it was closed.
         """
-        self._affinity_controller.release_affinity()
-        if self._waits:
-            self._waits = False
-            deadline = perf_counter() + self._farewell
-            self._child.send(b"C", deadline=deadline)
-            self._child.receive(deadline=deadline)
+        child = self.tuner.child
+        deadline = perf_counter() + min(self.seconds, _CLOSE_TIMEOUT_SECONDS)
+        child.send(b"C", deadline=deadline)
+        child.receive(deadline=deadline)

@@ -12,15 +12,16 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.message_channel import to_points
-from methods.tuner import Array, Evaluation, Proposal, Task
+from methods.tuner import Array, Evaluation, Proposal, Task, Tuner, TunerGenerator
 
 if TYPE_CHECKING:
+    from bench.benchmark.isolation.tuner_processes import IsolatedRun
     from bench.benchmark.problem.recording_observations import ObservedRuns
     from bench.benchmark.problem.tuning_problem import TuningProblem
 
@@ -30,28 +31,6 @@ Evaluate = Callable[[Array], "tuple[Array, Array]"]
 
 It returns observations (n, T, C) and losses (n,).
 """
-
-
-class TunerRun(Protocol):
-    """Run of a tuner, in this process or in another one; see `methods.tuner.TunerGenerator`."""
-
-    def __next__(self) -> Array | Proposal: ...
-
-    def send(self, evaluation: Evaluation, /) -> Array | Proposal:
-        """Send an evaluation to the tuner and return its next proposal."""
-        ...
-
-    def close(self) -> None:
-        """End the run."""
-        ...
-
-
-class RunnableTuner(Protocol):
-    """Tuner that can be run: a `methods.tuner.Tuner`, or one in another process."""
-
-    def tune(self, task: Task, rng: np.random.Generator, /) -> TunerRun:
-        """Start a run on a target."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -208,7 +187,7 @@ class _RunRecord:
 
 
 def drive_tuner(
-    tuner: RunnableTuner,
+    tuner: Tuner | IsolatedRun,
     task: Task,
     evaluate: Evaluate,
     rng: np.random.Generator,
@@ -223,7 +202,7 @@ def drive_tuner(
     which the loop ends becomes the status of the run.
 
     Args:
-        tuner: tuner, trained if it needs training.
+        tuner: tuner, trained if it needs training, in this process or in another one.
         task: task of the target, without its true parameters.
         evaluate: function that simulates points and computes their losses.
         rng: random generator of the run.
@@ -266,7 +245,7 @@ def drive_tuner(
 
 
 def _run_ask_tell_loop(
-    steps: TunerRun, task: Task, evaluate: Evaluate, record: _RunRecord, deadline: float
+    steps: TunerGenerator, task: Task, evaluate: Evaluate, record: _RunRecord, deadline: float
 ) -> tuple[str, str]:
     """Simulate the tuner's proposals until the budget or the time limit is reached.
 
@@ -317,7 +296,7 @@ def _run_ask_tell_loop(
         proposed = steps.send(Evaluation(points, observations, losses))
 
 
-def _close_generator(steps: TunerRun | None) -> str:
+def _close_generator(steps: TunerGenerator | None) -> str:
     """Close a tuner's generator, and return the traceback of an error in it, or an empty text.
 
     Args:
