@@ -36,6 +36,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from methods.learning.network_training import check_shapes
 from methods.learning.observation_features import (
     ObservationFeatures,
     make_raw_features,
@@ -453,40 +454,34 @@ class InputFeatures:
         Raises:
             ValueError: arrays are missing or have other shapes, or numbers that are not finite.
         """
-        remaining_arrays = {
-            name: np.array(array, dtype=np.float64) for name, array in state.items()
+        arrays = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
+        own_arrays = {
+            name: arrays.pop(name) for name in state if name.startswith(("inputs.", "told."))
         }
-        names = [f"inputs.{name}" for name in _OBSERVATION_FEATURE_ARRAYS]
-        if any(name.startswith("told.") for name in remaining_arrays):
-            names += [f"told.{name}" for name in _SCENARIO_FEATURE_ARRAYS]
-        # The shape of one array of each part determines the shapes of the others.
+        # The size of one array of each part determines the shapes of the others.
         sizes = {
-            part: remaining_arrays.get(f"{part}.centre", _MISSING_ARRAY).shape
+            part: own_arrays.get(f"{part}.centre", _MISSING_ARRAY).size
             for part in ("inputs", "told")
         }
-        for name in names:
-            shape = () if name == "told.initial" else sizes[name.partition(".")[0]]
-            if name not in remaining_arrays:
-                raise ValueError(f"expected array {name}, found {sorted(state)[:4]}")
-            array = remaining_arrays[name]
-            if array.shape != shape or len(shape) > 1 or not np.isfinite(array).all():
-                raise ValueError(
-                    f"array {name}: expected finite numbers of shape {shape}, found {array.shape}"
-                )
-        if not sizes["inputs"][0] + sum(sizes["told"]):
+        shapes: dict[str, tuple[int, ...]] = {
+            f"inputs.{name}": (sizes["inputs"],) for name in _OBSERVATION_FEATURE_ARRAYS
+        }
+        has_scenario_features = any(name.startswith("told.") for name in own_arrays)
+        if has_scenario_features:
+            shapes |= {f"told.{name}": (sizes["told"],) for name in _SCENARIO_FEATURE_ARRAYS}
+            shapes["told.initial"] = ()
+        chosen_numbers, centre, gain, *scenario_arrays = check_shapes(own_arrays, shapes).values()
+        if not sum(sizes.values()):
             raise ValueError("expected a network with inputs, found one without")
-        chosen_numbers, centre, gain, *scenario_arrays = (
-            remaining_arrays.pop(name) for name in names
-        )
         observation_features = ObservationFeatures(
             reading.points, reading.raw, chosen_numbers, centre, gain
         )
         scenario_features = (
             ScenarioFeatures(scenario_arrays[0], scenario_arrays[1], int(scenario_arrays[2]))
-            if scenario_arrays
+            if has_scenario_features
             else None
         )
-        return cls(reading, observation_features, scenario_features), remaining_arrays
+        return cls(reading, observation_features, scenario_features), arrays
 
 
 _ITERATIONS = 15

@@ -15,6 +15,7 @@ from methods.learning.library_isolation import deterministic_training
 from methods.tuner import Array
 
 Data = TypeVar("Data")
+ConvertedData = TypeVar("ConvertedData")
 Weights = dict[str, Any]
 """Weights as torch tensors, by name: ``LAYER.weight`` (inputs, outputs), ``LAYER.bias``."""
 
@@ -37,6 +38,10 @@ class TrainingMonitor(Generic[Data]):
 
     held_out: Data
     epoch: Callable[[int, int, float, float], None]
+
+    def convert(self, function: Callable[[Data], ConvertedData]) -> TrainingMonitor[ConvertedData]:
+        """Return a monitor that gets converted data, such as input rows of simulations."""
+        return TrainingMonitor(function(self.held_out), self.epoch)
 
 
 def train_weights(
@@ -114,3 +119,22 @@ def minimise_loss(
 def compute_cosine_rates(rate: float, epochs: int) -> list[float]:
     """Compute the learning rate of each epoch, which falls to zero along half a cosine."""
     return [rate * (0.5 + 0.5 * float(np.cos(np.pi * epoch / epochs))) for epoch in range(epochs)]
+
+
+def check_shapes(
+    arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]
+) -> dict[str, Array]:
+    """Return the arrays in the order of the expected names, after a check of their shapes.
+
+    Raises:
+        ValueError: arrays have other names or shapes, or numbers that are not finite.
+    """
+    if arrays.keys() != expected.keys():
+        raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
+    for name, shape in expected.items():
+        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(
+                f"array {name}: expected finite numbers of shape {shape}, "
+                f"found {arrays[name].shape}"
+            )
+    return {name: arrays[name] for name in expected}

@@ -212,25 +212,6 @@ def add_noise_to_held_out(held_out: TrainingData, noise: Array | None) -> Traini
     return held_out if noise is None else held_out.with_noise(noise, np.random.default_rng(0))
 
 
-def check_shapes(
-    arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]
-) -> dict[str, Array]:
-    """Return the arrays in the order of the expected names, after a check of their shapes.
-
-    Raises:
-        ValueError: arrays have other names or shapes, or numbers that are not finite.
-    """
-    if arrays.keys() != expected.keys():
-        raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
-    for name, shape in expected.items():
-        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-            raise ValueError(
-                f"array {name}: expected finite numbers of shape {shape}, "
-                f"found {arrays[name].shape}"
-            )
-    return {name: arrays[name] for name in expected}
-
-
 _UNIT_RANGE = np.array([[0.0], [1.0]])
 """Corners of the unit cube, a training range in any number of dimensions."""
 

@@ -9,11 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig, InputFeatures, fill_gaps
-from methods.learning.network_training import TrainingMonitor
-from methods.learning.noise_matched_networks import (
-    NoiseMatchedTuner,
-    check_shapes,
-)
+from methods.learning.network_training import TrainingMonitor, check_shapes
+from methods.learning.noise_matched_networks import NoiseMatchedTuner
 from methods.learning.pair_network import (
     PairInputs,
     PairNetworkDesign,
@@ -71,13 +68,18 @@ class TrainedPairNetwork:
             if reading.proposed
             else features
         )
-        validation_monitor = None
-        if monitor is not None:
-            held_out = monitor.held_out
-            rows = _compute_input_rows(proposed, features, held_out)
-            validation_monitor = TrainingMonitor((rows, held_out.parameters), monitor.epoch)
+        rows_monitor = (
+            None
+            if monitor is None
+            else monitor.convert(
+                lambda held_out: (
+                    _compute_input_rows(proposed, features, held_out),
+                    held_out.parameters,
+                )
+            )
+        )
         rows = _compute_input_rows(proposed, features, data)
-        weights = train_pair_network(rows, data.parameters, design, rng, alone, validation_monitor)
+        weights = train_pair_network(rows, data.parameters, design, rng, alone, rows_monitor)
         return cls(design, features, weights, proposed)
 
     def predict_difference(self, proposed: Array, target: Array) -> Array:

@@ -39,11 +39,8 @@ from methods.learning.history_transformer import (
     train_history_transformer,
 )
 from methods.learning.input_features import FeatureConfig, InputFeatures
-from methods.learning.network_training import TrainingMonitor
-from methods.learning.noise_matched_networks import (
-    NoiseMatchedTuner,
-    check_shapes,
-)
+from methods.learning.network_training import TrainingMonitor, check_shapes
+from methods.learning.noise_matched_networks import NoiseMatchedTuner
 from methods.learning.training_data import TrainingData
 from methods.tuner import Array, Proposal, Task, TrainingSimulator, TunerGenerator
 from methods.tuners.tunenet import MIN_STEP
@@ -200,15 +197,18 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
             monitor: monitor of the training; None for none.
         """
         features = InputFeatures.fit(data, self.make_feature_config())
-        validation_monitor = None
-        if monitor is not None:
-            held_out = _build_training_histories(features, monitor.held_out, training_range)
-            validation_monitor = TrainingMonitor(held_out, monitor.epoch)
+        history_monitor = (
+            None
+            if monitor is None
+            else monitor.convert(
+                lambda held_out: _build_training_histories(features, held_out, training_range)
+            )
+        )
         design = self.make_network_design()
         material = _build_training_histories(features, data, training_range)
         per_scenario = data.parameters.shape[1]
         weights = train_history_transformer(
-            material, partial(self._draw_histories, per_scenario), design, rng, validation_monitor
+            material, partial(self._draw_histories, per_scenario), design, rng, history_monitor
         )
         return TrainedHistoryNetwork(design, features, weights, training_range)
 
