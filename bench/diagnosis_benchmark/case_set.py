@@ -23,6 +23,7 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     NOISE_KINDS,
     BenchmarkCase,
     RequestedConditions,
+    name_case,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
@@ -285,11 +286,8 @@ class CaseSpec(Document):
     @property
     def name(self) -> str:
         """Name of the case, unique in a case set."""
-        words = [self.kind, self.system]
-        words += [self.effect] if self.effect else []
-        words += [f"{self.size:g}"] if self.size else []
-        words += [str(part) for part in self.asked if part is not None]
-        return "/".join([*words, str(self.index)])
+        effect = self.effect or ""
+        return name_case(self.kind, self.system, effect, self.size, self.asked, self.index, "/")
 
     def draw_case(self, seed: int, salt: str = PUBLIC_SALT) -> BenchmarkCase | None:
         """Draw the case; make several attempts if the hidden cause is not observable.

@@ -125,7 +125,7 @@ def recorded(item, design, folder):
     }
     scenario = Scenario(design.times, begin, dict(design.inputs))
     make = simulate_with_mujoco if item.source == "mujoco" else simulate_with_scipy
-    seen = make(setting.make_true_system(effects=item.effects), scenario, setting.channels)
+    seen = make(setting.make_true_system(item.effects), scenario, setting.channels)
     seen = setting.noise.add_to(seen, rng)
     channels = dict(zip(setting.channels, seen.T, strict=True))
     run = Run("next", design.times, channels, scenario.inputs, {}, {}, held_out=False)

@@ -41,7 +41,7 @@ class FlightDynamics:
             number: index of the run in the recording.
         """
         self.g = true_system.constants["gravity"]
-        self.acting = {**true_system.effects, **true_system.foreign}
+        self.acting = true_system.effects
         self.laws = [
             (ACCELERATION_LAWS[name], c)
             for name, c in self.acting.items()
@@ -285,8 +285,8 @@ def _compute_bounce(true_system: TrueSystem, t: float, state: Array) -> tuple[Ar
     speed, e = -state[5], true_system.parameters["restitution"]
     if "restitution.speed" in true_system.effects:
         e = min(e * speed ** true_system.effects["restitution.speed"][0], 1.0)
-    if "wear" in true_system.foreign:  # unmodelled: restitution that decreases with time
-        e = min(max(e * (1.0 - true_system.foreign["wear"][0] * t), 0.0), 1.0)
+    if "wear" in true_system.effects:  # unmodelled: restitution that decreases with time
+        e = min(max(e * (1.0 - true_system.effects["wear"][0] * t), 0.0), 1.0)
     tangential_speed = hypot(state[3], state[4])
     speed_loss = true_system.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
     rebound_state = state.copy()

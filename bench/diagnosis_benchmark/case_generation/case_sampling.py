@@ -18,17 +18,18 @@ from bench.diagnosis_benchmark.case_generation import effect_coefficients, effec
 from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_for_size
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
-    MIN_DISTINCT_SIZE,
-    MIN_SIMPLER_RESIDUAL,
     BenchmarkCase,
     RecordingConditions,
     RequestedConditions,
     draw_conditions,
+    draw_size,
     make_case_rng,
+    name_case,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
+    EffectCoefficients,
     simulate_with_mujoco,
     simulate_with_scipy,
 )
@@ -101,7 +102,7 @@ def draw_case(
     """Draw the hidden cause, its size and the nuisances of a benchmark case.
 
     The cause is drawn first, then recording conditions in which it can be observed, and finally its
-    size in units of the noise: log-uniform from 1 to 10, or from 3 for double and foreign causes.
+    size in units of the noise; see `recording_conditions.draw_size`.
 
     Args:
         kind: clean, single, double or foreign.
@@ -115,41 +116,34 @@ def draw_case(
         The case, or None if the sensors cannot show the effect at this size with a strength up to
         `effect_coefficients.MAX_STRENGTH`, or if another answer explains it too well.
     """
-    effect_label = effect or "any"
-    name = "-".join(
-        [
-            kind,
-            system,
-            *([effect_label] if kind != "clean" else []),
-            *([f"{size:g}"] if size else []),
-            *(str(part) for part in requested if part is not None),
-            str(seed),
-        ]
-    )
+    effect_label = "" if kind == "clean" else effect or "any"
+    name = name_case(kind, system, effect_label, size, requested, seed)
     rng = make_case_rng(name, "cause")
     hidden = _choose_hidden_causes(kind, system, effect, rng)
     setting = _draw_conditions(name, system, hidden, requested)
+    source = str(rng.choice(["scipy", "mujoco"]))
     case = BenchmarkCase(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
         setting.seconds,
-        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.is_driven,
+        # The library, which MuJoCo uses, has no unmodelled causes.
+        len(setting.scenarios), "scipy" if kind == "foreign" else source, setting.is_driven,
         setting.channels, seed,
         setting.parameters, asked=requested,
     )  # fmt: skip
-    target_size = size or float(
-        np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
-    )
+    target_size = draw_size(kind, size, rng)
+    if not hidden:
+        return case
     # The effect must be observable in the runs for fitting, because the held-out runs are not
     # fitted.
     fitted_setting = replace(
         setting, scenarios=setting.scenarios[: case.runs - count_held_out_runs(case)]
     )
-    return {
-        "clean": _draw_clean,
-        "single": _draw_single,
-        "double": _draw_pair,
-        "foreign": _draw_unmodelled,
-    }[kind](case, fitted_setting, hidden, target_size, rng)
+    return case.hide(
+        hidden,
+        target_size,
+        lambda name: find_coefficients(name, fitted_setting, target_size, rng),
+        lambda effects: _compute_unexplained_size(kind, fitted_setting, effects, target_size),
+    )
 
 
 def count_held_out_runs(case: BenchmarkCase) -> int:
@@ -208,85 +202,23 @@ def _choose_hidden_causes(
     return first, str(rng.choice([n for n in names if n not in equivalent_effects]))
 
 
-def _draw_clean(
-    case: BenchmarkCase,
-    setting: RecordingConditions,
-    hidden: tuple[str, ...],
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Return a clean case unchanged, because it hides nothing.
-
-    The parameters are those of the functions for the other kinds of cases, among which `draw_case`
-    chooses.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-        setting: unused.
-        hidden: unused.
-        target_size: unused.
-        rng: unused.
-    """
-    return case
-
-
-def _draw_single(
-    case: BenchmarkCase,
-    setting: RecordingConditions,
-    hidden: tuple[str, ...],
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide one effect of the library, with coefficients that give the requested size.
-
-    If the effect has a simpler form and at least the size of the noise, the case is rejected unless
-    that form leaves a visible residual (`unexplained`, at least `MIN_SIMPLER_RESIDUAL`): otherwise
-    the simpler form would be a correct answer.
-
-    Args:
-        case: the case without its hidden cause.
-        setting: recording conditions with the runs for fitting only.
-        hidden: the name of the effect.
-        target_size: size in units of the noise.
-        rng: random generator.
-
-    Returns:
-        The case; None if it is rejected or no coefficients give this size.
-    """
-    (name,) = hidden
-    coefficients = find_coefficients(name, setting, target_size, rng)
-    if coefficients is None:
-        return None
-    unexplained = None
-    if name in SIMPLER_EFFECTS and target_size >= 1.0:
-        observed = effect_sizing.simulate_observations(setting, {name: coefficients})
-        unexplained = min(
-            effect_sizing.compute_refitted_residual(setting, observed, simpler_effect)
-            for simpler_effect in SIMPLER_EFFECTS[name]
-        )
-    return case.hide({name: coefficients}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
-
-
 def find_coefficients(
     name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
-    """Find coefficients of an effect at which the residual has the requested size.
+    """Find coefficients of a hidden cause at which the residual has the requested size.
 
     Args:
-        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        name: name of the effect or unmodelled cause.
         setting: recording conditions.
         target_size: size in units of the noise.
-        rng: random generator for the shape of the effect.
+        rng: random generator for the shape of the cause.
 
     Returns:
         Coefficients, or None if there are none.
     """
     compute_coefficients = effect_coefficients.draw_effect_shape(name, setting, rng)
     compute_residual = effect_sizing.make_gap_function(
-        setting,
-        lambda strength: effect_sizing.simulate_observations(
-            setting, {name: compute_coefficients(strength)}
-        ),
+        setting, lambda strength: _simulate_causes(setting, {name: compute_coefficients(strength)})
     )
     found = find_strength_for_size(
         compute_residual, target_size, effect_coefficients.get_max_strength(name)
@@ -294,102 +226,57 @@ def find_coefficients(
     return None if found is None else compute_coefficients(found[0])
 
 
-def _draw_pair(
-    case: BenchmarkCase,
-    setting: RecordingConditions,
-    hidden: tuple[str, ...],
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide two effects, each of the requested size alone.
+def _simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -> Array:
+    """Simulate noise-free observations (R, T, C) with hidden causes.
 
-    The case is rejected if one of the two explains both: the residual that the better one leaves
-    (`unexplained`) must be at least `MIN_DISTINCT_SIZE`.
+    Unmodelled causes are simulated by scipy, because the batch engine does not know them.
+
+    Shapes: R runs, T samples, C channels.
+    """
+    if set(causes).isdisjoint(UNMODELLED_CAUSES[setting.system]):
+        return effect_sizing.simulate_observations(setting, causes)
+    true_system = setting.make_true_system(causes)
+    return np.array(
+        [
+            simulate_with_scipy(true_system, scenario, setting.channels, run_index)
+            for run_index, scenario in enumerate(setting.scenarios)
+        ]
+    )
+
+
+def _compute_unexplained_size(
+    kind: str, setting: RecordingConditions, effects: EffectCoefficients, size: float
+) -> float | None:
+    """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
+
+    It would be a correct answer if it left little: the simpler form of an effect, one of two
+    effects, or the best effect of the library for an unmodelled cause.
 
     Args:
-        case: the case without its hidden causes.
+        kind: single, double or foreign.
         setting: recording conditions with the runs for fitting only.
-        hidden: the two names.
-        target_size: size of each effect alone, in units of the noise.
-        rng: random generator.
+        effects: coefficients of the hidden causes by name.
+        size: size of each in units of the noise.
 
     Returns:
-        The case; None if it is rejected or no coefficients give this size.
+        The residual; None if the effect has no simpler form, or less than the size of the noise.
     """
-    coefficients_by_effect = {
-        name: find_coefficients(name, setting, target_size, rng) for name in hidden
-    }
-    effects = _order_input_effects(
-        {name: c for name, c in coefficients_by_effect.items() if c is not None}
+    wrong_answers = (
+        [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
+        if kind == "single"
+        else list(effects.items())
     )
-    if len(effects) < len(coefficients_by_effect):
+    if kind == "single" and (not wrong_answers or size < 1.0):
         return None
-    observed = effect_sizing.simulate_observations(setting, effects)
+    observed = _simulate_causes(setting, effects)
     if not np.isfinite(observed).all():
-        return None
-    unexplained = min(
-        effect_sizing.compute_refitted_residual(setting, observed, name, effects[name])
-        for name in effects
+        return 0.0
+    if kind == "foreign":
+        return effect_sizing.find_best_effect(setting, observed)[1]
+    return min(
+        effect_sizing.compute_refitted_residual(setting, observed, name, coefficients)
+        for name, coefficients in wrong_answers
     )
-    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE)
-
-
-def _order_input_effects(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
-    """Put a lag of the input last: nonlinear input effects act on the command."""
-    return dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
-
-
-def _draw_unmodelled(
-    case: BenchmarkCase,
-    setting: RecordingConditions,
-    hidden: tuple[str, ...],
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide an unmodelled cause, which no effect of the library explains fully.
-
-    The case is rejected if the best effect of the library leaves a residual (`unexplained`) below
-    `MIN_DISTINCT_SIZE`: that effect would then be a correct answer.
-
-    Args:
-        case: the case without its hidden cause.
-        setting: recording conditions with the runs for fitting only.
-        hidden: the name of the cause.
-        target_size: size in units of the noise.
-        rng: random generator.
-
-    Returns:
-        The case; None if it is rejected or no strength gives this size.
-    """
-    (name,) = hidden
-    compute_coefficients = effect_coefficients.draw_unmodelled_cause(name, setting, rng)
-
-    def observed(strength: float) -> Array:
-        """Simulate noise-free observations (R, T, C) with the cause at a strength, by scipy.
-
-        The batch engine cannot be used here, because it does not know unmodelled causes.
-
-        Shapes: R runs, T samples, C channels.
-        """
-        true_system = setting.make_true_system(foreign={name: compute_coefficients(strength)})
-        return np.array(
-            [
-                simulate_with_scipy(true_system, s, setting.channels, i)
-                for i, s in enumerate(setting.scenarios)
-            ]
-        )
-
-    found = find_strength_for_size(
-        effect_sizing.make_gap_function(setting, observed),
-        target_size,
-        effect_coefficients.MAX_STRENGTH,
-    )
-    if found is None:
-        return None
-    strength, _ = found
-    _, unexplained = effect_sizing.find_best_effect(setting, observed(strength))
-    effects = {name: compute_coefficients(strength)}
-    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE, source="scipy")
 
 
 def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
@@ -432,8 +319,7 @@ def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[R
         setting: its recording conditions, with all runs.
     """
     rng, held_out = make_case_rng(case.name, "noise"), count_held_out_runs(case)
-    hidden = {"foreign": case.effects} if case.kind == "foreign" else {"effects": case.effects}
-    true_system, runs = setting.make_true_system(**hidden), []
+    true_system, runs = setting.make_true_system(case.effects), []
     for run_index, scenario in enumerate(setting.scenarios):
         if case.source == "mujoco":
             observed = simulate_with_mujoco(true_system, scenario, setting.channels)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sims.core.simulator import Array
 
@@ -42,6 +43,22 @@ def compute_orthonormal_basis(columns: Array) -> Array:
     )
     basis: Array = left_vectors[:, singular_values > MIN_SINGULAR_VALUE * singular_values[0]]
     return basis
+
+
+def arrange_slopes(slopes: Array, shared_count: int) -> Array:
+    """Arrange the slopes of all runs as the columns of one Jacobian (R N, P + R S).
+
+    Shapes: R runs, N samples, P shared unknowns, S unknowns of each run.
+
+    Args:
+        slopes: derivatives of each run's samples, (R, P + S, N); those of the shared unknowns, such
+            as parameters, come first, those of the run's own unknowns, such as initial states,
+            last.
+        shared_count: number of shared unknowns, P.
+    """
+    columns = slopes.swapaxes(1, 2)
+    own_columns: Array = block_diag(*columns[:, :, shared_count:])
+    return np.hstack([np.concatenate(columns[:, :, :shared_count]), own_columns])
 
 
 def find_strength_for_size(

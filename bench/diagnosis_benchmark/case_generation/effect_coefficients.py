@@ -74,7 +74,7 @@ class BaseMotion:
 def draw_effect_shape(
     name: str, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw the shape of an effect of the library: everything except its strength.
+    """Draw the shape of an effect or unmodelled cause: everything except its strength.
 
     The shape is the sign, direction, period, speed or time constant. The strength stays free, so
     that `effect_sizing` can find the one that gives the requested size.
@@ -87,6 +87,8 @@ def draw_effect_shape(
     Returns:
         Coefficients as a function of the strength.
     """
+    if (unmodelled_cause := (setting.system == "ball", name)) in UNMODELLED_SAMPLERS:
+        return UNMODELLED_SAMPLERS[unmodelled_cause](BaseMotion(setting), rng)
     kind = SIMULATORS[setting.system].system.kind
     coefficient_scale = max(
         abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind)
@@ -511,17 +513,6 @@ SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
     "friction.stribeck": _draw_stribeck,
     "input.saturation": _draw_saturation,
 }
-
-
-def draw_unmodelled_cause(
-    name: str, setting: RecordingConditions, rng: np.random.Generator
-) -> CoefficientFunction:
-    """Draw the shape of an unmodelled cause; see `case_generation.reference_simulation`.
-
-    Returns:
-        Numbers of the cause as a function of the strength.
-    """
-    return UNMODELLED_SAMPLERS[(setting.system == "ball", name)](BaseMotion(setting), rng)
 
 
 def _draw_onsets(motion: BaseMotion, duration: float, rng: np.random.Generator) -> list[float]:

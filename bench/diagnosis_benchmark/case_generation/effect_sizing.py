@@ -16,6 +16,7 @@ from itertools import product
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import arrange_slopes, compute_rms
 from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
@@ -139,7 +140,7 @@ class NuisanceFitter:
             damping /= DAMPING_DECREASE
             if relative_gain < MIN_RELATIVE_GAIN:
                 break
-        return ResidualFit(float(np.sqrt(np.mean(residual**2))), theta, starts)
+        return ResidualFit(compute_rms(residual), theta, starts)
 
     @staticmethod
     def compute_step(residual: Array, slope: Array, damping: float) -> Array:
@@ -201,14 +202,10 @@ class NuisanceFitter:
         observations = observations.reshape(runs, variant_count, -1)
         residual = (observed / self.sigma).reshape(runs, -1) - observations[:, 0]
         slopes = (observations[:, 1:] - observations[:, :1]) / FINITE_DIFFERENCE_STEP
-        slope = np.zeros((*residual.shape, count + runs * state_count))
-        for run_index in range(runs):
-            slope[run_index, :, :count] = slopes[run_index, :count].T
-            first = count + run_index * state_count
-            slope[run_index, :, first : first + state_count] = slopes[run_index, count:].T
         is_finite = (np.abs(observations) < DIVERGED_VALUE).all()
-        return residual.ravel() if is_finite else np.full(residual.size, np.inf), slope.reshape(
-            residual.size, -1
+        return (
+            residual.ravel() if is_finite else np.full(residual.size, np.inf),
+            arrange_slopes(slopes, count),
         )
 
 
@@ -421,7 +418,7 @@ def _compute_residual(
         base_fit: fit without the effect, whose initial states are used.
     """
     residual, _ = fit.linearise(observed, theta, base_fit.starts)
-    return float(np.sqrt(np.mean(residual**2)))
+    return compute_rms(residual)
 
 
 def _estimate_linear_step(
@@ -454,5 +451,4 @@ def _estimate_linear_step(
     # Almost no damping, because the model is linear here.
     step = fit.compute_step(residual, slope, damping=1e-9)
     theta[:fitted_count] += step[:fitted_count] * fit.scales[:fitted_count]
-    rms_residual = float(np.sqrt(np.mean((residual - slope @ step) ** 2)))
-    return rms_residual, np.clip(theta, fit.low, fit.high)
+    return compute_rms(residual - slope @ step), np.clip(theta, fit.low, fit.high)

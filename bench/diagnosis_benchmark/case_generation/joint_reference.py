@@ -84,32 +84,31 @@ class JointDynamics:
             self.weight = lambda x: 0.0
             self.sideways = lambda x: self.inertia
         self.gravity = gravity
-        active_effects = {**true_system.effects, **true_system.foreign}
         self.forces = [
             FORCE_EFFECTS[name](self, list(coefficients))
-            for name, coefficients in active_effects.items()
+            for name, coefficients in true_system.effects.items()
             if name in FORCE_EFFECTS
         ]
         self.limits = [
             DRY_FRICTION_EFFECTS[name](self, list(coefficients))
-            for name, coefficients in active_effects.items()
+            for name, coefficients in true_system.effects.items()
             if name in DRY_FRICTION_EFFECTS
         ]
         self.breaks: list[float] = []
-        if "gust" in active_effects:
-            push, duration, *start_times = active_effects["gust"]
+        if "gust" in true_system.effects:
+            push, duration, *start_times = true_system.effects["gust"]
             push_start = start_times[number]
             self.breaks = [push_start, push_start + duration]
             self.forces.append(
                 lambda t, x, v: push if push_start <= self.middle < push_start + duration else 0.0
             )
         self.restless = bool(
-            {"force.periodic", "input.lag", "friction.warming"} & set(active_effects)
+            {"force.periodic", "input.lag", "friction.warming"} & set(true_system.effects)
         )
         total_inertia, gravity_of_all = self.inertia, self.weight
         self.hidden_state_effects: list[Any] = [
             HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *coefficients)
-            for name, coefficients in active_effects.items()
+            for name, coefficients in true_system.effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
         self.inertia = total_inertia - sum(part.inertia for part in self.hidden_state_effects)

@@ -5,9 +5,9 @@ They are parameters, runs, inputs, channels and noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -131,18 +131,9 @@ class RecordingConditions:
         """True if there is an input."""
         return bool(self.scenarios[0].inputs)
 
-    def make_true_system(
-        self, effects: EffectCoefficients | None = None, foreign: EffectCoefficients | None = None
-    ) -> TrueSystem:
-        """Make the true system with hidden causes.
-
-        Args:
-            effects: hidden effects of the library.
-            foreign: hidden unmodelled causes.
-        """
-        return TrueSystem(
-            self.system, self.parameters, self.constants, effects or {}, foreign or {}
-        )
+    def make_true_system(self, causes: EffectCoefficients) -> TrueSystem:
+        """Make the true system with hidden causes: effects of the library, or unmodelled ones."""
+        return TrueSystem(self.system, self.parameters, self.constants, causes)
 
 
 class RequestedConditions(NamedTuple):
@@ -432,27 +423,77 @@ class BenchmarkCase(Document):
 
     def hide(
         self,
-        effects: Mapping[str, tuple[float, ...]],
+        causes: Sequence[str],
         size: float,
-        beyond: float | None,
-        min_beyond: float,
-        **changes: Any,
+        find_coefficients: Callable[[str], tuple[float, ...] | None],
+        compute_unexplained: Callable[[EffectCoefficients], float | None],
     ) -> BenchmarkCase | None:
         """Hide causes in a case, unless a wrong answer would explain the recording as well.
 
+        A wrong answer is the simpler form of a single effect, one of two effects, or the best
+        effect of the library for an unmodelled cause. The residual that it leaves must be at least
+        `MIN_SIMPLER_RESIDUAL` for a simpler form, otherwise `MIN_DISTINCT_SIZE`.
+
         Args:
-            effects: coefficients of the causes by name.
-            size: their size.
-            beyond: RMS residual that the best wrong answer leaves; None if none was tested.
-            min_beyond: minimum of `beyond`: below it, the wrong answer would be correct.
-            **changes: further changed attributes.
+            causes: names of the causes.
+            size: size of each cause alone, in units of the noise.
+            find_coefficients: finds the coefficients of a cause with this size; None if there are
+                none.
+            compute_unexplained: computes, from the coefficients of the causes by name, the RMS
+                residual that the best wrong answer leaves; None if there is none.
 
         Returns:
-            The case; None if it is rejected.
+            The case; None if it is rejected or no coefficients give this size.
         """
-        if beyond is not None and beyond < min_beyond:
+        effects = {n: c for n in causes if (c := find_coefficients(n)) is not None}
+        if len(effects) < len(causes):
             return None
-        return replace(self, effects=dict(effects), size=size, beyond=beyond, **changes)
+        # A lag of the input comes last: nonlinear input effects act on the command.
+        effects = dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
+        beyond = compute_unexplained(effects)
+        least = MIN_SIMPLER_RESIDUAL if self.kind == "single" else MIN_DISTINCT_SIZE
+        if beyond is not None and beyond < least:
+            return None
+        return replace(self, effects=effects, size=size, beyond=beyond)
+
+
+def name_case(
+    kind: str,
+    system: str,
+    effect: str,
+    size: float | None,
+    requested: RequestedConditions,
+    number: int,
+    separator: str = "-",
+) -> str:
+    """Compose the name of a case or of its specification, such as ``single-ball-wind-3``.
+
+    Args:
+        kind: one of `CASE_KINDS`.
+        system: name of the system.
+        effect: hidden effect, or a word for it; left out if empty.
+        size: requested size; left out if there is none.
+        requested: requested recording conditions; those that are drawn are left out.
+        number: number that distinguishes the case from others.
+        separator: text between the parts.
+    """
+    parts = [kind, system, effect, f"{size:g}" if size else "", *requested, number]
+    return separator.join(str(part) for part in parts if part not in ("", None))
+
+
+def draw_size(kind: str, size: float | None, rng: np.random.Generator) -> float:
+    """Return the size of the hidden causes in units of the noise; draw it unless it is requested.
+
+    It is log-uniform from 1 to 10, or from 3 for double and foreign causes, which must be clearly
+    visible.
+
+    Args:
+        kind: one of `CASE_KINDS`.
+        size: requested size; None to draw it.
+        rng: random generator.
+    """
+    low = 3.0 if kind in ("double", "foreign") else 1.0
+    return size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
 
 
 def make_case_rng(name: str, purpose: str) -> np.random.Generator:

@@ -22,15 +22,14 @@ class TrueSystem:
         system: name of the system.
         parameters: values of the base parameters, by name.
         constants: values of the constants, by name.
-        effects: coefficients of effects of the library, in the order in which a signal passes them.
-        foreign: numbers of causes that the library does not contain.
+        effects: coefficients of the hidden causes by name, in the order in which a signal passes
+            them.
     """
 
     system: str
     parameters: Mapping[str, float]
     constants: Mapping[str, float]
     effects: EffectCoefficients = field(default_factory=dict)
-    foreign: EffectCoefficients = field(default_factory=dict)
 
 
 SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant

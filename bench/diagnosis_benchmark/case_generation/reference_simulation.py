@@ -141,7 +141,6 @@ def simulate_with_mujoco(
     Returns:
         Readings, (T, C).
     """
-    assert not true_system.foreign
     has_hidden_states = any(
         library.get_effect(name).hook == "hidden" for name in true_system.effects
     )

@@ -132,13 +132,13 @@ def get_joint(system: str, place: str) -> int:
 def draw_effect_shape(
     name: str, setting: MachineRecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw the shape of an effect at a place: everything but its strength, such as its sign.
+    """Draw the shape of a cause at a place: everything but its strength, such as its sign.
 
     Forces are scaled by the typical forces and speeds of the joint, effects of the input by its
     commands, and others have a fixed largest coefficient.
 
     Args:
-        name: ``effect@place``, or ``effect`` alone.
+        name: ``cause@place``, or ``cause`` alone.
         setting: recording conditions.
         rng: random generator.
 
@@ -147,6 +147,8 @@ def draw_effect_shape(
     """
     effect, _, place = name.partition("@")
     joint = get_joint(setting.system, place)
+    if effect in UNMODELLED_CAUSES:
+        return _draw_unmodelled_cause(effect, joint, setting, rng)
     typical_scales = {
         quantity: float(values[joint]) for quantity, values in setting.motion_scales.items()
     }
@@ -250,21 +252,20 @@ The scales are force, inertia, position, speed and travel.
 """
 
 
-def draw_unmodelled_cause(
-    name: str, setting: MachineRecordingConditions, rng: np.random.Generator
+def _draw_unmodelled_cause(
+    cause: str, joint: int, setting: MachineRecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw the shape of an unmodelled cause: when a gust acts, or where a patch of friction lies.
 
     Args:
-        name: ``cause@joint``, or ``cause`` alone.
+        cause: gust or patch.
+        joint: index of the joint on which it acts.
         setting: recording conditions.
         rng: random generator.
 
     Returns:
         Numbers of the cause as a function of the strength.
     """
-    cause, _, place = name.partition("@")
-    joint = get_joint(setting.system, place)
     force = float(setting.motion_scales["force"][joint])
     if cause == "gust":
         # Duration and begin of the gust, in s.

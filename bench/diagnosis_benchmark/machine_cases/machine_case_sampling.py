@@ -6,26 +6,28 @@ motion, after the part is projected out that changes of parameters and initial s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import (
+    arrange_slopes,
     compute_orthonormal_basis,
     compute_rms,
     find_strength_for_size,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
-    MIN_DISTINCT_SIZE,
-    MIN_SIMPLER_RESIDUAL,
     BenchmarkCase,
     RequestedConditions,
+    draw_size,
     make_case_rng,
+    name_case,
 )
 from bench.diagnosis_benchmark.machine_cases import hidden_causes
+from bench.diagnosis_benchmark.machine_cases.hidden_causes import EFFECTS_BY_MACHINE
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES, Effects
 from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
     MachineRecordingConditions,
@@ -36,11 +38,15 @@ from bench.diagnosis_benchmark.machine_cases.reference_motion import (
     read_encoders,
     simulate_machine,
 )
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Channel
+from sims.core.system import System
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_description import ModelFileReference
+from sims.recording.recording_writer import write_recording
+from sims.systems.servo import Servo
 
 MACHINE_NAMES = tuple(MACHINES)
 """Names of the machines."""
-SIMPLER_EFFECTS = {"friction.stribeck": "friction.coulomb"}
 _FINITE_DIFFERENCE_STEP = 1e-4
 """Finite-difference step: relative for a parameter, rad or rad/s for an initial state."""
 _PROBE_STRENGTH = 0.1
@@ -74,9 +80,7 @@ def draw_case(
         The case, or None if the encoders cannot show the cause, or if another answer explains it
         too well.
     """
-    words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
-    words += [str(part) for part in requested if part is not None]
-    name = "-".join([*words, str(seed)])
+    name = name_case(kind, system, effect or "any", size, requested, seed)
     conditions, rng = restore_conditions(name, system, requested), make_case_rng(name, "cause")
     case = BenchmarkCase(
         name=name,
@@ -96,17 +100,16 @@ def draw_case(
         parameters=conditions.free_parameters,
         asked=requested,
     )
-    if kind == "clean":
-        return case
-    # Sizes are log-uniform up to 10 noises; several or foreign causes must be clearly visible.
-    low = 3.0 if kind in ("double", "foreign") else 1.0
-    target_size = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
-    hidden = {
-        "single": _hide_one_effect,
-        "double": _hide_two_effects,
-        "foreign": _hide_unmodelled_cause,
-    }[kind]
-    return hidden(case, conditions, effect, target_size, rng)
+    target_size = draw_size(kind, size, rng)
+    hidden = _choose_hidden_causes(kind, system, effect, rng)
+    if not hidden:
+        return case if kind == "clean" else None
+    return case.hide(
+        hidden,
+        target_size,
+        lambda name: _find_sized_coefficients(name, conditions, target_size, rng),
+        lambda effects: _compute_unexplained_size(kind, conditions, effects, target_size, rng),
+    )
 
 
 @lru_cache(maxsize=4)
@@ -123,65 +126,33 @@ def restore_conditions(
     return draw_conditions(system, make_case_rng(name, "setting"), requested)
 
 
-def _draw_place(
-    case: BenchmarkCase, effect: str | None, rng: np.random.Generator, excluded_place: str = ""
-) -> str:
-    """Draw the effect, if it is not given, and its place: a joint, body, motor or sensor channel.
+def _choose_hidden_causes(
+    kind: str, system: str, effect: str | None, rng: np.random.Generator
+) -> tuple[str, ...]:
+    """Choose the causes that a case hides, with their places: joints, bodies, motors or channels.
 
     Args:
-        case: the case; its system determines the effects and places.
-        effect: name of the effect; None to draw it.
-        rng: random generator.
-        excluded_place: effect with place that must not be drawn, because the case already hides it.
-
-    Returns:
-        ``effect@place`` or ``effect``; empty if the only place is excluded by `excluded_place`.
-    """
-    chosen_effect = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[case.system]))
-    places = [
-        name
-        for name in hidden_causes.list_effect_places(case.system, chosen_effect)
-        if name != excluded_place
-    ]
-    return str(rng.choice(places)) if places else ""
-
-
-def _hide_one_effect(
-    case: BenchmarkCase,
-    conditions: MachineRecordingConditions,
-    effect: str | None,
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide one effect of the library, with coefficients that give the requested size.
-
-    Stribeck friction of at least one noise is rejected if Coulomb friction or drag explains it too
-    well: the residual that the better of them leaves (`unexplained`) must be at least
-    `MIN_SIMPLER_RESIDUAL`.
-
-    Args:
-        case: the case without its hidden cause.
-        conditions: recording conditions.
-        effect: name of the effect; None to draw it.
-        target_size: size in units of the noise.
+        kind: clean, single, double or foreign.
+        system: servo or arm2.
+        effect: name of the first cause; None to draw it.
         rng: random generator.
 
     Returns:
-        The case; None if it is rejected or no coefficients give this size.
+        ``cause@place`` or ``cause`` of each; none for a clean case, and none if the two effects of
+        a double case would be equivalent.
     """
-    name = _draw_place(case, effect, rng)
-    coefficients = _find_sized_coefficients(name, conditions, target_size, rng)
-    if coefficients is None:
-        return None
-    effect, _, place = name.partition("@")
-    unexplained = None
-    if effect in SIMPLER_EFFECTS and target_size >= 1.0:
-        simpler_effect = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
-        other_effects = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
-        unexplained = _compute_unexplained_size(
-            conditions, {name: coefficients}, {}, other_effects, rng
-        )
-    return case.hide({name: coefficients}, target_size, unexplained, MIN_SIMPLER_RESIDUAL)
+    if kind == "clean":
+        return ()
+    is_foreign = kind == "foreign"
+    causes = hidden_causes.UNMODELLED_CAUSES if is_foreign else EFFECTS_BY_MACHINE[system]
+    first_places = hidden_causes.list_effect_places(system, effect or str(rng.choice(causes)))
+    first = str(rng.choice(first_places))
+    if kind != "double":
+        return (first,)
+    places = hidden_causes.list_effect_places(system, str(rng.choice(causes)))
+    places = tuple(name for name in places if name != first)
+    second = str(rng.choice(places)) if places else first
+    return () if second in find_equivalent_causes(system, first) else (first, second)
 
 
 def _find_sized_coefficients(
@@ -189,7 +160,6 @@ def _find_sized_coefficients(
     conditions: MachineRecordingConditions,
     target_size: float,
     rng: np.random.Generator,
-    is_modelled: bool = True,
 ) -> tuple[float, ...] | None:
     """Find coefficients at which a cause has the requested size, with a strength of at most 1.
 
@@ -200,133 +170,82 @@ def _find_sized_coefficients(
         conditions: recording conditions.
         target_size: size in units of the noise.
         rng: random generator for the shape of the cause.
-        is_modelled: whether the cause is an effect of the library.
 
     Returns:
         The coefficients; None if the size is not reached.
     """
-    draw = hidden_causes.draw_effect_shape if is_modelled else hidden_causes.draw_unmodelled_cause
-    compute_coefficients = draw(name, conditions, rng)
+    compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
     gauge = _ResidualGauge(conditions)
 
     def compute_size(strength: float) -> float:
         causes = {name: compute_coefficients(strength)}
-        effects, foreign = (causes, {}) if is_modelled else ({}, causes)
-        return gauge.compute_residual_size(conditions.simulate_readings(effects, foreign))
+        return gauge.compute_residual_size(conditions.simulate_readings(causes))
 
     found = find_strength_for_size(compute_size, target_size, 1.0)
     return None if found is None else compute_coefficients(found[0])
 
 
-def _hide_two_effects(
-    case: BenchmarkCase,
-    conditions: MachineRecordingConditions,
-    effect: str | None,
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide two effects, each of the requested size alone; reject the case if one explains both.
-
-    Args:
-        case: the case without its hidden causes.
-        conditions: recording conditions.
-        effect: name of the first effect; None to draw it.
-        target_size: size of each effect alone, in units of the noise.
-        rng: random generator.
-
-    Returns:
-        The case; None if it is rejected, the effects are equivalent, or no coefficients give this
-        size.
-    """
-    first = _draw_place(case, effect, rng)
-    second = _draw_place(case, None, rng, excluded_place=first)
-    if not second or second in find_equivalent_causes(case.system, first):
-        return None
-    coefficients_by_effect = {
-        name: _find_sized_coefficients(name, conditions, target_size, rng)
-        for name in (first, second)
-    }
-    effects = {name: c for name, c in coefficients_by_effect.items() if c is not None}
-    if len(effects) < 2:
-        return None
-    unexplained = min(
-        _compute_unexplained_size(conditions, effects, {}, [name], rng) for name in effects
-    )
-    return case.hide(effects, target_size, unexplained, MIN_DISTINCT_SIZE)
-
-
-def _hide_unmodelled_cause(
-    case: BenchmarkCase,
-    conditions: MachineRecordingConditions,
-    cause: str | None,
-    target_size: float,
-    rng: np.random.Generator,
-) -> BenchmarkCase | None:
-    """Hide an unmodelled cause, which the library explains only in part.
-
-    The case is rejected if one effect of the library leaves a residual (`unexplained`) below
-    `MIN_DISTINCT_SIZE`.
-
-    Args:
-        case: the case without its hidden cause.
-        conditions: recording conditions.
-        cause: name of the cause; None to draw it.
-        target_size: size in units of the noise.
-        rng: random generator.
-
-    Returns:
-        The case; None if it is rejected or no strength gives this size.
-    """
-    chosen_cause = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
-    joint = str(rng.choice(MACHINES[case.system].joints))
-    name = f"{chosen_cause}@{joint}" if joint else chosen_cause
-    coefficients = _find_sized_coefficients(name, conditions, target_size, rng, is_modelled=False)
-    if coefficients is None:
-        return None
-    hidden = {name: coefficients}
-    library_effects = [
-        n
-        for e in hidden_causes.EFFECTS_BY_MACHINE[case.system]
-        for n in hidden_causes.list_effect_places(case.system, e)
-    ]
-    unexplained = _compute_unexplained_size(conditions, {}, hidden, library_effects, rng)
-    return case.hide(hidden, target_size, unexplained, MIN_DISTINCT_SIZE)
-
-
 def _compute_unexplained_size(
+    kind: str,
     conditions: MachineRecordingConditions,
     effects: Effects,
-    foreign: Effects,
-    other_causes: Sequence[str],
+    size: float,
     rng: np.random.Generator,
-) -> float:
-    """Compute the RMS residual that the best of other causes leaves, to first order.
+) -> float | None:
+    """Compute the RMS residual that the best wrong answer leaves, to first order.
 
     It is in units of the noise. If it is small, the case would be unfair, since a wrong answer
-    explains it. The direction of each other cause is its change of the readings at a small
+    explains it. The direction of each wrong answer is its change of the readings at a small
     strength; the part of the hidden causes' change along it is subtracted.
 
     Args:
+        kind: single, double or foreign.
         conditions: recording conditions.
-        effects: hidden effects of the library.
-        foreign: hidden unmodelled causes.
-        other_causes: the other causes, each of which may be a wrong answer.
-        rng: random generator for the shapes of the other causes.
+        effects: coefficients of the hidden causes by name.
+        size: size of each in units of the noise.
+        rng: random generator for the shapes of the wrong answers.
+
+    Returns:
+        The residual; None if the effect has no simpler form, or less than the size of the noise.
     """
+    wrong_answers = _list_wrong_answers(kind, conditions.system, effects)
+    if not wrong_answers or (kind == "single" and size < 1.0):
+        return None
     gauge = _ResidualGauge(conditions)
-    change = conditions.simulate_readings(effects, foreign) - gauge.bare
-    base_readings = conditions.simulate_readings(coarse=_COARSE_STEP_FACTOR)
+    change = conditions.simulate_readings(effects) - gauge.bare
+    base_readings = conditions.simulate_readings({}, coarse=_COARSE_STEP_FACTOR)
     residual_sizes = []
-    for name in other_causes:
+    for name in wrong_answers:
         compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
-        probe = (
-            {name: effects[name]}
-            if name in effects
-            else {name: compute_coefficients(_PROBE_STRENGTH)}
-        )
+        probe = {name: effects.get(name, compute_coefficients(_PROBE_STRENGTH))}
         direction = conditions.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - base_readings
         residual_sizes.append(gauge.compute_projected_size(change, direction))
     return min(residual_sizes)
+
+
+def _list_wrong_answers(kind: str, system: str, effects: Effects) -> list[str]:
+    """List causes that may explain a case though they are not its hidden causes.
+
+    They are Coulomb friction and drag instead of Stribeck friction, one of two effects, or any
+    effect of the library instead of an unmodelled cause.
+
+    Args:
+        kind: single, double or foreign.
+        system: servo or arm2.
+        effects: hidden causes.
+    """
+    if kind == "double":
+        return list(effects)
+    if kind == "foreign":
+        return [
+            name
+            for effect in EFFECTS_BY_MACHINE[system]
+            for name in hidden_causes.list_effect_places(system, effect)
+        ]
+    effect, at, place = next(iter(effects)).partition("@")
+    if effect != "friction.stribeck":
+        return []
+    return [f"friction.coulomb{at}{place}", f"drag.linear{at}{place}" if at else "drag.quadratic"]
 
 
 class _ResidualGauge:
@@ -366,21 +285,13 @@ class _ResidualGauge:
         for joint in range(joints):
             q[:, 1 + len(parameters) + joint, joint] += _FINITE_DIFFERENCE_STEP
             v[:, 1 + len(parameters) + joints + joint, joint] += _FINITE_DIFFERENCE_STEP
-        plant = MACHINES[conditions.system]({n: a.ravel() for n, a in values.items()}, {}, {})
+        plant = MACHINES[conditions.system]({n: a.ravel() for n, a in values.items()}, {})
         start_runs = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
         readings = read_encoders(simulate_machine(plant, start_runs), plant, conditions.runs.times)
         readings = readings.reshape(runs, variants, -1)
         slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
-        # Rows are the samples of all runs one after another.
-        parameter_columns = np.concatenate(slopes[:, : len(parameters)], axis=1).T
-        state_columns = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
-        for run_index in range(runs):
-            state_columns[run_index, :, run_index] = slopes[run_index, len(parameters) :].T
-        columns = np.column_stack(
-            [parameter_columns, state_columns.reshape(runs * slopes.shape[2], -1)]
-        )
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
-        self._basis = compute_orthonormal_basis(columns)
+        self._basis = compute_orthonormal_basis(arrange_slopes(slopes, len(parameters)))
 
     def compute_residual_size(self, readings: Array) -> float:
         """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
@@ -445,26 +356,6 @@ def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
     return frozenset({name}).union(*(names for names in EQUIVALENT_CAUSES[system] if name in names))
 
 
-def record_case(case: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
-    """Simulate the recording of a case with all its runs, and add the sensor noise.
-
-    Shapes: R runs, T samples, N joints.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-
-    Returns:
-        The recording conditions and the noisy encoder readings, (R, T, N).
-    """
-    conditions = restore_conditions(case.name, case.system, case.asked)
-    hidden = case.effects
-    foreign = case.kind == "foreign"
-    plant = conditions.make_machine({} if foreign else hidden, hidden if foreign else {})
-    readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
-    rng = make_case_rng(case.name, "noise")
-    return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
-
-
 MODEL_FILE_NAME = "robot.xml"
 """Name of the model file, in the folder of the recording."""
 
@@ -520,66 +411,18 @@ def _render_link(body: str, joint: str, n: Mapping[str, float]) -> str:
     )
 
 
-def build_description(
-    case: BenchmarkCase, conditions: MachineRecordingConditions
-) -> dict[str, object]:
-    """Build the description of the recording, as the document of a TOML file.
+class _ArmSignals(System):
+    """Signals of the arm, for the units in the description of its recording."""
 
-    It states what a user knows: units, constants or the model file, held-out runs and sometimes the
-    noise, but neither the hidden causes nor the true parameters.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-        conditions: recording conditions: parameters, commands, initial states and noise.
-    """
-    is_arm = case.system == "arm2"
-    plant = MACHINES[case.system]
-    noise_entry = {"noise": conditions.noise_sigmas} if case.stated else {}
-    channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
-    inputs = (
-        {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
-        if is_arm
-        else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
-    )
-    first_held_out = case.runs - conditions.held_out
-    runs = {str(number): {"held_out": True} for number in range(first_held_out, case.runs)}
-    source_entry = {"model": MODEL_FILE_NAME} if is_arm else {"system": case.system}
-    constants = {} if is_arm else {"constants": _get_stated_constants(conditions)}
-    return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
-
-
-def _get_stated_constants(conditions: MachineRecordingConditions) -> dict[str, float]:
-    """Return the parameters of a servo that its recording states and that are not fitted."""
-    return {
-        name: v for name, v in conditions.numbers.items() if name not in conditions.free_parameters
-    }
-
-
-def format_table(
-    case: BenchmarkCase, conditions: MachineRecordingConditions, readings: Array
-) -> str:
-    """Format the recording as CSV text.
-
-    Shapes: R runs, T samples, N joints.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-        conditions: recording conditions: parameters, commands, initial states and noise.
-        readings: encoder readings, (R, T, N).
-    """
-    plant, is_arm = MACHINES[case.system], case.system == "arm2"
-    inputs = [f"u.{name}" for name in plant.motors] if is_arm else ["goal", "torque_enable"]
-    lines = [",".join(["run", "t", *inputs, *plant.channels])]
-    for number, run in enumerate(readings):
-        for k, t in enumerate(conditions.runs.times.tolist()):
-            commands = conditions.runs.commands[number, k].tolist() + ([] if is_arm else [1.0])
-            cells = [t, *commands, *run[k].tolist()]
-            lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
-    return "\n".join(lines) + "\n"
+    channels = tuple(Channel(name, "rad") for name in MACHINES["arm2"].channels)
+    inputs = tuple(Channel(f"u.{name}", "N*m") for name in MACHINES["arm2"].motors)
 
 
 def write_case(case: BenchmarkCase, folder: Path) -> Path:
     """Write the recording, its description and, for an arm, its model file.
+
+    The files state what a user knows: units, constants or the model file, held-out runs and
+    sometimes the noise, but neither the hidden causes nor the true parameters.
 
     Args:
         case: case of the benchmark: its recording conditions and hidden causes.
@@ -588,13 +431,44 @@ def write_case(case: BenchmarkCase, folder: Path) -> Path:
     Returns:
         Path of the CSV file.
     """
-    import tomli_w
-
-    conditions, readings = record_case(case)
-    if case.system == "arm2":
-        (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(conditions.numbers), encoding="utf-8")
-    path = folder / "recording.csv"
-    path.write_text(format_table(case, conditions, readings), encoding="utf-8")
-    description = tomli_w.dumps(build_description(case, conditions))
-    path.with_suffix(".toml").write_text(description, encoding="utf-8")
+    conditions = restore_conditions(case.name, case.system, case.asked)
+    plant = conditions.make_machine(case.effects)
+    readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
+    rng = make_case_rng(case.name, "noise")
+    is_arm = case.system == "arm2"
+    declared = _ArmSignals if is_arm else Servo.system
+    path, model = folder / "recording.csv", folder / MODEL_FILE_NAME
+    times = conditions.runs.times
+    runs = []
+    for number, run in enumerate(readings):
+        recorded = conditions.noise.add_to(run, rng)
+        commands = [*conditions.runs.commands[number].T, *([] if is_arm else [np.ones_like(times)])]
+        inputs = dict(zip((c.name for c in declared.inputs), commands, strict=True))
+        channels = dict(zip(case.channels, recorded.T, strict=True))
+        held_out = number >= case.runs - conditions.held_out
+        runs.append(Run(str(number), times, channels, inputs, {}, {}, held_out))
+    stated_constants = (
+        {}
+        if is_arm
+        else {
+            name: v
+            for name, v in conditions.numbers.items()
+            if name not in conditions.free_parameters
+        }
+    )
+    write_recording(
+        path,
+        Recording(
+            path,
+            case.system,
+            "",
+            stated_constants,
+            conditions.noise.sigma if case.stated else {},
+            tuple(runs),
+            model=ModelFileReference(model, {}, {}) if is_arm else None,
+        ),
+        declared,
+        digits=9,
+        extra_files={model: render_arm_mjcf(conditions.numbers)} if is_arm else {},
+    )
     return path

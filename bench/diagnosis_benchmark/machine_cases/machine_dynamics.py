@@ -58,7 +58,7 @@ class MachineDynamics(ABC):
     channels: ClassVar[tuple[str, ...]]
     motors: ClassVar[tuple[str, ...]]
 
-    def __init__(self, numbers: MachineParameters, effects: Effects, foreign: Effects) -> None:
+    def __init__(self, numbers: MachineParameters, effects: Effects) -> None:
         """Store the parameters and add the hidden causes.
 
         Further attributes are `added`, additional rotor inertia (N,); `patch`, (joint, friction
@@ -69,11 +69,10 @@ class MachineDynamics(ABC):
 
         Args:
             numbers: parameters, see `MachineParameters`.
-            effects: hidden effects of the library.
-            foreign: hidden causes that the library does not contain.
+            effects: hidden causes, with those that the library does not contain.
         """
         self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
-        self.effects, self.foreign = effects, foreign
+        self.effects = effects
         count = len(self.joints)
         self.dry, self.extra, self.speed = np.zeros(count), np.zeros(count), np.ones(count)
         self.added = np.zeros(count)
@@ -83,9 +82,6 @@ class MachineDynamics(ABC):
         for name, coefficients in effects.items():
             effect, _, place = name.partition("@")
             self._add_effect(effect, place, list(coefficients))
-        for name, coefficients in foreign.items():
-            cause, _, place = name.partition("@")
-            self._add_unmodelled_cause(cause, place, list(coefficients))
 
     @property
     def has_dry_friction(self) -> NDArray[np.bool_]:
@@ -173,13 +169,14 @@ class MachineDynamics(ABC):
         """Compute the generalised forces (L, N) of gravity."""
 
     def _add_effect(self, effect: str, place: str, c: list[float]) -> None:
-        """Add an effect of the library to the equations of motion.
+        """Add a hidden cause to the equations of motion.
 
+        A patch is dry friction in a region of a joint angle: its limit, centre and half width.
         Effects on commands (``input.``) and sensors (``sensor.``) are ignored here;
         `reference_motion` applies them.
 
         Args:
-            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+            effect: name of the effect or unmodelled cause.
             place: joint or body on which it acts; empty if the machine has only one place.
             c: coefficients.
         """
@@ -189,7 +186,7 @@ class MachineDynamics(ABC):
             def act(t: float, q: Array, v: Array, u: Array) -> Array:
                 """Return the generalised forces (L, N) of the effect on its joint."""
                 pushed = np.zeros_like(q)
-                pushed[:, joint] = law(c, q[:, joint], v[:, joint])
+                pushed[:, joint] = law(c, t, q[:, joint], v[:, joint])
                 return pushed
 
             self.acts.append(act)
@@ -198,6 +195,9 @@ class MachineDynamics(ABC):
         elif effect == "friction.stribeck":
             joint = self.joints.index(place)
             self.dry[joint], self.extra[joint], self.speed[joint] = c
+        elif effect == "patch":
+            max_friction, centre, half_width = c
+            self.patch = self.joints.index(place), max_friction, centre, half_width
         elif effect == "inertia.armature":
             self.added[self.joints.index(place)] = c[0]
         elif effect == "gravity.tilt":
@@ -221,49 +221,21 @@ class MachineDynamics(ABC):
         for name in (f"mass{body + 1}", f"inertia{body + 1}"):
             self.numbers[name] = factor * self.numbers[name]
 
-    def _add_unmodelled_cause(self, cause: str, place: str, c: list[float]) -> None:
-        """Add a cause that the library does not contain.
 
-        Args:
-            cause: ``patch`` (dry friction in a region of the joint angle) or ``gust`` (temporary
-                force).
-            place: joint on which it acts.
-            c: friction limit, centre and half width of a patch; force, begin and duration of a
-                gust.
-        """
-        joint = self.joints.index(place)
-        if cause == "patch":
-            max_friction, centre, half_width = c
-            self.patch = joint, max_friction, centre, half_width
-        elif cause == "gust":
-            push, start, duration = c
-
-            def compute_gust_force(t: float, q: Array, v: Array, u: Array) -> Array:
-                """Return the generalised forces (L, N) of the gust at time t.
-
-                Args:
-                    t: time, s.
-                    q: (L, N) positions; only the shape counts.
-                    v: unused.
-                    u: unused.
-                """
-                pushed = np.zeros_like(q)
-                pushed[:, joint] = push * (start <= t < start + duration)
-                return pushed
-
-            self.acts.append(compute_gust_force)
-
-
-JOINT_FORCE_LAWS: dict[str, Callable[[list[float], Array, Array], Array]] = {
-    "drag.linear": lambda c, q, v: -c[0] * v,
-    "drag.quadratic": lambda c, q, v: -c[0] * np.abs(v) * v,
-    "spring.linear": lambda c, q, v: -c[0] * q,
-    "force.bias": lambda c, q, v: c[0] + 0.0 * q,
-    "force.ripple": lambda c, q, v: (
+JOINT_FORCE_LAWS: dict[str, Callable[[list[float], float, Array, Array], Array]] = {
+    "drag.linear": lambda c, t, q, v: -c[0] * v,
+    "drag.quadratic": lambda c, t, q, v: -c[0] * np.abs(v) * v,
+    "spring.linear": lambda c, t, q, v: -c[0] * q,
+    "force.bias": lambda c, t, q, v: c[0] + 0.0 * q,
+    "force.ripple": lambda c, t, q, v: (
         c[0] * np.sin(2 * np.pi * q / c[2]) + c[1] * np.cos(2 * np.pi * q / c[2])
     ),
+    "gust": lambda c, t, q, v: c[0] * (c[1] <= t < c[1] + c[2]) + 0.0 * q,
 }
-"""Forces at a joint as functions of its coefficients, positions (L,) and velocities (L,)."""
+"""Forces at a joint as functions of coefficients, time, positions (L,) and velocities (L,).
+
+A gust is a temporary force: the coefficients are force, begin and duration.
+"""
 
 
 class ServoDynamics(MachineDynamics):

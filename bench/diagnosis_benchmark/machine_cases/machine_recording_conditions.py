@@ -89,20 +89,11 @@ class MachineRecordingConditions:
         commands, q, v = (part[:count] for part in self.runs[1:])
         return MachineRuns(self.runs.times, commands, q, v)
 
-    def make_machine(
-        self, effects: Effects | None = None, foreign: Effects | None = None
-    ) -> MachineDynamics:
-        """Make the machine with hidden causes.
+    def make_machine(self, causes: Effects) -> MachineDynamics:
+        """Make the machine with hidden causes: effects of the library, or unmodelled ones."""
+        return MACHINES[self.system](self.numbers, causes)
 
-        Args:
-            effects: hidden effects of the library.
-            foreign: hidden unmodelled causes.
-        """
-        return MACHINES[self.system](self.numbers, effects or {}, foreign or {})
-
-    def simulate_readings(
-        self, effects: Effects | None = None, foreign: Effects | None = None, coarse: float = 1.0
-    ) -> Array:
+    def simulate_readings(self, causes: Effects, coarse: float = 1.0) -> Array:
         """Simulate noise-free encoder readings of the runs for fitting.
 
         The held-out runs at the end of `runs` are left out.
@@ -110,14 +101,13 @@ class MachineRecordingConditions:
         Shapes: R runs, T samples, N joints.
 
         Args:
-            effects: hidden effects of the library.
-            foreign: hidden causes that no effect of the library models.
+            causes: hidden causes.
             coarse: factor of the step size.
 
         Returns:
             Readings, (R, T, N).
         """
-        plant = self.make_machine(effects, foreign)
+        plant = self.make_machine(causes)
         return read_encoders(
             simulate_machine(plant, self.fitted_runs, coarse), plant, self.runs.times
         )
@@ -125,7 +115,7 @@ class MachineRecordingConditions:
     @cached_property
     def base_motion(self) -> MachineMotion:
         """Motion of the runs for fitting without hidden causes."""
-        return simulate_machine(self.make_machine(), self.fitted_runs)
+        return simulate_machine(self.make_machine({}), self.fitted_runs)
 
     @cached_property
     def motion_scales(self) -> dict[str, Array]:
@@ -140,7 +130,7 @@ class MachineRecordingConditions:
         q, v = self.base_motion.q, self.base_motion.v
         a = np.gradient(v, self.base_motion.times, axis=0)
         runs, joints = q.shape[1:]
-        plant, positions = self.make_machine(), q.reshape(-1, joints)
+        plant, positions = self.make_machine({}), q.reshape(-1, joints)
         inertia = plant.compute_mass_matrix(positions).reshape(len(q), runs, joints, joints)
         inertia_force = np.einsum("klij,klj->kli", inertia, a)
         force = inertia_force - plant.compute_gravity_force(positions).reshape(q.shape)
@@ -173,7 +163,7 @@ def draw_conditions(
     rate, count = requested.rate or rate, requested.runs or count
     times = np.arange(round(rate * seconds)) / rate
     numbers = _draw_servo_parameters(rng) if system == "servo" else _draw_arm_parameters(rng)
-    plant = MACHINES[system](numbers, {}, {})
+    plant = MACHINES[system](numbers, {})
     runs = _draw_runs(plant, times, count, rng)
     sigma = float(np.exp(rng.uniform(*np.log(ENCODER_NOISE_RANGE))))
     noise = SensorNoise(

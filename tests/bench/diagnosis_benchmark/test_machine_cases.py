@@ -72,8 +72,8 @@ def commands(plant):
     return np.stack([s * np.repeat(rng.uniform(-1, 1, 4), 10) for s in sizes], axis=1)
 
 
-def seen(system, effects, foreign=None):
-    plant = MACHINES[system](ARM if system == "arm2" else CONSTANTS | SERVO, effects, foreign or {})
+def seen(system, effects):
+    plant = MACHINES[system](ARM if system == "arm2" else CONSTANTS | SERVO, effects)
     count = len(plant.joints)
     begun = np.array([[0.3, -0.2][:count]])
     runs = MachineRuns(TIMES, commands(plant)[None], begun, 0.5 * begun)
@@ -137,7 +137,7 @@ def test_a_different_coefficient_does_not_agree(arm):
 
 def test_a_wheel_with_dry_friction_stops_where_mechanics_says():
     free = CONSTANTS | SERVO | {"kp": 0.0, "gravity": 0.0, "torque_constant": 0.0}
-    plant = ServoDynamics(free, {"friction.coulomb": (0.02,)}, {})
+    plant = ServoDynamics(free, {"friction.coulomb": (0.02,)})
     inertia = float(plant.compute_mass_matrix(np.zeros((1, 1)))[0, 0, 0])
     speed, slows = 1.5, 0.02 / inertia
     runs = MachineRuns(TIMES, np.zeros((1, 40, 1)), np.zeros((1, 1)), np.array([[speed]]))
@@ -149,7 +149,7 @@ def test_a_wheel_with_dry_friction_stops_where_mechanics_says():
 
 def test_an_arm_is_held_until_a_motor_exceeds_its_friction():
     plant = ArmDynamics(
-        ARM, {"friction.coulomb@shoulder": (1.0,), "friction.coulomb@elbow": (9.0,)}, {}
+        ARM, {"friction.coulomb@shoulder": (1.0,), "friction.coulomb@elbow": (9.0,)}
     )
     told = np.zeros((1, 40, 2))
     told[0, 20:, 0] = 1.05
@@ -162,10 +162,10 @@ def test_an_arm_is_held_until_a_motor_exceeds_its_friction():
 
 def test_foreign_causes_push_where_and_when_they_say():
     bare = seen_without_effects("arm2")
-    gust = seen("arm2", {}, {"gust@elbow": (0.5, 0.61, 0.2)})
+    gust = seen("arm2", {"gust@elbow": (0.5, 0.61, 0.2)})
     assert np.abs(gust - bare)[TIMES <= 0.6].max() == 0.0
     assert np.abs(gust - bare).max() > 0.01
-    patch = seen("arm2", {}, {"patch@shoulder": (0.5, 5.0, 0.1)})
+    patch = seen("arm2", {"patch@shoulder": (0.5, 5.0, 0.1)})
     assert np.abs(patch - bare).max() < 1e-6  # the arm never reaches the patch
 
 

@@ -156,7 +156,7 @@ def strange(system, foreign, initial, number=0, times=TIMES):
     names = list(SIMULATORS[system].states)
     run = Scenario(times, dict(zip(names, initial, strict=True)))
     return simulate_with_scipy(
-        TrueSystem(system, BASE[system], get_constants(system), {}, foreign),
+        TrueSystem(system, BASE[system], get_constants(system), foreign),
         run,
         CHANNELS[system],
         number,

@@ -10,8 +10,6 @@ from scipy.optimize import least_squares
 from bench.diagnosis_benchmark.case_generation import effect_coefficients, effect_sizing
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     EQUIVALENT_EFFECTS,
-    MIN_DISTINCT_SIZE,
-    BenchmarkCase,
     count_held_out_runs,
     draw_case,
     find_coefficients,
@@ -19,6 +17,8 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     write_case,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    MIN_DISTINCT_SIZE,
+    BenchmarkCase,
     SensorNoise,
     draw_conditions,
 )
@@ -135,13 +135,13 @@ def test_no_effect_of_the_library_explains_a_foreign_cause():
 @pytest.mark.parametrize("system", ["ball", "slider"])
 def test_every_run_contains_the_gust(system):
     drawn = draw_conditions(system, np.random.default_rng(0), ("gust",))
-    numbers = effect_coefficients.draw_unmodelled_cause(
+    numbers = effect_coefficients.draw_effect_shape(
         "gust", replace(drawn, scenarios=drawn.scenarios[:2]), np.random.default_rng(0)
     )(0.5)
-    world = drawn.make_true_system(foreign={"gust": numbers})
+    world = drawn.make_true_system({"gust": numbers})
     for number, run in enumerate(drawn.scenarios):
         change = simulate_with_scipy(world, run, drawn.channels, number) - simulate_with_scipy(
-            drawn.make_true_system(), run, drawn.channels
+            drawn.make_true_system({}), run, drawn.channels
         )
         assert np.abs(change).max() > 0.01
 
