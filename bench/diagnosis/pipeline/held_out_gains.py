@@ -11,12 +11,15 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import EffectNames
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.validation.gain_and_intervals import HeldOutGain, compute_held_out_gain
+from bench.diagnosis.validation.gain_and_intervals import (
+    MIN_REPORTED_GAIN,
+    HeldOutGain,
+    compute_closed_share,
+    compute_held_out_gain,
+)
 from bench.diagnosis.verdict import HeldOutResult, to_finite_or_none
 from sims.core.simulator import Array
 
-MIN_REPORTED_GAIN = -9.0
-"""Lower limit of a candidate's reported share of the held-out gap; it only means "worse"."""
 NOISE_RATIO = 1.05
 """Maximum ratio of an error to the noise at which the error is taken for noise."""
 ERROR_UNITS = ("m", "rad", "m/s", "rad/s")
@@ -137,14 +140,9 @@ class HeldOutGains:
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
         floor = self._noise_floor
-        # As for the gain of the whole model, an error below the noise floor is not a gain.
         before = _compute_rmse(runs, held_out_fits[()].simulated, self._channels)
         after = _compute_rmse(runs, held_out_fits[names].simulated, self._channels)
-        share = 0.0
-        # At the noise floor there is no gap, and the quotient would be a rounding error.
-        if before > floor * 1.001:
-            share = (before - max(after, floor)) / (before - floor)
-        return float(np.clip(share, MIN_REPORTED_GAIN, 1.0)) if np.isfinite(share) else None
+        return to_finite_or_none(float(compute_closed_share(before, after, floor)))
 
     def compute_share_intervals(self) -> dict[str, tuple[float, float]]:
         """Compute 95 % intervals of the share of the held-out gap that single effects close.

@@ -67,12 +67,8 @@ MIN_REPORTED_GAIN = -9.0
 """Lower limit of the reported share of the gap closed; for a failed model the exact value has no
 meaning.
 """
-PSEUDOINVERSE_CUTOFF = 1e-13
-"""Relative size of eigenvalues that the pseudoinverse takes for zero."""
 MIN_EIGENVALUE = 1e-12
-"""Eigenvalue of the scaled curvature below which a direction counts as unidentified."""
-UNIDENTIFIED_VARIANCE = 1e12
-"""Variance of an unidentified direction, in units of the scale."""
+"""Minimum eigenvalue of the scaled curvature; a direction with a smaller one is unidentified."""
 
 
 def compute_central_jacobian(
@@ -265,13 +261,9 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
     unit_products = np.outer(scale, scale)
     scaled = schur_complement / unit_products
-    inverse = np.linalg.pinv(scaled, rcond=PSEUDOINVERSE_CUTOFF, hermitian=True)
     values, vectors = np.linalg.eigh(scaled)
-    is_unidentified = values < MIN_EIGENVALUE
-    # The pseudo-inverse of an unidentified direction is zero, which would look certain.
-    if is_unidentified.any():
-        unidentified = vectors[:, is_unidentified]
-        inverse = inverse + (unidentified * UNIDENTIFIED_VARIANCE) @ unidentified.T
+    # An unidentified direction would look certain if its inverse were zero.
+    inverse = (vectors / np.maximum(values, MIN_EIGENVALUE)) @ vectors.T
     result: Array = inverse / unit_products  # (2)
     return result
 
@@ -432,22 +424,18 @@ def compute_held_out_gain(
             two or three runs are too few to draw from.
     """
     sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
-    total_sums = sums.sum(axis=0)
-    # Squared errors before and after, and number of samples.
-    before_sum, after_sum, count = total_sums
-    rms_before = float(np.sqrt(before_sum / count))
-    rms_after = float(np.sqrt(after_sum / count))
+    rms_before, rms_after = _compute_rms_errors(sums.sum(axis=0))
     # Whole runs are drawn, because samples of one run depend on each other.
     part_count = len(sums)
     drawn_parts = rng.integers(part_count, size=(BOOTSTRAP_RESAMPLES, part_count))
     resampled = sums[drawn_parts].sum(axis=1)
-    shares = _compute_closed_share(resampled, floor)
+    shares = compute_closed_share(*_compute_rms_errors(resampled), floor)
     low = high = np.nan
     # All resamples of a single part are equal, and would look certain.
     if part_count > 1:
         low, high = np.quantile(shares, INTERVAL_QUANTILES).tolist()
-    gap_closed = float(_compute_closed_share(total_sums[None], floor)[0])
-    return HeldOutGain(rms_before, rms_after, floor, gap_closed, low, high)
+    gap_closed = float(compute_closed_share(rms_before, rms_after, floor))
+    return HeldOutGain(float(rms_before), float(rms_after), floor, gap_closed, low, high)
 
 
 def _sum_squared_errors(
@@ -514,25 +502,27 @@ def _list_resampled_parts(
     return parts
 
 
-def _compute_closed_share(sums: Array, floor: float) -> Array:
-    """Compute the share of the gap closed, eq. (1), for each row of sums (n, 3); 0 without a gap.
+def _compute_rms_errors(sums: Array) -> tuple[Array, Array]:
+    """Compute RMS errors before and after from sums (..., 3) of squares, and numbers of samples."""
+    before, after, counts = np.moveaxis(sums, -1, 0)
+    return np.sqrt(before / counts), np.sqrt(after / counts)
 
-    A row has the squared errors before and after, and the number of samples.
+
+def compute_closed_share(base: Array | float, extended: Array | float, floor: float) -> Array:
+    """Compute the share of the gap closed, eq. (1), of any number of models; 0 without a gap.
 
     For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
 
     Args:
-        sums: (n, 3) sum of squared errors before and after, and number of samples, of n resamples.
+        base: RMS errors before.
+        extended: RMS errors after.
         floor: RMS of the noise.
     """
-    before, after, counts = sums.T
-    base = np.sqrt(before / counts)
-    extended = np.sqrt(after / counts)
     gap = base - floor
     # A model cannot reduce the error below the noise floor.
     reached_error = np.maximum(extended, floor)
     with np.errstate(all="ignore"):
-        share = (base - reached_error) / gap  # (1)
+        share = (base - reached_error) / np.asarray(gap)  # (1)
     # A gap below rounding errors would give an arbitrary share, and a resample may have no gap.
     shares = np.where(gap > 1e-3 * floor, share, 0.0)
     return np.clip(shares, MIN_REPORTED_GAIN, 1.0)

@@ -52,9 +52,9 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.validation.gain_and_intervals import (
-    MIN_EIGENVALUE,
     Z95,
     compute_fisher_blocks,
+    invert_scaled,
 )
 from sims.core.simulator import Array
 from sims.recording.recording import Run
@@ -217,11 +217,19 @@ class GroupEstimate:
 
 @dataclass(frozen=True)
 class Trend:
-    """Linear trend of a parameter over the groups: slope, its standard error and its p-value."""
+    """Linear trend of a parameter over the groups.
+
+    Attributes:
+        slope: Slope.
+        error: Its standard error.
+        p_value: Its p-value.
+        mean_square: Mean square of the estimates about the line, in units of their errors.
+    """
 
     slope: float
     error: float
     p_value: float
+    mean_square: float
 
 
 @dataclass(frozen=True)
@@ -390,13 +398,8 @@ def _find_trend_covariate(
             else None
         )
         if trend is not None:
-            trends.append(
-                (
-                    _compute_residual_mean_square(consistency.group_estimates, values),
-                    covariate,
-                    trend,
-                )
-            )
+            # The mean square about the line is at least that of the errors, 1.
+            trends.append((max(trend.mean_square, 1.0), covariate, trend))
     significant_trends = [
         entry for entry in trends if entry[2].p_value < SIGNIFICANCE_LEVEL / len(trends)
     ]
@@ -410,23 +413,6 @@ def _find_trend_covariate(
         if covariate is not best and residual_scatter < COVARIATE_TIE_FACTOR * lowest_scatter
     ]
     return TrendCovariate(best.kind, best.name, trend, tuple(similar_covariates))
-
-
-def _compute_residual_mean_square(
-    group_estimates: Sequence[GroupEstimate], covariate_values: Array
-) -> float:
-    """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation).
-
-    Args:
-        group_estimates: estimates of G groups with their standard errors.
-        covariate_values: (G,) mean of the covariate in each group.
-    """
-    values = np.array([part.value for part in group_estimates])
-    weights = np.array([part.error for part in group_estimates]) ** -2.0
-    residual = values - np.polyval(
-        np.polyfit(covariate_values, values, 1, w=np.sqrt(weights)), covariate_values
-    )
-    return max(float(weights @ residual**2) / (len(group_estimates) - 2), 1.0)
 
 
 def _assess_parameter(consistency: ParameterConsistency, level: float) -> ParameterConsistency:
@@ -531,10 +517,10 @@ def _test_parameters(
         curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
         gradients: (R, q) g_r of eq. (1).
     """
-    joint_covariance = _invert_regularised(curvatures.sum(axis=0))
+    joint_covariance = _invert(curvatures)
     steps, group_errors = [], []
     for runs in grouping.runs:
-        group_covariance = _invert_regularised(curvatures[list(runs)].sum(axis=0))
+        group_covariance = _invert(curvatures[list(runs)])
         steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
         group_errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
     for column, index in enumerate(model.fit.free_indices.tolist()):
@@ -571,14 +557,16 @@ def _test_parameters(
         )
 
 
-def _invert_regularised(curvature: Array) -> Array:
-    """Invert a curvature matrix; directions that the runs do not identify get a huge variance."""
-    scale = np.sqrt(np.maximum(np.diagonal(curvature), 1e-200))
-    values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
-    result: Array = (
-        (vectors / np.maximum(values, MIN_EIGENVALUE)) @ vectors.T / np.outer(scale, scale)
-    )
-    return result
+def _invert(curvatures: Array) -> Array:
+    """Invert the sum of the curvatures (R, q, q) of runs; see `invert_scaled`."""
+    curvature = curvatures.sum(axis=0)
+    return invert_scaled(curvature, curvature)
+
+
+def _weigh(group_estimates: Sequence[GroupEstimate]) -> tuple[Array, Array]:
+    """Return the values of the groups, and their weights: the squares of the inverse errors."""
+    values = np.array([part.value for part in group_estimates])
+    return values, np.array([part.error for part in group_estimates]) ** -2.0
 
 
 def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[float, float]:
@@ -592,8 +580,7 @@ def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[f
     Args:
         group_estimates: Estimate and standard error of each group.
     """
-    values = np.array([part.value for part in group_estimates])
-    weights = np.array([part.error for part in group_estimates]) ** -2.0
+    values, weights = _weigh(group_estimates)
     weighted_mean = float(weights @ values / weights.sum())
     q = float(weights @ (values - weighted_mean) ** 2)  # (3)
     degrees_of_freedom = len(group_estimates) - 1
@@ -616,8 +603,7 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     """
     if len(group_estimates) < 3 or not np.ptp(covariate_values) > 0:
         return None
-    values = np.array([part.value for part in group_estimates])
-    weights = np.array([part.error for part in group_estimates]) ** -2.0
+    values, weights = _weigh(group_estimates)
     centred = covariate_values - weights @ covariate_values / weights.sum()
     spread = float(weights @ centred**2)
     slope = float(weights @ (centred * values)) / spread
@@ -633,6 +619,7 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
         erfc(t_statistic / sqrt(2.0))
         if mean_square <= 1.0
         else _compute_student_p_value(t_statistic, degrees_of_freedom),
+        mean_square,
     )
 
 
