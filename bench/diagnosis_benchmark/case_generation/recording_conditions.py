@@ -437,8 +437,8 @@ class BenchmarkCase(Document):
         Args:
             causes: names of the causes.
             size: size of each cause alone, in units of the noise.
-            find_coefficients: finds the coefficients of a cause with this size; None if there are
-                none.
+            find_coefficients: finds the coefficients of a cause with this size; None if it
+                finds none.
             compute_unexplained: computes, from the coefficients of the causes by name, the RMS
                 residual that the best wrong answer leaves; None if there is none.
 
