@@ -16,8 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect, Level
-from sims.core.engine import Engine
-from sims.core.plain_values import is_plausible_number, truncate_text
+from sims.core.engine import Engine, check_positive
 from sims.core.simulator import Array, InputError
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 from sims.engines.external.bullet_world import import_pybullet
@@ -269,10 +268,7 @@ class OwnSimulator(SystemSimulator):
             raise InputError(
                 f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
             )
-        if not (is_plausible_number(step) and step > 0):
-            found_text = truncate_text(str(step))
-            raise InputError(f"time_step must be a positive number of seconds, found {found_text}")
-        return OwnSimulatorEngine(self, step)
+        return OwnSimulatorEngine(self, check_positive("time_step", step))
 
     def close(self) -> None:
         """Release resources of the simulator."""

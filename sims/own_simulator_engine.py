@@ -105,7 +105,7 @@ class OwnSimulatorEngine:
         levels = np.full(shape, np.nan)
         for element in range(len(batch.theta)):
             try:
-                rows = self._run(batch, element)
+                rows = self._run(batch.select(np.array([element])))
             except InputError:
                 raise
             except Exception as error:
@@ -114,15 +114,14 @@ class OwnSimulatorEngine:
                 levels[element] = rows
         return Trajectories(levels, levels, levels)
 
-    def _run(self, batch: IntegrationBatch, element: int) -> Array | None:
-        """Simulate one batch element, given by its number, with the user's simulator.
+    def _run(self, batch: IntegrationBatch) -> Array | None:
+        """Simulate one batch element with the user's simulator.
 
         Before each step the forces of effects are applied, and after it levels are cut at their
         rims.
 
         Args:
-            batch: Batch of parameter vectors with inputs, steps and effects.
-            element: Index of the element.
+            batch: Batch of this element alone.
 
         Returns:
             (N, C) readings of all channels, at the start and after each `steps_per_sample` steps.
@@ -131,20 +130,20 @@ class OwnSimulatorEngine:
         system = batch.system
         world = self.world
         names = [p.name for p in system.parameters]
-        theta = dict(zip(names, batch.theta[element].tolist(), strict=True))
-        constants = {name: float(value[element, 0]) for name, value in batch.constants.items()}
+        theta = dict(zip(names, batch.theta[0].tolist(), strict=True))
+        constants = {name: float(value[0, 0]) for name, value in batch.constants.items()}
         states = (*system.coordinates, *system.rates)
-        start = [*batch.x[element].tolist(), *batch.v[element].tolist()]
+        start = [*batch.x[0].tolist(), *batch.v[0].tolist()]
         initial = dict(zip(states, start, strict=True))
         # Never pass NaN to a user's model: it may hang or never recover.
         arguments = [*theta.values(), *constants.values(), *initial.values()]
         if not np.isfinite(arguments).all():
             return None
         world.reset(theta, constants, initial)
-        forces = _Forces(batch, element, world)
-        rims = _LevelLimits(batch, element, world)
+        forces = _Forces(batch, world)
+        rims = _LevelLimits(batch, world)
         rims.keep()
-        steps = batch.steps[element].copy()
+        steps = batch.steps[0].copy()
         # Steps of zero length, in which this batch element waits for others, are skipped.
         moving = steps > 0
         steps[moving] = equalise_steps(steps[moving], batch.steps_per_sample)
@@ -154,7 +153,7 @@ class OwnSimulatorEngine:
         samples = [sample]
         for step_index, seconds in enumerate(steps.tolist()):
             if seconds > 0:
-                inputs = {name: float(u[element, step_index]) for name, u in batch.inputs.items()}
+                inputs = {name: float(u[0, step_index]) for name, u in batch.inputs.items()}
                 if forces.any:
                     world.apply_force(forces.at(time, inputs, seconds))
                 world.step(inputs, seconds)
@@ -278,20 +277,18 @@ def get_checked_inertia(simulator: SteppableSimulator) -> float | Array:
 class _LevelLimits:
     """Limits of the levels of one batch element."""
 
-    def __init__(self, batch: IntegrationBatch, element: int, world: SteppableSimulator) -> None:
+    def __init__(self, batch: IntegrationBatch, world: SteppableSimulator) -> None:
         """Select the effects that limit a level of this element, with coefficients (K, 1, 1).
 
         An effect without a place limits the first level of the system.
 
         Shapes: K coefficients.
         """
-        self.acting = []
-        for effect, c in batch.effects:
-            element_coefficients = c[:, element : element + 1]
-            if isinstance(effect, Level) and element_coefficients.any():
-                self.acting.append(
-                    (effect, element_coefficients, effect.place or batch.system.levels[0])
-                )
+        self.acting = [
+            (effect, c, effect.place or batch.system.levels[0])
+            for effect, c in batch.effects
+            if isinstance(effect, Level) and c.any()
+        ]
         self.world = world
 
     def keep(self) -> None:
@@ -309,7 +306,7 @@ class _LevelLimits:
 class _Forces:
     """Forces of the effects on one batch element."""
 
-    def __init__(self, batch: IntegrationBatch, element: int, world: SteppableSimulator) -> None:
+    def __init__(self, batch: IntegrationBatch, world: SteppableSimulator) -> None:
         """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
 
         `_last` holds velocity, forces and length of the previous step, from which (1) estimates
@@ -317,19 +314,14 @@ class _Forces:
 
         Shapes: K coefficients.
         """
-        element_effects = [(effect, c[:, element : element + 1]) for effect, c in batch.effects]
-        active_effects = [(effect, c) for effect, c in element_effects if c.any()]
+        active_effects = [(effect, c) for effect, c in batch.effects if c.any()]
         self.forces = [(effect, c) for effect, c in active_effects if isinstance(effect, Force)]
         self.frictions = [
             (effect, c) for effect, c in active_effects if isinstance(effect, Friction)
         ]
         self.any = bool(self.forces or self.frictions)
         self.world = world
-        self.system = batch.system
-        self.theta = batch.theta[element : element + 1]
-        self.constants = {
-            name: value[element : element + 1] for name, value in batch.constants.items()
-        }
+        self.batch = batch
         self._last: tuple[Array, Array, float] | None = None
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
@@ -349,7 +341,8 @@ class _Forces:
         v = self._read_state(observation, self.world.rates)
         applied_inputs = {name: np.array([[value]]) for name, value in inputs.items()}
         time = np.array([[t]])
-        moment = StateSnapshot(self.system, self.theta, self.constants, time, x, v, applied_inputs)
+        system, theta, constants = self.batch.system, self.batch.theta, self.batch.constants
+        moment = StateSnapshot(system, theta, constants, time, x, v, applied_inputs)
         force = np.zeros(x.shape[1])
         for effect, c in self.forces:
             force = force + effect.force(c, moment)[0]

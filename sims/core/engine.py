@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
 
 from sims.core.effect import ActiveEffects
-from sims.core.simulator import Array
+from sims.core.plain_values import is_plausible_number, truncate_text
+from sims.core.simulator import Array, Indices, InputError
 from sims.core.system import System
 
 
@@ -39,6 +42,29 @@ class IntegrationBatch:
     effects: ActiveEffects
     steps_per_sample: int = 1
 
+    def select(self, i: Indices) -> IntegrationBatch:
+        """Return the part of the batch with the elements i (n,).
+
+        Engines use it to simulate some elements separately. All elements in their order give the
+        batch itself, and steps that all elements share are not copied.
+        """
+        if i.size == len(self.x) and (i[1:] > i[:-1]).all():
+            return self
+        if self.steps.strides[0] == 0:  # steps shared by all elements stay shared
+            steps = np.broadcast_to(self.steps[0], (i.size, self.steps.shape[1]))
+        else:
+            steps = self.steps[i]
+        return replace(
+            self,
+            theta=self.theta[i],
+            constants={name: values[i] for name, values in self.constants.items()},
+            x=self.x[i],
+            v=self.v[i],
+            steps=steps,
+            inputs={name: values[i] for name, values in self.inputs.items()},
+            effects=tuple((effect, c[:, i]) for effect, c in self.effects),
+        )
+
 
 @dataclass(frozen=True)
 class Trajectories:
@@ -51,6 +77,22 @@ class Trajectories:
     x: Array
     v: Array
     a: Array
+
+
+def check_positive(name: str, value: Any, expected: str = "a positive number of seconds") -> float:
+    """Return a setting of an engine as a float.
+
+    Args:
+        name: Name of the setting, for messages.
+        value: Its value.
+        expected: Words for the expected value.
+
+    Raises:
+        InputError: The value is not a positive number.
+    """
+    if not (is_plausible_number(value) and value > 0):
+        raise InputError(f"{name} must be {expected}, found {truncate_text(str(value))}")
+    return float(value)
 
 
 class Engine(Protocol):

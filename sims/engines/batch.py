@@ -7,12 +7,10 @@ is inactive on an element changes nothing there. Elements are stepped by
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from sims.core.engine import IntegrationBatch, Trajectories
-from sims.core.plain_values import is_plausible_number, truncate_text
+from sims.core.engine import IntegrationBatch, Trajectories, check_positive
+from sims.core.plain_values import truncate_text
 from sims.core.simulator import Indices, InputError
 from sims.core.system import System
 from sims.engines.compiled.batch_runner import integrate_batch
@@ -59,22 +57,14 @@ class BatchEngine:
             patience: Largest number of steps per planned step, after which an element fails.
             jobs: Number of threads.
         """
-        if not (is_plausible_number(time_step) and time_step > 0):
-            raise InputError(
-                "engine batch: time_step must be a positive number of seconds, found"
-                f" {truncate_text(str(time_step))}"
-            )
+        self.largest_step = check_positive("engine batch: time_step", time_step)
         for name, value in (("turn", turn), ("patience", patience)):
-            if value != np.inf and not (is_plausible_number(value) and value > 0):
-                raise InputError(
-                    f"engine batch: {name} must be a positive number, "
-                    f"found {truncate_text(str(value))}"
-                )
+            if value != np.inf:
+                check_positive(f"engine batch: {name}", value, "a positive number")
         if not (isinstance(jobs, int) and jobs >= 1):
             raise InputError(
                 f"engine batch: jobs must be a number of threads, found {truncate_text(str(jobs))}"
             )
-        self.largest_step = float(time_step)
         self._max_phase = float(turn)
         self._patience = float(patience)
         self._jobs = jobs
@@ -127,30 +117,6 @@ def make_engine(
         The engine; see `BatchEngine`.
     """
     return BatchEngine(time_step, turn, patience, jobs)
-
-
-def slice_batch(batch: IntegrationBatch, i: Indices) -> IntegrationBatch:
-    """Return the part of a batch with the elements i (n,).
-
-    Engines use it to simulate some elements separately. All elements in their order give the
-    batch itself, and steps that all elements share are not copied.
-    """
-    if i.size == len(batch.x) and (i[1:] > i[:-1]).all():
-        return batch
-    if batch.steps.strides[0] == 0:  # steps shared by all elements stay shared
-        steps = np.broadcast_to(batch.steps[0], (i.size, batch.steps.shape[1]))
-    else:
-        steps = batch.steps[i]
-    return replace(
-        batch,
-        theta=batch.theta[i],
-        constants={name: values[i] for name, values in batch.constants.items()},
-        x=batch.x[i],
-        v=batch.v[i],
-        steps=steps,
-        inputs={name: values[i] for name, values in batch.inputs.items()},
-        effects=tuple((effect, c[:, i]) for effect, c in batch.effects),
-    )
 
 
 def join_trajectories(

@@ -23,7 +23,7 @@ from sims.core.effect import Effect, Force, Friction, HiddenState, HiddenStateEf
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot, System
-from sims.engines.batch import join_trajectories, slice_batch
+from sims.engines.batch import join_trajectories
 
 
 class AugmentedSystem(System):
@@ -179,7 +179,7 @@ def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Tra
     for pattern in sorted(set(patterns.tolist())):
         group_indices = np.flatnonzero(patterns == pattern)
         active_effects = [pair for k, pair in enumerate(hidden) if pattern >> k & 1]
-        group = slice_batch(replace(batch, effects=other_effects), group_indices)
+        group = replace(batch, effects=other_effects).select(group_indices)
         effects = [(e, c[:, group_indices]) for e, c in active_effects]
         motion = engine.integrate(_augment_batch(group, effects) if active_effects else group)
         base_size = batch.x.shape[1]

@@ -45,6 +45,7 @@ import numpy as np
 
 from sims.core.effect import Contact
 from sims.core.simulator import Array
+from sims.core.system import StateSnapshot
 from sims.engines.external.external_engine import (
     ElementForces,
     ElementWork,
@@ -61,7 +62,9 @@ def get_gravity(element: ElementWork) -> Vector:
     """Return the acceleration of gravity, a vector, as the system computes it; it is constant."""
     start = np.zeros((1, 1))
     zeros = np.zeros((1, 3))
-    moment = element.make_snapshot(start, zeros, zeros, {})
+    moment = StateSnapshot(
+        element.system, element.theta, element.constants, start, zeros, zeros, {}
+    )
     weight: list[float] = element.system.weight(moment)[0].tolist()
     return weight
 
@@ -149,7 +152,7 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     rollout = BallRollout(ball, element)
     recorded_steps = set(element.recorded_steps.tolist())
     recorded_states = [rollout.state]
-    for number, step in enumerate(element.steps.tolist(), start=1):
+    for number, step in enumerate(element.steps[0].tolist(), start=1):
         rollout.advance(step)
         if number in recorded_steps:
             recorded_states.append(rollout.state)
@@ -184,9 +187,9 @@ class BallRollout:
         self._short_flights = 0
         self._gravity = get_gravity(element)
         self._floor = float(element.system.floor(element.constants)[0, 0])
-        x, y, z = element.x.tolist()
+        x, y, z = element.x[0].tolist()
         self.x: Vector = x, y, max(z, self._floor)  # not inside the ground
-        self.v: Vector = element.v.tolist()
+        self.v: Vector = element.v[0].tolist()
         self.a = self._gravity
         self.lift = self._gravity[2]
         self.w: Vector | None = None
@@ -413,15 +416,15 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
 
     floor = float(element.system.floor(element.constants)[0, 0])
     ball.reset_world(element.plain_constants)
-    x: Vector = element.x.tolist()
-    w: Vector = element.v.tolist()
+    x: Vector = element.x[0].tolist()
+    w: Vector = element.v[0].tolist()
     ball.set_contact_parameters(*forces.compute_impact(max(-w[2], 0.0)))
     ball.set_state(x, w)
     recorded_steps = set(element.recorded_steps.tolist())
     t = 0.0
     step = math.nan
     recorded_states = [(*x, *w, *compute_force(t, x, w))]
-    for number, seconds in enumerate(element.steps.tolist(), start=1):
+    for number, seconds in enumerate(element.steps[0].tolist(), start=1):
         if seconds != step:
             step = seconds
             ball.set_step(step)

@@ -22,17 +22,16 @@ those of a force program (`external.external_engine`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from sims.core.effect import ActiveEffects, Contact, Force, Friction
-from sims.core.engine import IntegrationBatch, Trajectories
-from sims.core.plain_values import is_plausible_number, truncate_text
-from sims.core.simulator import Array, Indices, InputError
-from sims.core.system import StateSnapshot, System
+from sims.core.effect import Contact, Force, Friction
+from sims.core.engine import IntegrationBatch, Trajectories, check_positive
+from sims.core.simulator import Array, Indices
+from sims.core.system import System
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     HAS_FRICTION,
@@ -63,33 +62,19 @@ Trajectory = tuple[Array, Array, Array]
 """Trajectory of one batch element: positions, velocities and accelerations, each (N, D)."""
 
 
-@dataclass(frozen=True)
-class ElementWork:
-    """Work for one batch element; effects whose coefficients are all zero are left out.
+@dataclass(frozen=True, kw_only=True)
+class ElementWork(IntegrationBatch):
+    """Batch of a single element, without effects whose coefficients are all zero.
+
+    Its steps are all > 0; steps of zero length are left out. Inputs have at least one value.
 
     Attributes:
-        system: system to integrate.
-        theta: (1, p) parameters of the system.
-        constants: (1, 1) constants by name; `plain_constants` returns them as floats.
-        x: (D,) initial position.
-        v: (D,) initial velocity.
-        steps: (S,) step sizes in seconds, all > 0; steps of zero length are left out.
-        inputs: (S,) inputs by name, at least one value.
-        effects: active effects with coefficients (K, 1, 1).
-        program: force program of the system and these effects.
+        program: force program of the system and the effects.
         parameters: (P,) parameters of the program.
         recorded_steps: (N,) increasing step counts, beginning with 0, after which the state is
             recorded.
     """
 
-    system: System
-    theta: Array
-    constants: Mapping[str, Array]
-    x: Array
-    v: Array
-    steps: Array
-    inputs: Mapping[str, Array]
-    effects: ActiveEffects
     program: ForceProgram | NumpyForceProgram
     parameters: Array
     recorded_steps: Indices
@@ -98,27 +83,6 @@ class ElementWork:
     def plain_constants(self) -> dict[str, float]:
         """Constants as floats, by name."""
         return {name: float(value[0, 0]) for name, value in self.constants.items()}
-
-    def make_snapshot(
-        self, t: Array, x: Array, v: Array, inputs: Mapping[str, Array]
-    ) -> StateSnapshot:
-        """Make a snapshot of n states of this element.
-
-        Shapes: D coordinates.
-
-        Args:
-            t: (n, 1) times in seconds.
-            x: (n, D) positions.
-            v: (n, D) velocities.
-            inputs: (n, 1) inputs by name.
-
-        Returns:
-            The snapshot.
-        """
-        n = len(x)
-        constants = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
-        theta = np.repeat(self.theta, n, axis=0)
-        return StateSnapshot(self.system, theta, constants, t, x, v, inputs)
 
 
 RolloutFunction = Callable[[ElementWork], Trajectory]
@@ -230,28 +194,22 @@ def _make_element(
         steps: lengths of these steps in seconds.
         recorded_steps: numbers of the steps after which the state is recorded.
     """
-    batch_effects = [(effect, c[:, i : i + 1]) for effect, c in batch.effects]
-    effects = tuple((effect, c) for effect, c in batch_effects if c.any())
+    element = batch.select(np.array([i]))
+    effects = tuple((effect, c) for effect, c in element.effects if c.any())
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
-    program = get_force_program(batch, np.array([i]), [effect for effect, _ in forces])
-    numbers = [batch.theta[i], *(value[i] for value in batch.constants.values())]
-    parameters = np.concatenate([*numbers, *(c[:, 0, 0] for _, c in forces)])
-    constants = {name: value[i : i + 1] for name, value in batch.constants.items()}
+    numbers = [element.theta[0], *(value[0] for value in element.constants.values())]
     # An element without any step of positive length still has an input at its single time.
     input_steps = moving if moving.size else slice(1)
-    inputs = {name: value[i, input_steps] for name, value in batch.inputs.items()}
+    changes = {
+        "steps": steps[None],
+        "inputs": {name: values[:, input_steps] for name, values in element.inputs.items()},
+        "effects": effects,
+    }
     return ElementWork(
-        batch.system,
-        batch.theta[i : i + 1],
-        constants,
-        batch.x[i],
-        batch.v[i],
-        steps,
-        inputs,
-        effects,
-        program,
-        parameters,
-        recorded_steps,
+        **(vars(element) | changes),
+        program=get_force_program(element, np.array([0]), [effect for effect, _ in forces]),
+        parameters=np.concatenate([*numbers, *(c[:, 0, 0] for _, c in forces)]),
+        recorded_steps=recorded_steps,
     )
 
 
@@ -304,10 +262,7 @@ def resolve_time_step(time_step: float | None, system: type[System]) -> float:
     """
     if time_step is None:
         return DEFAULT_MAX_STEPS[system.kind]
-    if not (is_plausible_number(time_step) and time_step > 0):
-        found_text = truncate_text(str(time_step))
-        raise InputError(f"time_step must be a positive number of seconds, found {found_text}")
-    return float(time_step)
+    return check_positive("time_step", time_step)
 
 
 Vector = Sequence[float]
@@ -345,7 +300,7 @@ class ElementForces:
         self._limit = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
         self._impact = offsets[OUT_E], offsets[OUT_MU]
         self._states = states
-        self._signals = [values.tolist() for values in element.inputs.values()]
+        self._signals = [values[0].tolist() for values in element.inputs.values()]
         self._restitution = (
             float(element.system.restitution(element.theta)[0, 0]) if flags[BOUNCES] else 0.0
         )

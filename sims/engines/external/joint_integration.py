@@ -207,8 +207,8 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
     if not inertia > 0.0:
         return failed, failed, failed
     forces = LinearisedForces(joint, element, inertia)
-    x = float(element.x[0])
-    v = float(element.v[0])
+    x = float(element.x[0, 0])
+    v = float(element.v[0, 0])
     t = 0.0
     step = math.nan
     w = v
@@ -216,7 +216,7 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
     forces.linearise(t, x, v)
     recorded_steps = set(element.recorded_steps.tolist())
     step_records = [(x, v, forces.compute_acceleration(v))]
-    for i, h in enumerate(element.steps.tolist()):
+    for i, h in enumerate(element.steps[0].tolist()):
         if i and forces.set_inputs(i):
             forces.linearise(t, x, v)
         start = integrate_velocity(

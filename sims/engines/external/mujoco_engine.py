@@ -7,12 +7,11 @@ interface is specified in `sims.engines.external.world_interface`.
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from functools import partial
 from typing import cast
 
-from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.engine import Engine, IntegrationBatch, Trajectories, check_positive
 from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
@@ -92,8 +91,8 @@ def make_engine(
         return MujocoEngine(system, step, threads=threads)
     if not system.bounces:
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
-    if stiffness is not None and not 0 < stiffness < math.inf:
-        raise InputError(f"stiffness must be a positive number, found {stiffness}")
+    if stiffness is not None:
+        check_positive("stiffness", stiffness, "a positive number")
     return MujocoEngine(system, step, stiffness or _CONTACT_STIFFNESS, threads)
 
 
