@@ -13,7 +13,7 @@ from bench.benchmark.problem.experiment_tables import compute_problem_hash
 from bench.benchmark.problem.missing_requirements import leave_out_missing_problems
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
-from bench.studies.archive_bundle import verify_archive, write_bundle
+from bench.studies.archive_bundle import verify_results, write_bundle
 from bench.studies.study import begin_studies, report_jointly
 from bench.suite import suite_page
 from bench.suite.suite_runs import read_suite_runs, write_suite_runs
@@ -201,7 +201,7 @@ def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_su
     assert set(read_suite_runs(tmp_path / "own").cells["suite"]) == {"suite 1"}
     bundle = write_bundle(tmp_path / "own", tmp_path / "own.zip")
     assert bundle.command == "simgap compare suite --plugin own/plugins/mine.py --tuners mine"
-    assert verify_archive(bundle.archive, lambda line: None, [str(plugin)]).is_consistent
+    assert verify_results(bundle.archive, lambda line: None, [str(plugin)]).is_consistent
 
 
 @pytest.mark.usefixtures("undrawn")
