@@ -22,7 +22,6 @@ from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     make_robot_experiment,
 )
-from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.comparison_resources import check_comparison_size
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.statistics.comparison_statistics import build_tables
@@ -333,15 +332,8 @@ class ComparisonResult:
 
     @cached_property
     def _axis_labels(self) -> comparison_charts.AxisLabels:
-        """Labels of axes in figures: names and units of the parameters and channels.
-
-        The problem is built to read them, which takes time, so the labels are cached.
-        """
-        problem = TuningProblem(self.experiment)
-        try:
-            return comparison_charts.make_axis_labels(problem)
-        finally:
-            problem.close()
+        """Labels of axes in figures: names and units of the parameters and channels."""
+        return comparison_charts.make_axis_labels(self.experiment)
 
     def _read_csv_table(self, name: str) -> pd.DataFrame:
         """Read a table file of a bounce shot or of a study of two comparisons.

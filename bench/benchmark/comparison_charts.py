@@ -28,7 +28,7 @@ from bench.benchmark.statistics.training_amortisation import (
     map_break_even_counts,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
-from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles
+from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles, compute_category_offset
 from bench.pages.chart import Axis, AxisSpan, Panel, ReferenceLine, Series, SeriesKind
 from bench.pages.text_format import format_number
 
@@ -45,11 +45,14 @@ class AxisLabels(NamedTuple):
     parameter: str
 
 
-def make_axis_labels(problem: TuningProblem) -> AxisLabels:
-    """Make the axis labels for a comparison's problem, with units.
+def make_axis_labels(experiment: Experiment) -> AxisLabels:
+    """Make the axis labels of a comparison, with units.
 
-    The label of a parameter is empty if there are several, because they share no unit.
+    The label of a parameter is empty if there are several, because they share no unit. The problem
+    is built to find the names and units of its parameters and channels, which takes time.
     """
+    problem = TuningProblem(experiment)
+    problem.close()
     channel = problem.channels[problem.error_channel]
     parameters = problem.cube.parameters
     parameter = ""
@@ -244,7 +247,7 @@ def _make_median_chart(
         side_by_side: facet whose panels are side by side.
     """
     statistics, budget = view.statistics, view.experiment.budget
-    x_axis = _make_simulations_axis(budget)
+    x_axis = make_simulations_axis(budget)
     frames, panels = [], []
     for metric, kind in keys:
         medians = statistics.compute_median_curves(metric, kind)
@@ -293,18 +296,8 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
     )
     panels = []
     for simulations in select_distance_checkpoints(view.experiment.budget):
-        series = tuple(
-            Series(
-                name,
-                "median",
-                mark_style,
-                {"tuner": name, "simulations": str(simulations)},
-                "low",
-                "high",
-                "points",
-                view.style.get_category_offset(name),
-            )
-            for name, mark_style in view.get_tuner_styles(table["tuner"])
+        series = _make_tuner_series(
+            view, table, "median", "points", "low", "high", simulations=str(simulations)
         )
         facets = {"after": f"{simulations} simulations"}
         title = f"After {simulations} simulations"
@@ -312,7 +305,7 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
     return ComparisonChart(panels, {"distance": table}, "after", _make_notes(view))
 
 
-def _make_simulations_axis(budget: int) -> Axis:
+def make_simulations_axis(budget: int) -> Axis:
     """Make the axis of the number of simulations, up to a budget.
 
     Args:
@@ -347,7 +340,7 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
     """
     table = view.statistics.runtime_distribution
     budget = int(table["simulations"].max())
-    x_axis = _make_simulations_axis(budget)
+    x_axis = make_simulations_axis(budget)
     # A margin of 0.02, so that lines at 0 and 1 are visible.
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panels = []
@@ -463,8 +456,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                     "low",
                     "high",
                     "points",
-                    # The tuners are spread over 0.6 of a category.
-                    0.6 * ((tuner_index + 0.5) / len(trained) - 0.5),
+                    compute_category_offset(tuner_index, len(trained)),
                 )
                 for tuner_index, name in enumerate(trained)
             )
@@ -583,8 +575,10 @@ def _make_tuner_series(
         where: values of further columns, by which the rows are selected.
     """
     styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
+    # Points of several tuners in one category lie side by side.
+    shifts = {name: view.style.get_category_offset(name) * (draw == "points") for name, _ in styles}
     return tuple(
-        Series(name, y, mark_style, {"tuner": name, **where}, low, high, draw)
+        Series(name, y, mark_style, {"tuner": name, **where}, low, high, draw, shifts[name])
         for name, mark_style in styles
     )
 

@@ -10,15 +10,16 @@ from pathlib import Path
 import pandas as pd
 
 from bench.benchmark import best_tuner_summary, comparison_figures
-from bench.benchmark.comparison_charts import AxisLabels, ComparisonView, make_axis_labels
+from bench.benchmark.comparison_charts import ComparisonView, make_axis_labels
 from bench.benchmark.comparison_page import (
     ComparisonReportData,
     format_redraws,
+    list_mean_seconds,
     render_page,
 )
 from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
+from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.error_curves import build_summary
 from bench.benchmark.storage.result_folder import (
@@ -61,7 +62,7 @@ _PRINTED_CHECKPOINTS = (3, 10)
 
 
 @numeric_warnings_silenced()
-def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str], None]) -> int:
+def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and the report page of a comparison, and print a summary.
 
     The summary has the best tuners, their median errors, limitations of the comparison, failures
@@ -77,14 +78,14 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     if stored.runs.empty:
         print_line(f"no run was made; {folder}/status.csv has the reasons")
         return 0
-    labels, statistics = make_axis_labels(problem), ComparisonStatistics(stored)
-    tables = build_tables(stored, statistics)
+    view = ComparisonView(stored, make_axis_labels(stored.experiment), ComparisonStatistics(stored))
+    tables = build_tables(stored, view.statistics)
     for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
-    pictures = _render_figures(stored, labels, statistics)
+    pictures = _render_figures(view)
     figures = _write_figures(folder, pictures)
     results = ComparisonReportData(
-        ComparisonView(stored, labels, statistics),
+        view,
         tables,
         pictures,
         read_environment(folder),
@@ -95,18 +96,18 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     write_atomically(folder / REPORT_FILE, render_page(results))
 
     lines = tables["table"]
-    for text in _describe_best_tuners(results.view):
-        print_line(text)
-    for text in _format_median_errors(lines, labels, statistics):
-        print_line(text)
-    for text in _list_limitations(stored.experiment):
+    for text in (
+        *_describe_best_tuners(view),
+        *_format_median_errors(lines, view),
+        *_list_limitations(stored.experiment),
+    ):
         print_line(text)
     if redraw_note := format_redraws(results):
         print_line(f"\n{redraw_note}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     for text in format_failures(failed):
         print_line(text)
-    print_line("\n" + _format_run_seconds(lines, statistics))
+    print_line("\n" + _format_run_seconds(results))
     print_line(f"\ntable   {folder / 'table.csv'}")
     print_line(f"more    {folder}/{', '.join(f'{name}.csv' for name in tables if name != 'table')}")
     for figure in figures:
@@ -116,13 +117,13 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     return int((failed["status"] != "skipped").sum())
 
 
-def _render_figures(
-    stored: StoredComparison, labels: AxisLabels, statistics: ComparisonStatistics
-) -> dict[str, FigureFiles]:
+def _render_figures(view: ComparisonView) -> dict[str, FigureFiles]:
     """Render all figures that exist for the comparison, by name."""
     return {
-        name: render_all_formats(comparison_figures.draw_figure(stored, labels, name, statistics))
-        for name in comparison_figures.list_figure_names(stored)
+        name: render_all_formats(
+            comparison_figures.draw_figure(view.stored, view.labels, name, view.statistics)
+        )
+        for name in comparison_figures.list_figure_names(view.stored)
     }
 
 
@@ -225,35 +226,30 @@ def _format_ranking(ranking: best_tuner_summary.TunerRanking) -> list[str]:
     return lines
 
 
-def _format_median_errors(
-    lines: pd.DataFrame, labels: AxisLabels, statistics: ComparisonStatistics
-) -> list[str]:
+def _format_median_errors(lines: pd.DataFrame, view: ComparisonView) -> list[str]:
     """Format the median errors of each range, then the errors along directions where known.
 
     Args:
         lines: error curves: one row for each tuner, range, metric and number of simulations.
-        labels: axis labels.
-        statistics: statistics of the comparison.
+        view: the comparison.
     """
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
-        texts.append("\n" + _format_error_table(lines, kind, labels, statistics))
-        if direction_table := _format_direction_errors(lines, kind, labels.channel, statistics):
+        texts.append("\n" + _format_error_table(lines, kind, view))
+        if direction_table := _format_direction_errors(lines, kind, view):
             texts.append("\n" + direction_table)
     return texts
 
 
-def _format_error_table(
-    lines: pd.DataFrame, kind: str, labels: AxisLabels, statistics: ComparisonStatistics
-) -> str:
+def _format_error_table(lines: pd.DataFrame, kind: str, view: ComparisonView) -> str:
     """Format the median errors of one range as a table for the terminal.
 
     Args:
         lines: error curves: one row for each tuner, range, metric and number of simulations.
         kind: range of the targets, such as ``in``; ``real`` for a recording.
-        labels: axis labels.
-        statistics: statistics of the comparison.
+        view: the comparison.
     """
+    labels, statistics = view.labels, view.statistics
     metrics = set(lines["metric"])
     if kind == "real":
         held_out = "heldout_error" in metrics
@@ -278,9 +274,7 @@ def _format_frame(frame: pd.DataFrame) -> str:
     return unnamed_frame.to_string(float_format=lambda value: f"{value:.2g}")
 
 
-def _format_direction_errors(
-    lines: pd.DataFrame, kind: str, channel: str, statistics: ComparisonStatistics
-) -> str:
+def _format_direction_errors(lines: pd.DataFrame, kind: str, view: ComparisonView) -> str:
     """Format errors along stiff and sloppy directions, and held-out errors, of one range.
 
     The text is empty if there are none.
@@ -288,9 +282,9 @@ def _format_direction_errors(
     Args:
         lines: error curves: one row for each tuner, range, metric and number of simulations.
         kind: range of the targets; ``real`` for a recording.
-        channel: error channel with unit.
-        statistics: statistics of the comparison.
+        view: the comparison.
     """
+    statistics = view.statistics
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
     shown_lines = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
     if kind == "real" or shown_lines.empty:
@@ -309,26 +303,20 @@ def _format_direction_errors(
     medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
     title = "median error along stiff and sloppy directions [training widths]"
     if "heldout_error" in set(shown_lines["metric"]):
-        title += f" and RMSE of {channel} in unseen scenarios"
+        title += f" and RMSE of {view.labels.channel} in unseen scenarios"
     table = _format_frame(medians.rename(index=statistics.format_label))
     return f"{title}, after N simulations\n{table}"
 
 
-def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
-    """Format the mean seconds per run of each tuner, of its simulations, and of its training.
-
-    Args:
-        lines: rows of table.csv; the values after all simulations are used.
-        statistics: statistics of the comparison, with the order of the tuners.
-    """
-    last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+def _format_run_seconds(results: ComparisonReportData) -> str:
+    """Format the mean seconds per run of each tuner, of its simulations, and of its training."""
     columns = {
-        "tuner": "tuner_seconds",
-        "simulator": "simulator_seconds",
-        "one training": "fit_seconds",
+        "tuner_seconds": "tuner",
+        "simulator_seconds": "simulator",
+        "fit_seconds": "one training",
     }
-    seconds = pd.DataFrame({name: last[column] for name, column in columns.items()})
-    seconds = seconds.reindex([t for t in statistics.order if t in seconds.index])
+    rows = dict(list_mean_seconds(results))
+    seconds = pd.DataFrame.from_dict(rows, orient="index")[list(columns)].rename(columns=columns)
     return f"mean seconds of a run\n{_format_frame(seconds)}"
 
 

@@ -314,12 +314,9 @@ class Comparison(Study):
             InputError: nothing has been written yet, or the results are damaged.
         """
         from bench.benchmark.comparison_report import write_report
-        from bench.benchmark.problem.tuning_problem import TuningProblem
 
-        results = self.results
-        problem = results.problem if results else TuningProblem(self.configuration.experiment)
-        failed = write_report(self.folder, problem, print_line)
-        for line in results.notes.lines() if results else ():
+        failed = write_report(self.folder, print_line)
+        for line in self.results.notes.lines() if self.results else ():
             print_line(line)
         return failed
 

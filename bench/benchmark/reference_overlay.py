@@ -14,7 +14,6 @@ from bench.benchmark.comparison_figures import (
     check_references_allowed,
 )
 from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
-from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.storage.reference_results import ReferenceResult
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.figures.figure_output import write_figure
@@ -47,11 +46,7 @@ def draw_with_references(
     if stored.runs.empty:
         raise InputError(f"{folder}: contains no runs")
     check_references_allowed(stored, OVERLAYABLE_FIGURES[0], references)
-    problem = TuningProblem(stored.experiment)
-    try:
-        labels = make_axis_labels(problem)
-    finally:
-        problem.close()
+    labels = make_axis_labels(stored.experiment)
     for reference in references:
         print_line(f"behind  {reference.provenance_text}")
         for line in reference.find_mismatches(stored.experiment):

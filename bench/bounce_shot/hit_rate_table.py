@@ -8,7 +8,7 @@ import pandas as pd
 
 from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.benchmark.storage.run_status import FAILED_STATUSES
-from bench.figures.style import get_mark_style
+from bench.figures.style import compute_category_offset, get_mark_style
 from bench.pages.chart import Axis, Panel, Series
 
 ALL_BALLS = "all"
@@ -131,8 +131,7 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
             "low",
             "high",
             "points",
-            # The methods are spread over 0.6 of a category.
-            (i - (len(methods) - 1) / 2) * 0.6 / len(methods),
+            compute_category_offset(i, len(methods)),
         )
         for i, method in enumerate(methods)
     )

@@ -314,8 +314,20 @@ class TunerStyles:
         }
 
     def get_category_offset(self, tuner: str) -> float:
-        """Return a small shift along a category axis that places error bars side by side."""
-        return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
+        """Return the shift of a tuner's points along a category axis."""
+        return compute_category_offset(self._places[tuner], len(self._places))
+
+
+def compute_category_offset(place: int, count: int) -> float:
+    """Compute a small shift along a category axis that places points side by side.
+
+    The points of one category are spread over 0.6 of its width.
+
+    Args:
+        place: place of the point among those of the category.
+        count: number of these points.
+    """
+    return (place - (count - 1) / 2) * 0.6 / count
 
 
 def make_panel_grid(

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from bench.benchmark.comparison_charts import make_simulations_axis
 from bench.benchmark.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
-from bench.benchmark.statistics.error_curves import RunCurves, select_checkpoints
+from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,
     compute_solved_fraction,
@@ -363,14 +364,7 @@ def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], p
     for part in collection.parts:
         experiment, statistics = part.experiment, part.statistics
         metric = statistics.metric
-        x_axis = Axis(
-            "simulations used on the target",
-            "symlog",
-            ("symlog", "linear"),
-            tuple(float(k) for k in select_checkpoints(experiment.budget)),
-            # Marks at the ends must not be cut off.
-            ends=(-0.08, experiment.budget * 1.1),
-        )
+        x_axis = make_simulations_axis(experiment.budget)
         for kind in dict.fromkeys(statistics.curves.keys["range"]):
             medians = statistics.compute_median_curves(metric, str(kind))
             medians = medians[medians["tuner"].isin(collection.tuners)]

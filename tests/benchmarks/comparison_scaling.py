@@ -84,7 +84,7 @@ def measure(targets, budget, figures):
         whole = None
         if figures:
             started = perf_counter()
-            write_report(folder, results.problem, lambda _: None)
+            write_report(folder, lambda _: None)
             whole = round(perf_counter() - started, 2)
         print(json.dumps({
             "runs": runs, "rows": runs * (budget + 1), "plan_seconds": round(planned, 2),

@@ -203,9 +203,9 @@ def test_errors_along_directions_and_of_prediction_are_recorded(folder):
 
 
 def test_folder_has_the_spectra_and_the_table_the_metrics(folder):
-    folder, results = folder
+    folder, _ = folder
     said = []
-    write_report(folder, results.problem, said.append)
+    write_report(folder, said.append)
     spectra = pd.read_csv(folder / "identifiability.csv")
     assert len(spectra) == 2 * 2 * 2
     assert {"rate", "decay", "eigenvalue", "sigma", "stiff"} <= set(spectra.columns)
