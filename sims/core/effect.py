@@ -38,6 +38,7 @@ CoefficientReference = Literal[
     "stop",
     "give",
     "rotor",
+    "shift",
 ]
 """Quantity from which the unit of a coefficient is derived, or the meaning of a coefficient."""
 
@@ -57,7 +58,8 @@ class Coefficient:
             second squared, ``level`` the stored quantity. Other values state a meaning: ``stop`` is
             the stiffness of a stop at the position given by coefficient ``place``; ``drive`` is a
             limit of the drive's force and ``travel`` a part of its travel, with units of their own;
-            ``give`` is a compliance; ``rotor`` is an inertia that a model file may state itself.
+            ``give`` is a compliance; ``rotor`` is an inertia that a model file may state itself;
+            ``shift`` is a time by which a signal that may jump comes later.
         least: Lower bound of a fit that is not a matter of plausibility; None for none.
         most: Upper bound of a fit that is not a matter of plausibility; None for none.
         tried: Values at which a search for it begins, if an evenly spaced grid would be too large.

@@ -156,7 +156,9 @@ class InputDelay(Input):
         "the input acts later than commanded; a negative value means that its time stamps are late"
     )
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _SECONDS, (_DELAY, _DELAY, _DELAY)),)
+    coefficients = (
+        Coefficient("coefficient", _SECONDS, (_DELAY, _DELAY, _DELAY), of="shift"),
+    )
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) whose command is applied.
@@ -175,7 +177,9 @@ class InputLag(Input):
     noun = "an input lag"
     says = "the input follows its command with a first-order lag"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.5), (0, 0.5), (0, 0.5))),)
+    coefficients = (
+        Coefficient("coefficient", _SECONDS, ((0, 0.5), (0, 0.5), (0, 0.5)), of="shift"),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the lagged input over each step.

@@ -63,6 +63,12 @@ ACCELERATION_LIMIT_SHARES = (1.0, 0.25, 0.06, 0.016, 0.004)
 
 At a quarter of the acceleration, a command takes twice as long.
 """
+SHIFTS = (0.01, 0.03, 0.08, 0.2)
+"""Delays and lags of a robot's commands that are tried, in seconds.
+
+A command that jumps is not nearly linear in time, so the response to a small lag does not show that
+to a large one.
+"""
 ROUNDING_SHARE = 1e-11
 """Minimum change of the observations that is not rounding, as a share of the largest one."""
 SHAPE_GRID_SIZE = 12
@@ -195,7 +201,18 @@ def iterate_first_probes(
     if first_coefficient.of == "stop":
         yield from _make_end_stop_candidates(evaluator, name, grid_point)
         return
-    lowest, _ = parameters[0].bounds
+    lowest, highest = parameters[0].bounds
+    if first_coefficient.of == "shift" and evaluator.has_linearisation:
+        for grid_point, shift in enumerate(SHIFTS, start=grid_point):
+            if shift < highest:
+                yield CandidateDirection(
+                    effect=name,
+                    grid_point=grid_point,
+                    coefficient_index=0,
+                    coefficients=np.full(coefficient_count, shift),
+                    can_be_negative=False,
+                    is_single_size=True,
+                )
     # A small limit does not act like a large one, so limits are tried at values that the input
     # reaches.
     if first_coefficient.of in NONLINEAR_COEFFICIENT_KINDS or (
