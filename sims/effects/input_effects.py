@@ -156,9 +156,7 @@ class InputDelay(Input):
         "the input acts later than commanded; a negative value means that its time stamps are late"
     )
     source = _FEEDBACK
-    coefficients = (
-        Coefficient("coefficient", _SECONDS, (_DELAY, _DELAY, _DELAY), of="shift"),
-    )
+    coefficients = (Coefficient("coefficient", _SECONDS, (_DELAY, _DELAY, _DELAY), of="shift"),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) whose command is applied.

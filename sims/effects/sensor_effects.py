@@ -111,7 +111,9 @@ class SensorDelay(Sensor):
     noun = "a sensor delay"
     says = "the sensor reading is late by a constant time"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
-    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (
+        Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2)), of="shift"),
+    )
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) of the recorded values.
@@ -131,7 +133,9 @@ class SensorLag(Sensor):
     says = "the sensor reading follows with a first-order lag"
     source = _VOCABULARY + ", 4.23"
     filters = True  # the lag evolves between samples, so every step is needed
-    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (
+        Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2)), of="shift"),
+    )
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the lagged reading (L, S), exact for a reading that is linear over each step.

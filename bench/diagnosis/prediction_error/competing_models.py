@@ -36,8 +36,10 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
     FilteredSet,
     compute_comparison_margin,
     has_series,
+    is_time_shift,
     list_at_coupled_joints,
     list_joint_model_effects,
+    list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
 from bench.diagnosis.prediction_error.regression_selection import Selected
@@ -351,7 +353,7 @@ class _CompetingEffect(NamedTuple):
     Attributes:
         effect: its name.
         c: (k,) its coefficients from the regression.
-        loss: loss in twice the log-likelihood.
+        loss: loss in twice the log-likelihood; infinite if a regression cannot tell it.
     """
 
     effect: str
@@ -489,7 +491,8 @@ def _find_competing_effects(
     The regression is about the fitted model without the given effect, so that its gain and that of
     every other effect are comparable. Compared are gains in twice the log-likelihood minus the
     penalty of the effect. An effect of the joint or servo model at the same joint may be much
-    worse, because the linear regression is inaccurate for large effects.
+    worse, because the linear regression is inaccurate for large effects. In place of a delay or a
+    lag, similar ones are always compared, with the same coefficient.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -517,6 +520,10 @@ def _find_competing_effects(
             near_count += is_near
             c = context.columns.coefficients(group, remaining.solve([group])[1][0])
             competing_effects[effect] = _CompetingEffect(effect, c, loss)
+    c = model.fit.theta[evaluator.coefficient_slices[name]]
+    for effect in list_similar_shifts(evaluator, name):
+        if effect not in model.effects:
+            competing_effects[effect] = _CompetingEffect(effect, c, np.inf)
     return list(competing_effects.values())
 
 
@@ -528,7 +535,8 @@ def _confirm(
     The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
     best one, the start is returned at once. So is a payload, whose response is far from linear in
     its place. If not, simulations or a filter decide. Simulations of an effect with one coefficient
-    are faster, and show more if the best model explains the runs.
+    are faster, and show more if the best model explains the runs. A filter does not follow late
+    readings, so simulations decide about delays and lags.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -543,7 +551,8 @@ def _confirm(
     is_payload = competing_effect.effect.startswith("payload@")
     if competing_effect.loss <= COMPETING_MODEL_MARGIN or is_payload:
         return start
-    if competing_effect.c.size == 1 and is_explained(context, best):
+    effect = context.evaluator.available_effects[competing_effect.effect]
+    if is_time_shift(effect) or (competing_effect.c.size == 1 and is_explained(context, best)):
         return _confirm_by_simulation(context, best, competing_effect, start)
     return _confirm_by_filter(context, best, competing_effect, start)
 

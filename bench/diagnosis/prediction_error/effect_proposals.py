@@ -27,6 +27,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
     ModelFilters,
     get_joint_name,
     get_servo_input,
+    list_similar_shifts,
     offset_from_command,
 )
 from bench.diagnosis.prediction_error.regression_columns import (
@@ -40,7 +41,9 @@ from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 
 MAX_REGRESSION_PROPOSALS = 4
-"""Maximum number of effects that are proposed by regression."""
+"""Maximum number of effects that are proposed by regression and then fitted or filtered."""
+MAX_SIMULATED_PROPOSALS = 8
+"""Maximum number of effects that are proposed by regression and only simulated, without a fit."""
 MAX_FAMILY_PROPOSALS = 2
 """Maximum number among them of effects at all places.
 
@@ -75,11 +78,14 @@ class EffectProposals:
 
     filters: ModelFilters
     columns: LibraryColumns
-    _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
+    _for_base: dict[int, tuple[Proposals, Proposals, Proposals]] = field(default_factory=dict)
     _base_steps: dict[str, tuple[Array, float]] = field(default_factory=dict)
 
     def of(
-        self, current: FilteredSet, max_joint_proposals: int = MAX_JOINT_PROPOSALS
+        self,
+        current: FilteredSet,
+        max_joint_proposals: int = MAX_JOINT_PROPOSALS,
+        is_fitted: bool = True,
     ) -> list[FitStart]:
         """Return models with one more effect than a set: the effects worth trying next.
 
@@ -90,6 +96,7 @@ class EffectProposals:
             current: the set of effects in the model, with its filter; no effects mean the base
                 model.
             max_joint_proposals: maximum number of effects of the joint and servo models.
+            is_fitted: false to return more models, which are only simulated.
 
         Returns:
             Starts of fits, each with the effects of the set and one more, with a first coefficient.
@@ -98,7 +105,12 @@ class EffectProposals:
         proposed = self._propose_effects(current) if current.names else self._for_base.get(count)
         if proposed is None:
             proposed = self._for_base[count] = self._propose_effects(current)
-        by_regression, joint_model = proposed
+        by_regression, others, joint_model = proposed
+        if is_fitted:
+            by_regression = by_regression[:MAX_REGRESSION_PROPOSALS]
+        by_regression = by_regression + others
+        names = dict(by_regression)
+        joint_model = [(name, c) for name, c in joint_model if name not in names]
         present_model = FitStart(
             current.names, current.followed.theta, evaluator.initial_state_guesses
         )
@@ -107,26 +119,42 @@ class EffectProposals:
             for name, c in by_regression + joint_model[:max_joint_proposals]
         ]
 
-    def list_alone(self, max_joint_proposals: int = MAX_JOINT_PROPOSALS) -> list[FitStart]:
+    def list_alone(
+        self,
+        max_joint_proposals: int = MAX_JOINT_PROPOSALS,
+        is_fitted: bool = True,
+    ) -> list[FitStart]:
         """Return models with one effect that may explain the runs alone.
 
         Effects at one joint are left out if a force is missing at another joint.
 
         Args:
             max_joint_proposals: maximum number of effects of the joint and servo models.
+            is_fitted: false to return more models, which are only simulated.
         """
         return [
             start
-            for start in self.of(self.filters.empty_set, max_joint_proposals)
+            for start in self.of(self.filters.empty_set, max_joint_proposals, is_fitted)
             if self.filters.act_where_forces_are_missing(start.effects)
         ]
 
-    def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
-        """Return all proposals, with those of the joint and servo models in a separate list."""
+    def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals, Proposals]:
+        """Return proposals by regression, of offsets and less friction, and of the joint model."""
         by_regression = self._propose_by_regression(current)
-        excluded, joint = {*current.names, *dict(by_regression)}, current.followed.joints_by_loss[0]
+        fitted = dict(by_regression[:MAX_REGRESSION_PROPOSALS])
+        # A filter does not follow late readings, so that the regression misjudges them.
+        shifts = {
+            similar: c
+            for name, c in fitted.items()
+            for similar in list_similar_shifts(self.filters.evaluator, name)
+            if similar not in fitted
+        }
+        further = dict(by_regression[MAX_REGRESSION_PROPOSALS:])
+        by_regression = [*fitted.items(), *(further | shifts).items()]
+        excluded, joint = {*current.names, *fitted}, current.followed.joints_by_loss[0]
         joint_model = self._propose_joint_model(current.followed, joint, excluded)
-        return by_regression + self._propose_offset_and_friction(joint, excluded), joint_model
+        others = self._propose_offset_and_friction(joint, {*excluded, *dict(by_regression)})
+        return by_regression, others, joint_model
 
     def _propose_by_regression(self, current: FilteredSet) -> Proposals:
         """Propose the effects with the largest net gain by regression, with their coefficients.
@@ -151,7 +179,7 @@ class EffectProposals:
             if is_surplus or group.effect in (*current.names, *proposals):
                 continue
             too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
-            if len(proposals) == MAX_REGRESSION_PROPOSALS or too_little:
+            if len(proposals) == MAX_SIMULATED_PROPOSALS or too_little:
                 break
             solution = regression.solve([group])[1][0]
             proposals[group.effect] = self.columns.coefficients(group, solution)

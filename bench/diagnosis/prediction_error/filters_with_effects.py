@@ -27,7 +27,7 @@ from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.search.scored_models import ScoredModelSet
-from sims.core.effect import members_of
+from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.places.place_list import coupled_joints
@@ -151,6 +151,44 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
         and not other.endswith("@*")
         and acts_at_joint(evaluator, other, joints)
     }
+
+
+def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
+    """Return the delays and lags that may move the readings as a delay or lag does.
+
+    A command that comes late moves the readings nearly as sensors that read late. Compared are
+    effects at the same joint, effects at all places, and with both of them an effect that has a
+    single place.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect; the result is empty if it is neither a delay nor a lag.
+    """
+    if not is_time_shift(evaluator.available_effects[name]):
+        return []
+    count = len(evaluator.simulator.system.coordinates)
+    joints = {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
+
+    def has_one_place(effect: str) -> bool:
+        return f"{effect.partition('@')[0]}@*" not in evaluator.library
+
+    return [
+        other
+        for other in evaluator.library
+        if other != name
+        and is_time_shift(evaluator.available_effects[other])
+        and acts_at_joint(evaluator, other, joints)
+        and (
+            other.endswith("@*") == name.endswith("@*")
+            or has_one_place(other)
+            or has_one_place(name)
+        )
+    ]
+
+
+def is_time_shift(effect: Effect) -> bool:
+    """Return whether an effect is a delay or a lag, with one coefficient."""
+    return [c.of for c in effect.coefficients] == ["shift"]
 
 
 def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:

@@ -7,13 +7,13 @@ With the whitened innovations e of N samples and the whitened responses W of the
 for the columns S of a set of effects. Effects are added one by one, first the one that decreases N
 log rss most, until none fulfils
 
-    N log(rss(S) / rss(S ∪ g)) > k log N + 2 log M                                              (2)
+    N log(rss(S) / rss(S ∪ g)) > k log N + 2 log(M n)                                           (2)
 
-with k the number of coefficients of the effect g and M the number of candidates. The last term
-bounds the gain of the best of M under the null hypothesis (D. P. Foster, E. I. George, Ann. Stat.
-22(4), 1947, 1994, doi:10.1214/aos/1176325766). After each addition, effects that no longer fulfil
-(2) are removed (A. Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). No simulation
-is needed.
+with k the number of coefficients of the effect g, n the number of its shapes, and M the number of
+candidates. The last term bounds the gain of the best of M n under the null hypothesis (D. P.
+Foster, E. I. George, Ann. Stat. 22(4), 1947, 1994, doi:10.1214/aos/1176325766). After each
+addition, effects that no longer fulfil (2) are removed (A. Miller, Subset Selection in Regression,
+2nd ed., 2002, chapter 3). No simulation is needed.
 
 Scores of single effects are compared with their null distribution: twice the gain in
 log-likelihood by k further coefficients has a chi-squared distribution with k degrees of freedom
@@ -32,6 +32,7 @@ overestimates the gain under the null hypothesis.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -192,11 +193,17 @@ class Regression:
     def price(self, group: DirectionGroup) -> float:
         """Return the minimum gain of an effect in twice the log-likelihood.
 
-        It is k log N + 2 log M for k coefficients, N samples and M candidate effects: the right
-        side of eq. (2) of the module docstring.
+        It is k log N + 2 log(M n) for k coefficients and n shapes of the effect, N samples and M
+        candidate effects: the right side of eq. (2) of the module docstring.
         """
         coefficients = len(group.column_indices) * np.log(max(self.count, 2))
-        return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
+        candidates = max(len(self.effects), 2) * self._shape_counts[group.effect]
+        return float(coefficients + 2.0 * np.log(candidates))
+
+    @cached_property
+    def _shape_counts(self) -> Counter[str]:
+        """Number of shapes of each effect."""
+        return Counter(group.effect for group in self.groups)
 
     def gains(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the gain (n,) in twice the log-likelihood of each group in addition to a set.

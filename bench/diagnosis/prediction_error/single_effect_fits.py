@@ -69,7 +69,10 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    proposed = [replace(start, initial_states=states) for start in context.proposals.list_alone()]
+    proposed = [
+        replace(start, initial_states=states)
+        for start in context.proposals.list_alone(is_fitted=False)
+    ]
     costs = select_lowest_of_each(context, proposed)
     if not has_noise_like_cost(context, costs):
         costs = _try_scaled(context, costs, SCANNED_FACTORS)

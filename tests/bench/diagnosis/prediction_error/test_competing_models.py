@@ -11,6 +11,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import competing_models, single_effect_fits
 from bench.diagnosis.prediction_error.filters_with_effects import list_joint_model_effects
 from bench.logs.recording_loading import load_joined
+from sims.effects.drag import LinearDrag
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")
@@ -51,7 +52,10 @@ def test_a_competing_effect_is_simulated_at_several_coefficients(
     base, best = (SimpleNamespace(fit=SimpleNamespace(cost=cost)) for cost in (1000.0, 100.0))
     context = SimpleNamespace(
         search=SimpleNamespace(base_model=base),
-        evaluator=SimpleNamespace(get_coefficient_indices=lambda _: [0]),
+        evaluator=SimpleNamespace(
+            get_coefficient_indices=lambda _: [0],
+            available_effects={"drag.linear@elbow": LinearDrag()},
+        ),
     )
     competing = competing_models._CompetingEffect("drag.linear@elbow", np.ones(1), 1e6)
     start = FitStart(("drag.linear@elbow",), np.ones(1), np.zeros((1, 2)))
