@@ -37,7 +37,7 @@ from bench.diagnosis.search.coefficient_start_values import (
     is_period,
     list_coefficients,
 )
-from sims.core.effect import ALL_PLACES, Effect, Sensor, members_of
+from sims.core.effect import ALL_PLACES, Effect, Input, members_of
 from sims.core.simulator import Array, Parameter
 
 INITIAL_PROBE_SHARE = 1e-4
@@ -64,10 +64,10 @@ ACCELERATION_LIMIT_SHARES = (1.0, 0.25, 0.06, 0.016, 0.004)
 At a quarter of the acceleration, a command takes twice as long.
 """
 SHIFTS = (0.01, 0.015, 0.023, 0.035, 0.053, 0.08, 0.12, 0.18)
-"""Delays and lags of a robot that are tried, in seconds.
+"""Delays and lags of a robot's commands that are tried, in seconds.
 
-A command or a velocity that jumps is not nearly linear in time, so the response to a small lag does
-not show that to a large one. A delay is recognised if it differs by less than a quarter.
+A command that jumps is not nearly linear in time, so the response to a small lag does not show that
+to a large one. A delay is recognised if it differs by less than a quarter.
 """
 ROUNDING_SHARE = 1e-11
 """Minimum change of the observations that is not rounding, as a share of the largest one."""
@@ -218,32 +218,28 @@ def iterate_first_probes(
 def _make_shift_probes(
     effect: Effect, highest: float, first_grid_point: int
 ) -> Iterator[CandidateDirection]:
-    """Yield delays and lags of several sizes, in addition to a small one.
+    """Yield delays and lags of commands of several sizes, in addition to a small one.
 
-    The states of a robot are the measured ones, which come late if a sensor does. So its delay is
-    tried as reading ahead, whose opposite is the change from the true states to the readings. A lag
-    c of a sensor is linear about measured states z, because the true ones are z + c dz/dt.
+    Sensors that read late have none. The states of a robot are the measured ones, so that the true
+    states are later readings. A regression on these is invalid, because the innovations of a filter
+    are independent of earlier readings only.
 
     Args:
-        effect: the effect, with one coefficient at each of its places.
+        effect: the effect.
         highest: largest plausible coefficient.
         first_grid_point: number of the first candidate; the following ones count up from it.
     """
-    if isinstance(effect, Sensor) and effect.filters:
+    if not isinstance(effect, Input):
         return
-    sign = -1.0 if isinstance(effect, Sensor) else 1.0
-    sizes = [sign * shift for shift in SHIFTS if shift < highest]
-    for index in range(len(effect.coefficients)):
-        for grid_point, size in enumerate(sizes, start=first_grid_point):
-            values = np.zeros(len(effect.coefficients))
-            values[index] = size
-            yield CandidateDirection(
-                effect=effect.name,
-                grid_point=grid_point,
-                coefficient_index=index,
-                coefficients=values,
-                can_be_negative=False,
-            )
+    sizes = [shift for shift in SHIFTS if shift < highest]
+    for grid_point, size in enumerate(sizes, start=first_grid_point):
+        yield CandidateDirection(
+            effect=effect.name,
+            grid_point=grid_point,
+            coefficient_index=0,
+            coefficients=np.array([size]),
+            can_be_negative=False,
+        )
 
 
 def _is_contained_in_model(
