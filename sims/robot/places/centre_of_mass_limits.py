@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ MARGIN_SHARE = 0.1
 """Margin of a link's box on each face, as a share of its longest side."""
 MIN_PARALLEL_COSINE = 1.0 - 1e-9
 """Absolute cosine above which two joint axes count as parallel."""
+CUBE_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Corners (8, 3) of a cube with sides of 2."""
 UNKNOWN_LENGTH = 0.1
 """Assumed longest side, in metres, of a link in a robot whose file specifies no lengths."""
 
@@ -30,7 +33,8 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
 
     A fitted offset outside them would put the centre of mass outside the link. The limits are a box
     that contains the geoms and sites of the link and the joints of its child links. A link without
-    any is assumed to be as long as its distance from its parent.
+    geoms is as large as its inertia needs, and one without any of these and inertia is assumed to
+    be as long as its distance from its parent.
 
     Returns:
         (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
@@ -56,7 +60,8 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
     """Yield the points of a link, in its own frame, that its box must contain.
 
     They are its origin, its stated centre of mass, the corners of its geoms, its sites, such as
-    those of rotors, and the origins of its child bodies.
+    those of rotors, and the origins of its child bodies. Without geoms they are also the corners of
+    the box that has its mass and inertia.
 
     Args:
         model: compiled model.
@@ -69,7 +74,14 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
     yield np.zeros(3)
     yield model.body_ipos[body_id]
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-    for body in _list_fixed_bodies(model, body_id):
+    bodies = _list_fixed_bodies(model, body_id)
+    if not model.body_geomnum[bodies].any():
+        inertia_axes = np.zeros(9)
+        mujoco.mju_quat2Mat(inertia_axes, model.body_iquat[body_id])
+        half_sides = _compute_box_of_inertia(model, body_id)
+        for corner in CUBE_CORNERS:
+            yield model.body_ipos[body_id] + inertia_axes.reshape(3, 3) @ (half_sides * corner)
+    for body in bodies:
         yield axes.T @ (data.xpos[body] - origin)
         for site in np.flatnonzero(model.site_bodyid == body):
             yield axes.T @ (data.site_xpos[site] - origin)
@@ -79,12 +91,29 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
                 continue
             centre, size = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
             geom_axes = data.geom_xmat[geom].reshape(3, 3)
-            for corner in np.ndindex(2, 2, 2):
-                corner_point = centre + size * (2.0 * np.array(corner) - 1.0)
+            for corner in CUBE_CORNERS:
+                corner_point = centre + size * corner
                 yield axes.T @ (data.geom_xpos[geom] + geom_axes @ corner_point - origin)
         for child in np.flatnonzero(model.body_parentid == body):
             if child and model.body_jntnum[child]:
                 yield axes.T @ (data.xpos[child] - origin)
+
+
+def _compute_box_of_inertia(model: Any, number: int) -> Array:
+    """Return half the sides (3,), in metres, of the uniform box with a body's mass and inertia.
+
+    A box with sides 2 a, 2 b, 2 c and mass m has the moment of inertia m (b² + c²) / 3 about the
+    side a.
+
+    Args:
+        model: compiled model.
+        number: number of the body.
+    """
+    mass, moments = float(model.body_mass[number]), model.body_inertia[number]
+    if mass <= 0.0:
+        return np.zeros(3)
+    squares: Array = 1.5 * (moments.sum() - 2.0 * moments) / mass
+    return np.sqrt(np.maximum(squares, 0.0))
 
 
 def _list_fixed_bodies(model: Any, number: int) -> list[int]:

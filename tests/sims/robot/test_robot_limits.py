@@ -2,6 +2,8 @@
 robot.
 """
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -87,6 +89,22 @@ def test_a_centre_of_mass_stays_within_its_link(yaw, bounds):
     assert np.all(compute_centre_of_mass_limits(yaw, "upper")[:, 0] < 0.0)
     # Without geoms and children it counts as long as its parent link.
     assert np.abs(compute_centre_of_mass_limits(yaw, "last")).max() < 0.4
+
+
+def test_a_link_without_geoms_is_as_large_as_its_inertia_needs(tmp_path):
+    """A uniform rod of 0.4 m about its middle, whose centre of mass is stated at 0.02 m."""
+    mass, length = 0.3, 0.4
+    moment = mass * length**2 / 12.0
+    inertia = f'mass="{mass}" diaginertia="1e-9 {moment} {moment}"'
+    rod = re.sub(
+        r'<inertial pos="0 0 0" mass="1e-6".*/>', f'<inertial pos="0.02 0 0" {inertia}/>', YAW
+    )
+    low, high = compute_centre_of_mass_limits(robot(tmp_path, rod), "last").T
+    # The box of the link is the rod and a margin of a tenth of its length at each end.
+    assert low[0] == pytest.approx(-0.6 * length, abs=1e-4)
+    assert high[0] == pytest.approx(0.6 * length, abs=1e-4)
+    # A thin rod may be a quarter of its length thick.
+    assert high[1:] == pytest.approx(0.35 * length, abs=1e-4)
 
 
 def test_an_offset_along_the_only_axis_of_rotation_is_fixed(yaw, bounds):
