@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,20 +35,6 @@ ANGULAR_VELOCITY_AXES = ("wx", "wy", "wz")
 """Axes of angular velocity, those of the body."""
 
 
-class FloatingJoint(NamedTuple):
-    """Layout of the numbers of one floating joint.
-
-    Attributes:
-        axes: axes of translation; empty for a ball joint.
-        turn: slice of the quaternion within a pose.
-        first: index of the first number of its displacement.
-    """
-
-    axes: tuple[str, ...]
-    turn: slice
-    first: int
-
-
 class FloatingState(NamedTuple):
     """Poses (..., P) and velocities (..., F) of all floating joints."""
 
@@ -62,11 +47,13 @@ class FloatingJoints:
     """The floating joints of a model.
 
     Attributes:
+        model: compiled model of the robot.
         joints: free and ball joints.
         positions: (P,) addresses in qpos.
         velocities: (F,) addresses in qvel.
     """
 
+    model: Any
     joints: tuple[Joint, ...]
     positions: IndexArray
     velocities: IndexArray
@@ -91,7 +78,9 @@ class FloatingJoints:
             for j in joints
             for k in range(len(_list_translation_axes(j) + ANGULAR_VELOCITY_AXES))
         ]
-        return cls(joints, np.array(positions, np.intp), np.array(velocities, np.intp))
+        return cls(
+            robot.compiled, joints, np.array(positions, np.intp), np.array(velocities, np.intp)
+        )
 
     def __bool__(self) -> bool:
         return bool(self.joints)
@@ -125,10 +114,10 @@ class FloatingJoints:
             units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in ANGULAR_VELOCITY_AXES}
         return units
 
-    def states(self, model: Any) -> dict[str, float]:
+    def states(self) -> dict[str, float]:
         """Return initial states by name: poses from the model file, and velocities of zero."""
         positions, velocities = self.names()
-        poses = model.qpos0[self.positions].tolist()
+        poses = self.model.qpos0[self.positions].tolist()
         return dict(zip(positions, poses, strict=True)) | dict.fromkeys(velocities, 0.0)
 
     def get_initial_state(self, states: Mapping[str, float]) -> FloatingState:
@@ -140,16 +129,16 @@ class FloatingJoints:
         positions, velocities = self.names()
         pose = np.array([states[name] for name in positions], dtype=float)
         rate = np.array([states[name] for name in velocities], dtype=float)
-        for joint, (_, quaternion_columns, _) in zip(
-            self.joints, self._joint_addresses, strict=True
-        ):
-            length = float(np.linalg.norm(pose[quaternion_columns]))
+        for joint in self.joints:
+            first = positions.index(f"q.{joint.name}.{QUATERNION_ENTRIES[0]}")
+            quaternion = pose[first : first + len(QUATERNION_ENTRIES)]
+            length = float(np.linalg.norm(quaternion))
             if length < MIN_QUATERNION_NORM:
                 state_names = ", ".join(f"q.{joint.name}.{axis}" for axis in QUATERNION_ENTRIES)
                 raise InputError(
                     f"initial states {state_names}: expected a quaternion, found zeros"
                 )
-            pose[quaternion_columns] /= length
+            quaternion /= length
         return FloatingState(pose, rate)
 
     def displace(self, pose: Array, number: int, displacement: float) -> Array:
@@ -180,18 +169,14 @@ class FloatingJoints:
         """
         import mujoco
 
-        displaced_pose = pose.copy()
-        for axes, quaternion_columns, first in self._joint_addresses:
-            place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
-            displaced_pose[:, place] += displacements[:, first : first + len(axes)]
-            rotation = displacements[
-                :, first + len(axes) : first + len(axes) + len(ANGULAR_VELOCITY_AXES)
-            ]
-            for quaternion, vector in zip(
-                displaced_pose[:, quaternion_columns], rotation, strict=True
-            ):
-                mujoco.mju_quatIntegrate(quaternion, vector, 1.0)
-        return displaced_pose
+        displaced_poses = pose.copy()
+        positions, velocities = self.model.qpos0.copy(), np.zeros(self.model.nv)
+        for displaced_pose, displacement in zip(displaced_poses, displacements, strict=True):
+            positions[self.positions] = displaced_pose
+            velocities[self.velocities] = displacement
+            mujoco.mj_integratePos(self.model, positions, velocities, 1.0)
+            displaced_pose[:] = positions[self.positions]
+        return displaced_poses
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P).
@@ -201,34 +186,14 @@ class FloatingJoints:
         """
         import mujoco
 
-        columns = []
-        for axes, quaternion_columns, _ in self._joint_addresses:
-            translation_columns = slice(
-                quaternion_columns.start - len(axes), quaternion_columns.start
-            )
-            columns.append(pose[:, translation_columns] - reference[:, translation_columns])
-            vectors = np.zeros((len(pose), len(ANGULAR_VELOCITY_AXES)))
-            quaternions = (pose[:, quaternion_columns], reference[:, quaternion_columns])
-            for vector, quaternion, initial in zip(vectors, *quaternions, strict=True):
-                mujoco.mju_subQuat(vector, quaternion, initial)
-            columns.append(vectors)
-        return np.concatenate(columns, axis=1) if columns else np.zeros((len(pose), 0))
-
-    @cached_property
-    def _joint_addresses(self) -> tuple[FloatingJoint, ...]:
-        """Where the pose numbers and the velocities of each joint are, in order.
-
-        They are columns of the poses and displacements of floating joints alone, not of MuJoCo's
-        state.
-        """
-        floating_joints, end, first = [], 0, 0
-        for axes in map(_list_translation_axes, self.joints):
-            end += len(axes + QUATERNION_ENTRIES)
-            floating_joints.append(
-                FloatingJoint(axes, slice(end - len(QUATERNION_ENTRIES), end), first)
-            )
-            first += len(axes + ANGULAR_VELOCITY_AXES)
-        return tuple(floating_joints)
+        displacements = np.empty((len(pose), self.velocities.size))
+        before, after = self.model.qpos0.copy(), self.model.qpos0.copy()
+        velocities = np.zeros(self.model.nv)
+        for displacement, reached, start in zip(displacements, pose, reference, strict=True):
+            before[self.positions], after[self.positions] = start, reached
+            mujoco.mj_differentiatePos(self.model, velocities, 1.0, before, after)
+            displacement[:] = velocities[self.velocities]
+        return displacements
 
 
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:

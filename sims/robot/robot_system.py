@@ -269,7 +269,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
     states |= {f"qd.{j.name}": 0.0 for j in joints}
     floating = FloatingJoints.from_robot(robot)
-    states |= floating.states(model)
+    states |= floating.states()
     actuators_by_coordinate = {
         coordinate: [a for a in robot.actuators if a.joint == joint.name]
         for coordinate, joint in enumerate(joints)
