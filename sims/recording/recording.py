@@ -226,16 +226,12 @@ def read_recording(
     description = check_description(description_path, meta, declared)
     columns = list(description.channels), list(description.inputs)
     csv_path = table.with_suffix(".csv") if table.suffix == ".toml" else table
-    if description.sources.is_renaming and has_run_column(csv_path):
+    sources = description.sources
+    if not sources.stated or (sources.is_renaming and has_run_column(csv_path)):
         table = csv_path
-        parts = _read_renamed(csv_path, description.sources, *columns, list(description.extra))
-    elif description.sources.stated:
-        parts = read_logs(
-            table.with_suffix(".csv"), description.sources, *columns, description.linear
-        )
+        parts = _read_own_table(csv_path, sources, *columns, list(description.extra))
     else:
-        table = csv_path
-        parts = read_table(csv_path, *columns, list(description.extra))
+        parts = read_logs(table.with_suffix(".csv"), sources, *columns, description.linear)
     model = model_in(description_path, meta)
     recording = _assemble_recording(table, parts, description, description_path, model)
     if whole:
@@ -278,14 +274,14 @@ def _assemble_recording(
     )
 
 
-def _read_renamed(
+def _read_own_table(
     path: Path,
     sources: RecordingSources,
     channels: Sequence[str],
     inputs: Sequence[str],
     extra: Sequence[str],
 ) -> list[CsvRun]:
-    """Read a table whose columns are renamed by the description.
+    """Read a table written for simgap, whose columns the description may rename.
 
     Args:
         path: Path of the table.
