@@ -335,7 +335,7 @@ def _check_table(source: Source, key_path: str, value: Any, declared: Any) -> di
 
 
 def check_entries(
-    source: Source, where: str, value: Any, hints: Mapping[str, Any], kind: str = ""
+    source: Source, where: str, value: Any, hints: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Check a table whose entries have the names and types of `hints`.
 
@@ -344,14 +344,13 @@ def check_entries(
         where: Entry of the table; empty for the whole file.
         value: Value from the file.
         hints: Type annotations by name.
-        kind: Kind of the entries and their place in messages; derived from `where` if empty.
 
     Raises:
         InputError: A name is unknown, or an entry has a wrong type.
     """
     table = check_table(source, where, value)
     # Check names first: an error about the type of an unknown key would be confusing.
-    check_known_names(kind or f"entry of [{where}] in {source}", table, hints)
+    check_known_names(f"entry of [{where}] in {source}", table, hints)
     result = {}
     for key, item in table.items():
         place = f"{where}.{key}" if where else key

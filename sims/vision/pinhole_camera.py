@@ -216,17 +216,6 @@ class PinholeCamera:
         semi_minor_axis = np.sqrt(squared_semi_axis)
         return centre, self.focal * np.stack([semi_major_axis, semi_minor_axis], axis=-1)
 
-    def compute_apparent_radius(self, points: ArrayLike, radius: float) -> Array:
-        """Return the radius (...) in pixels of the circle with the area of the sphere's outline.
-
-        Args:
-            points: Centres of the sphere (..., 3), m.
-            radius: Radius of the sphere, m.
-        """
-        axes = self.project_sphere(points, radius)[1]
-        result: Array = np.sqrt(axes[..., 0] * axes[..., 1])
-        return result
-
     def estimate_heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
         """Estimate the heights of a ball on a vertical line from the centres of its outlines.
 

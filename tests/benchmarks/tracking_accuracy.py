@@ -44,7 +44,7 @@ def one(seed, folder, count):
         look.crf,
     )
     truth = camera.project(points)
-    reach = camera.compute_apparent_radius(points, 0.5)[:, None]
+    reach = np.sqrt(camera.project_sphere(points, 0.5)[1].prod(axis=-1, keepdims=True))
     whole = ((truth > reach) & (truth < 99 - reach)).all(axis=1)
     begun = process_time()
     try:

@@ -100,7 +100,7 @@ class RunLinearisation:
             self._motion = self._simulate_nominal_motion()
             self._tangent = self._make_tangent_model()
             self._preparation_count = self._tangent.placed_element_count
-        self._perturbation_cache: dict[tuple[str, bytes], Perturbation] = {}
+        self._perturbation_cache: dict[tuple[str, bytes], tuple[Array, Array]] = {}
         self.observed = self._observe_nominal_motion()
         # The joints of the file come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
@@ -372,9 +372,10 @@ class RunLinearisation:
             with capture_mujoco_warnings():
                 mujoco_batch = self._simulator.make_linearisation_batch(acting)
                 self._perturbation_cache[key] = self._tangent.perturb_model_numbers(
-                    0, acting, share, mujoco_batch
+                    acting, share, mujoco_batch
                 )
-        return [self._perturbation_cache[key]._replace(owner=owner)]
+        forces, readings = self._perturbation_cache[key]
+        return [Perturbation(owner, forces=forces, readings=readings)]
 
     def _is_centred_spring(self, name: str, joint: int | None) -> bool:
         """Return whether an effect is a spring about zero, equal to a joint stiffness.

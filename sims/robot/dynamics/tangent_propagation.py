@@ -271,22 +271,23 @@ class TangentModel:
     # -- changes
 
     def perturb_model_numbers(
-        self, owner: int, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
-    ) -> Perturbation:
+        self, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
+    ) -> tuple[Array, Array]:
         """Return the perturbation by other model parameters, such as a mass, per unit of `change`.
+
+        It consists of equivalent forces (N, E), and of direct changes of readings (N, O).
 
         The accelerations at the points of the motion are computed with the changed model. A change
         da of the acceleration at the same state acts like the force M da, with the inertia matrix
         M, and is propagated like a force.
 
         Args:
-            owner: number of the effect candidate.
             acting: active effects including the one that changes the parameters.
             change: size of the change.
             mujoco_batch: batch whose model has the required elements.
         """
         if self._at.has_contacts and not self._at.steps_joints_by_runge_kutta:
-            return self._perturb_numbers_at_contacts(owner, acting, change, mujoco_batch)
+            return self._perturb_numbers_at_contacts(acting, change, mujoco_batch)
         step_mean_forces = self._mean_acceleration_forces
         with self._at.with_batch(mujoco_batch):
             accelerations, readings = self._at.compute_accelerations(acting, step_mean_forces)
@@ -297,13 +298,11 @@ class TangentModel:
         # A change of the acceleration is equivalent to a force.
         difference = (accelerations - self._accelerations_with_mean_forces) / change
         force = np.einsum("nij,nj->ni", self._mass_matrices, difference)
-        return Perturbation(
-            owner, forces=force, readings=(readings - self._base_accelerations[1]) / change
-        )
+        return force, (readings - self._base_accelerations[1]) / change
 
     def _perturb_numbers_at_contacts(
-        self, owner: int, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
-    ) -> Perturbation:
+        self, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
+    ) -> tuple[Array, Array]:
         """Return the result of `perturb_model_numbers` for a robot whose geoms touch.
 
         A contact reacts to a force M da, so that the motion does not change by da. The force that
@@ -318,7 +317,7 @@ class TangentModel:
         force: Array = np.linalg.solve(derivatives, difference[..., None])[..., 0].astype(
             np.float64
         )
-        return Perturbation(owner, forces=force, readings=(readings - self._base_readings) / change)
+        return force, (readings - self._base_readings) / change
 
     @cached_property
     def _mean_acceleration_forces(self) -> Array:

@@ -60,7 +60,6 @@ def test_outline_of_a_sphere_by_hand_and_by_its_surface():
     )  # on the optical axis: a circle, tangents from the camera
     np.testing.assert_allclose(centre, [100, 50], atol=1e-12)
     np.testing.assert_allclose(axes, [radius, radius], rtol=1e-12)
-    assert camera.compute_apparent_radius([0.0, 0.0, 2.0], 0.5) == pytest.approx(radius, rel=1e-12)
     camera = PinholeCamera(0.3, 5.5, 7.5, size=(400, 400))
     ball = np.array([0.6, 0.4, 4.6])
     rng = np.random.default_rng(1)
