@@ -236,11 +236,21 @@ class PlaceMark:
 
 
 class _Label(NamedTuple):
-    """A label: its lines, its (2,) point in metres, and whether that point is marked."""
+    """A label of a place.
+
+    Attributes:
+        lines: Its lines.
+        point: (2,) place in the picture, in metres.
+        kind: Kind of the place, as of a `PlaceMark`.
+        is_marked: Whether the place is marked.
+        is_certain: Whether a mark of the place is certain.
+    """
 
     lines: tuple[str, ...]
     point: Array
-    marked: bool
+    kind: str
+    is_marked: bool
+    is_certain: bool
 
     @property
     def height(self) -> float:
@@ -265,7 +275,8 @@ def draw_robot_figure(
     """
     data = make_posed_data(robot, dict(positions))
     projection = choose_projection(robot, data)
-    left_labels, right_labels = _divide_labels(_make_labels(robot, data, projection, marks))
+    labels = _make_labels(robot, data, projection, marks)
+    left_labels, right_labels = _divide_labels(labels)
     # Sizes in inches; coordinates of the axes are metres.
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
     width, height = scale * projection.width, scale * projection.height
@@ -286,7 +297,7 @@ def draw_robot_figure(
     axis.set_autoscale_on(False)
 
     _draw_robot(axis, robot, data, projection)
-    _draw_place_rings(axis, robot, data, projection, marks)
+    _draw_place_rings(axis, labels)
     gap = 0.12 / scale  # 0.12 inches between the picture and its labels
     _draw_label_column(axis, left_labels, -half_width - gap, scale, tall)
     _draw_label_column(axis, right_labels, half_width + gap, scale, tall)
@@ -368,28 +379,29 @@ def _make_labels(
         projection: camera.
         marks: places that the verdict names.
     """
-    lines_by_place: dict[tuple[str, str], list[str]] = {}
+    marks_by_place: dict[tuple[str, str], list[PlaceMark]] = {}
     for mark in marks:
-        lines = lines_by_place.setdefault((mark.kind, mark.name), [])
-        lines += [mark.says] if mark.says and mark.says not in lines else []
+        marks_by_place.setdefault((mark.kind, mark.name), []).append(mark)
     if len(robot.joints) <= MAX_NAMED_JOINTS:
         for joint in robot.joints:
             if joint.name not in robot.base_joints:
-                lines_by_place.setdefault(("joint", joint.name), [])
-    marked = {(mark.kind, mark.name) for mark in marks}
+                marks_by_place.setdefault(("joint", joint.name), [])
     labels = []
-    for (kind, name), lines in lines_by_place.items():
+    for (kind, name), place_marks in marks_by_place.items():
         place = locate_place(robot, data, kind, name)
         if place is None:
             continue
         # A name without a kind is a joint's.
         title = name if kind == "joint" else f"{kind} {name}"
-        texts = [line[:MAX_LABEL_LENGTH] for line in (title, *lines)]
+        texts = dict.fromkeys([title, *(mark.says for mark in place_marks if mark.says)])
         lines = [
-            line for text in texts for line in break_name(text, MAX_LABEL_LINE_LENGTH).split("\n")
+            line
+            for text in texts
+            for line in break_name(text[:MAX_LABEL_LENGTH], MAX_LABEL_LINE_LENGTH).split("\n")
         ]
         point = projection.project(place[None])[0]
-        labels.append(_Label(tuple(lines), point, (kind, name) in marked))
+        is_certain = any(mark.is_certain for mark in place_marks)
+        labels.append(_Label(tuple(lines), point, kind, bool(place_marks), is_certain))
     return labels
 
 
@@ -472,15 +484,15 @@ def _draw_label_column(
     half_height = tall / scale / 2
     middles = arrange_labels([label.point[1] for label in labels], sizes, -half_height, half_height)
     for label, y in zip(labels, middles.tolist(), strict=True):
-        colour = "black" if label.marked else CAPTION_GREY
+        colour = "black" if label.is_marked else CAPTION_GREY
         axis.annotate(
             "\n".join(label.lines),
             (label.point[0], label.point[1]),
             (x, y),
             ha="right" if x < 0 else "left",
             va="center",
-            fontsize=9 if label.marked else 8,
-            weight="bold" if label.marked else "normal",
+            fontsize=9 if label.is_marked else 8,
+            weight="bold" if label.is_marked else "normal",
             color=colour,
             annotation_clip=False,
             parse_math=False,
@@ -488,35 +500,25 @@ def _draw_label_column(
             arrowprops={
                 "arrowstyle": "-",
                 "color": colour,
-                "linewidth": 0.9 if label.marked else 0.5,
+                "linewidth": 0.9 if label.is_marked else 0.5,
                 "shrinkA": 2,
-                "shrinkB": 9 if label.marked else 3,
+                "shrinkB": 9 if label.is_marked else 3,
             },
         )
 
 
-def _draw_place_rings(
-    axis: Axes, robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
-) -> None:
-    """Draw a ring around each diagnosed place: dashed if the data allow other places as well.
+def _draw_place_rings(axis: Axes, labels: Sequence[_Label]) -> None:
+    """Draw a ring around each marked place: dashed if the data allow other places as well.
 
     Args:
         axis: axes to draw on.
-        robot: model of the robot.
-        data: state at the pose (`mujoco.MjData`).
-        projection: camera.
-        marks: the places.
+        labels: labels of all places.
     """
-    certainty: dict[tuple[str, str], bool] = {}
-    for mark in marks:
-        key = mark.kind, mark.name
-        certainty[key] = certainty.get(key, False) or mark.is_certain
-    for (kind, name), is_certain in certainty.items():
-        place = locate_place(robot, data, kind, name)
-        if place is None:
+    for label in labels:
+        if not label.is_marked:
             continue
-        shape, size = _MARKER_BY_PLACE_KIND.get(kind, _MARKER_BY_PLACE_KIND["joint"])
-        x, y = projection.project(place[None])[0].tolist()
+        shape, size = _MARKER_BY_PLACE_KIND.get(label.kind, _MARKER_BY_PLACE_KIND["joint"])
+        x, y = label.point.tolist()
         # Markers cannot be dashed, so a ring is a scatter plot of one point.
         axis.scatter(
             x,
@@ -526,7 +528,7 @@ def _draw_place_rings(
             facecolors="none",
             edgecolors=BLUE,
             linewidths=2.4,
-            linestyles="-" if is_certain else (0, (1.6, 1.0)),
+            linestyles="-" if label.is_certain else (0, (1.6, 1.0)),
             zorder=5,
             clip_on=False,
         )
