@@ -36,8 +36,11 @@ _MAX_ANSWER_BYTES = 1 << 20
 """Maximum size of the description of a plugin, in bytes."""
 _PROJECT_PACKAGES = ("methods.", "bench.")
 """Packages of the project's own tuners and diagnosers, which are trusted."""
-_ISOLATED_REGISTRIES = ("tuner", "diagnoser")
-"""Kinds of parts that are compared; their code never runs in a process with true parameters."""
+_ISOLATED_REGISTRIES: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnosers}
+"""Registries of parts that are compared.
+
+Their code never runs in a process with true parameters.
+"""
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,12 @@ class Plugin:
     Attributes:
         path: path of the file; empty for an installed plugin.
         is_loaded: whether its code runs in the harness's processes.
-        tuners: descriptions of its tuners if it is not loaded, as fields of `TunerStub`.
-        diagnosers: descriptions of its diagnosers if it is not loaded.
+        parts: descriptions of its tuners and diagnosers if it is not loaded.
     """
 
     path: str
     is_loaded: bool = True
-    tuners: tuple[dict[str, Any], ...] = ()
-    diagnosers: tuple[dict[str, Any], ...] = ()
+    parts: tuple[dict[str, Any], ...] = ()
 
 
 class TunerStub(Tuner):
@@ -69,13 +70,9 @@ class DiagnoserStub(Diagnoser):
         raise NotImplementedError
 
 
-def _make_stub(base: type, description: dict[str, Any]) -> Any:
-    """Make the stub class of a tuner or diagnoser from its description.
-
-    Args:
-        base: base class of the stub, `TunerStub` or `DiagnoserStub`.
-        description: description by the isolated process.
-    """
+def _make_stub(description: dict[str, Any]) -> Any:
+    """Make the stub class of a tuner or diagnoser from its description by the isolated process."""
+    base = TunerStub if description["kind"] == "tuner" else DiagnoserStub
     fields: dict[str, Any] = {
         "name": str(description["name"]),
         "stochastic": description["stochastic"] is not False,
@@ -99,10 +96,8 @@ def register_plugins(plugins: Iterable[Plugin]) -> None:
     load_plugins(plugin.path for plugin in plugins if plugin.is_loaded)
     for plugin in plugins:
         path = Path(plugin.path) if plugin.path else None
-        for description in plugin.tuners:
-            tuners.announce(_make_stub(TunerStub, description), path)
-        for description in plugin.diagnosers:
-            diagnosers.announce(_make_stub(DiagnoserStub, description), path)
+        for description in plugin.parts:
+            _ISOLATED_REGISTRIES[description["kind"]].announce(_make_stub(description), path)
 
 
 _known_plugins: dict[str, Plugin] = {}
@@ -162,9 +157,9 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
     """
     labels = {entry.tuner: entry.label for entry in experiment.tuners}
     for plugin in plugins:
-        for plugin_list in plugin.tuners:
-            if plugin.is_loaded and plugin_list["name"] in labels:
-                raise _make_untrusted_code_error(labels[plugin_list["name"]], plugin.path)
+        for part in plugin.parts:
+            if plugin.is_loaded and part["kind"] == "tuner" and part["name"] in labels:
+                raise _make_untrusted_code_error(labels[part["name"]], plugin.path)
 
 
 def _make_untrusted_code_error(label: str, file: object) -> InputError:
@@ -264,17 +259,13 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
             plugins.append(Plugin(path))
             continue
         parts = _ask_isolated_process({"file": path, "kind": "", "name": ""}, path)
-        simulated_parts = {
-            part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES
-        }
-        for part in parts:
-            if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
-                _check_name_free(part["kind"], part["name"], path, paths_by_name)
-        tuners_and_diagnosers = [
-            tuple(part for part in parts if part["kind"] == kind) for kind in _ISOLATED_REGISTRIES
+        isolated_parts = tuple(part for part in parts if part["kind"] in _ISOLATED_REGISTRIES)
+        needed_parts = [
+            part for part in parts if part["name"] in needed_names and part not in isolated_parts
         ]
-        is_loaded = bool(simulated_parts & needed_names)
-        plugins.append(Plugin(path, is_loaded, *tuners_and_diagnosers))
+        for part in needed_parts:
+            _check_name_free(part["kind"], part["name"], path, paths_by_name)
+        plugins.append(Plugin(path, bool(needed_parts), isolated_parts))
     return plugins
 
 
@@ -317,11 +308,12 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         InputError: it cannot be inspected.
     """
     descriptions = _ask_isolated_process({"file": "", "kind": kind, "name": name}, name)
-    if descriptions and "skipped" in descriptions[0]:
+    if not descriptions:
+        raise InputError(f"plugin {name}: its process did not describe it")
+    if "skipped" in descriptions[0]:
         raise PartUnavailableError(kind, name, descriptions[0]["skipped"])
-    return Plugin(
-        "", False, *(tuple(descriptions) if kind == k else () for k in _ISOLATED_REGISTRIES)
-    )
+    # Under another name or kind, the part itself would have no stub, and its code would run here.
+    return Plugin("", False, ({**descriptions[0], "kind": kind, "name": name},))
 
 
 def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
@@ -452,12 +444,9 @@ def _describe_installed_part(question: dict[str, str]) -> dict[str, Any]:
     """Describe an installed tuner or diagnoser; runs in an isolated process, as it imports it."""
     kind, name = question["kind"], question["name"]
     try:
-        return _describe_class(kind, _REGISTRY_OF[kind].get(name))
+        return _describe_class(kind, _ISOLATED_REGISTRIES[kind].get(name))
     except PartUnavailableError as error:
         return {"kind": kind, "name": name, "skipped": error.reason}
-
-
-_REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnosers}
 
 
 def _describe_class(kind: str, part: Any) -> dict[str, Any]:
@@ -482,7 +471,7 @@ def _describe_class(kind: str, part: Any) -> dict[str, Any]:
             "trains_as": getattr(part, "trains_as", ""),
             "source": hash_class_source(part),
             # A package may be missing for the part although its file can be imported.
-            "name": _REGISTRY_OF[kind].get(part.name).name,
+            "name": _ISOLATED_REGISTRIES[kind].get(part.name).name,
         }
     except PartUnavailableError as error:
         return {**description, "skipped": error.reason}

@@ -96,7 +96,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     with Killing(what) as killing:
         known = inspect_plugins([path], [])
     assert killing.killed == 1
-    assert [tuner["name"] for tuner in known[0].tuners] == ["slow"]
+    assert [tuner["name"] for tuner in known[0].parts] == ["slow"]
     load_plugins_for_experiment([path], experiment)
     entry = TunerEntry("slow", "slow")
     lesson = TrainingRequest(entry, 0, tuner_process_reuse.make_tuner_spec(entry))

@@ -184,12 +184,13 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
         train_or_load(experiment, make_training_request("school"), anew=True)
 
 
-def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeypatch):
+@pytest.mark.parametrize("is_lying", [False, True])
+def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeypatch, is_lying):
     from importlib import metadata
 
     from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
 
-    (tmp_path / "their_package.py").write_text(THEIRS)
+    (tmp_path / "their_package.py").write_text(THEIRS + OTHER_NAME * is_lying)
     about = tmp_path / "their_package-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 1.0\n")
@@ -211,6 +212,19 @@ def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeyp
     assert "their_package" not in sys.modules, "its code never ran here"
 
 
+OTHER_NAME = """
+from bench.benchmark.isolation.message_channel import MessageChannel
+
+send = MessageChannel.send_document
+
+def lie(channel, kind, document):
+    if isinstance(document, list) and document and isinstance(document[0], dict):
+        document = [{**document[0], "kind": "simulator", "name": "other"}]
+    send(channel, kind, document)
+
+MessageChannel.send_document = lie
+"""
+"""Code that describes the tuner as another part, so that the tuner itself would have no stub."""
 THEIRS = """
 import os
 from methods.tuner import Tuner
