@@ -28,7 +28,7 @@ import numpy as np
 
 from bench.logs.importing.import_result import MAX_NAMES, ImportResult
 from bench.logs.importing.run_logs import RunLogs
-from bench.logs.importing.signal_assignment import Placement, SignalAssignment
+from bench.logs.importing.signal_assignment import Placement, Signal, SignalAssignment
 from sims.core.simulator import Array
 from sims.robot.dynamics.inverse_dynamics import motion_forces
 from sims.robot.mujoco_messages import capture_mujoco_warnings
@@ -184,8 +184,6 @@ MAX_DISTANCE_RATIO = 0.5
 """Maximum ratio of distances (1), another order over the present one, for changing the order."""
 MIN_SAMPLES = 20
 """Minimum number of samples for determining an order."""
-MAX_COMPARED_JOINTS = 7
-"""Maximum number of joints of which all orders are compared."""
 
 
 def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> list[int] | None:
@@ -230,17 +228,11 @@ def find_best_order(distances: Array) -> list[int]:
     """Return the order in which the positions are closest to the commands.
 
     It is the permutation p that minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1), with
-    commands u_i and positions q_j. All permutations of a few joints are compared; for more it is
-    found by linear assignment.
+    commands u_i and positions q_j, found by linear assignment.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns).
     """
-    count = len(distances)
-    if count <= MAX_COMPARED_JOINTS:
-        orders = np.array(list(permutations(range(count))))
-        best = int(np.argmin(distances[np.arange(count), orders].sum(axis=1)))
-        return [int(column) for column in orders[best]]
     # SciPy's optimisers take a third of a second to import.
     from scipy.optimize import linear_sum_assignment
 
@@ -286,6 +278,11 @@ class _ServoSignals(NamedTuple):
     commands: list[Array]
     positions: list[Array]
 
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels with the positions of the joints."""
+        return [f"q.{joint}" for joint in self.joints]
+
 
 def assign_order(
     logs: RunLogs, signals: SignalAssignment, is_normalised: bool, result: ImportResult
@@ -310,7 +307,7 @@ def assign_order(
         all(table[name].placement.is_order for name in names)
         for table, names in (
             (signals.inputs, servos.inputs),
-            (signals.channels, [f"q.{joint}" for joint in servos.joints]),
+            (signals.channels, servos.channels),
         )
     )
     if not servos.commands:
@@ -383,14 +380,28 @@ def _follow_commands(
         return {}
     joints = servos.joints
     if are_commands_guessed:
-        columns = [signals.inputs[name] for name in servos.inputs]
-        for place, signal in zip(order, columns, strict=True):
-            signals.inputs[servos.inputs[place]] = signal.with_placement(Placement.COMMANDS)
+        # Each command moves to its position, so the order is reversed.
+        inverse_order = np.argsort(order).tolist()
+        _reorder(signals.inputs, servos.inputs, inverse_order, Placement.COMMANDS)
     else:
-        columns = [signals.channels[f"q.{joint}"] for joint in joints]
-        for joint, place in zip(joints, order, strict=True):
-            signals.channels[f"q.{joint}"] = columns[place].with_placement(Placement.COMMANDS)
+        _reorder(signals.channels, servos.channels, order, Placement.COMMANDS)
     return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
+
+
+def _reorder(
+    table: dict[str, Signal], names: Sequence[str], order: Sequence[int], placement: Placement
+) -> None:
+    """Exchange the columns of signals.
+
+    Args:
+        table: channels or inputs of the assignment, changed in place.
+        names: names of the signals.
+        order: for each name, the index of the name whose column it gets.
+        placement: reason for the new order.
+    """
+    columns = [table[name] for name in names]
+    for name, place in zip(names, order, strict=True):
+        table[name] = columns[place].with_placement(placement)
 
 
 def _prefer_model(
@@ -420,17 +431,14 @@ def _prefer_model(
     # Unknown gains explain nothing.
     if len(driven) < len(joints) or all(map(signals.has_number_of_joint, joints)):
         return {}
-    seconds = logs.seconds[signals.channels[f"q.{joints[0]}"].column.file]
+    seconds = logs.seconds[signals.channels[servos.channels[0]].column.file]
     preferred = find_order_by_model(
         signals.robot, driven, seconds, servos.commands, servos.positions
     )
     if preferred is None or not preferred.is_certain():
         return {}
-    positions = [signals.channels[f"q.{joint}"] for joint in joints]
-    commands = [signals.inputs[name] for name in servos.inputs]
-    for joint, name, place in zip(joints, servos.inputs, preferred.order, strict=True):
-        signals.channels[f"q.{joint}"] = positions[place].with_placement(Placement.MODEL)
-        signals.inputs[name] = commands[place].with_placement(Placement.MODEL)
+    _reorder(signals.channels, servos.channels, preferred.order, Placement.MODEL)
+    _reorder(signals.inputs, servos.inputs, preferred.order, Placement.MODEL)
     columns = sorted(joints, key=lambda joint: preferred.order[joints.index(joint)])
     result.checks.append(
         "order of joints: the log does not name those of its columns; they are taken in the "
