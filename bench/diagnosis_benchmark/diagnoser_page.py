@@ -32,6 +32,7 @@ from bench.figures.style import (
 from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
 from bench.pages.html_page import HtmlPage
 from bench.pages.text_format import format_p_value, format_percent, sanitise
+from sims.core.plain_values import format_count
 
 
 @dataclass(frozen=True)
@@ -409,8 +410,7 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
     )
     leader_alarms, alarms_text = alarms[leader], ""
     if leader_alarms["high"] > TARGET_FALSE_ALARM_RATE:
-        plural = "" if leader_alarms["count"] == 1 else "s"
-        alarms_text = f"{int(leader_alarms['count'])} false alarm{plural}"
+        alarms_text = format_count(int(leader_alarms["count"]), "false alarm")
     return Leader(
         leader,
         tuple(candidates),

@@ -24,7 +24,7 @@ from bench.core.resource_estimates import (
 )
 from sims.core.argument_checks import Expected, Name
 from sims.core.files import hash_file
-from sims.core.plain_values import MAX_NUMBER
+from sims.core.plain_values import MAX_NUMBER, format_count
 from sims.core.simulator import InputError, Simulator
 from sims.core.toml_validation import get_subtable
 from sims.recording.column_mapping import list_mapped_files
@@ -467,11 +467,10 @@ def load_joined(
         for name, recording in zip(names, recordings, strict=True)
         for run in recording.runs
     ]
-    other_count = len(loaded) - 1
     joined_recording = replace(
         first_recording,
-        title=f"{first_recording.title or first_recording.path.stem} and {other_count} more "
-        f"log{'s' if other_count > 1 else ''}",
+        title=f"{first_recording.title or first_recording.path.stem} and "
+        + format_count(len(loaded) - 1, "more log"),
         constants=common_constants,
         noise=_compute_rms_noise(recordings),
         runs=tuple(runs),

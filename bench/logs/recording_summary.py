@@ -5,13 +5,13 @@ The summary of a robot includes its model file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from bench.logs.quality.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
-from sims.core.plain_values import align_columns, format_unit, join_first_names
+from sims.core.plain_values import align_columns, format_count, format_run_names, format_unit
 from sims.core.simulator import Array, Channel, Simulator
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
@@ -208,9 +208,7 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
         held_out_text = "its last third is held out"
     if recording.folds():
         held_out_text = "each left out in turn"
-    size = (
-        f"{_format_count(run_count, 'run')} ({held_out_text}), {samples} samples, {seconds:.4g} s"
-    )
+    size = f"{format_count(run_count, 'run')} ({held_out_text}), {samples} samples, {seconds:.4g} s"
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
     yield ""
@@ -308,21 +306,14 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
     unit = f" {format_unit(unit)}".rstrip()
     if len(runs_by_value) > 1:
         parts = [
-            f"{value:g}{unit} in {_format_run_names(runs)}" for value, runs in runs_by_value.items()
+            f"{value:g}{unit} in {format_run_names(runs, _MAX_LISTED_NAMES)}"
+            for value, runs in runs_by_value.items()
         ]
         return f"{name} differs by run: {'; '.join(parts)}"
     value = next(iter(runs_by_value))
     is_stated = name in recording.constants or any(name in run.constants for run in recording.runs)
     note = "" if is_stated else " (the system's default; not stated)"
     return f"{name} = {value:g}{unit}{note}"
-
-
-def _format_run_names(names: Sequence[str]) -> str:
-    return f"run{'s' if len(names) > 1 else ''} {join_first_names(names, _MAX_LISTED_NAMES)}"
-
-
-def _format_count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' if number != 1 else ''}"
 
 
 LIMIT_TOLERANCE = 0.01
@@ -346,15 +337,11 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
         (len(robot.bodies), "moving body"),
         (len(robot.sensors), "sensor row"),
     )
-    words = ", ".join(f"{n} {_pluralise(word, n)}" for n, word in counts if n)
+    words = ", ".join(format_count(n, word) for n, word in counts if n)
     step, integrator, *_ = simulator.numerics
     form = robot.format.upper()
     yield f"robot {robot.path} ({form}): {words}; {integrator} at {1e3 * step:g} ms"
     yield from (f"note: {note}" for note in robot.notes)
-
-
-def _pluralise(word: str, count: int) -> str:
-    return word if count == 1 else word.replace("body", "bodie") + "s"
 
 
 def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator[str]:

@@ -77,8 +77,24 @@ def join_first_names(names: Iterable[str], max_count: int = 4) -> str:
     return f"{text} and {unnamed_count} more" if unnamed_count > 0 else text
 
 
+def format_count(count: int, noun: str) -> str:
+    """Return a number with a noun in singular or plural, such as ``1 run`` or ``3 bodies``."""
+    return f"{count} {noun if count == 1 else _PLURAL_STEM.sub('ie', noun) + 's'}"
+
+
+def format_run_names(names: Sequence[str], max_count: int) -> str:
+    """Return the first names of runs after the noun, such as ``runs a, b and 3 more``.
+
+    Args:
+        names: Names of the runs.
+        max_count: Maximum number of names to write.
+    """
+    return f"run{'s' if len(names) > 1 else ''} {join_first_names(names, max_count)}"
+
+
 SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 """Translation of digits and minus sign to superscripts."""
+_PLURAL_STEM = re.compile("(?<=[^aeiou])y$")
 _POWER_PATTERN = re.compile(r"(?:\^|\*\*)(-?\d+)")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +32,7 @@ from sims import effects as library
 from sims.core.argument_checks import check_arguments
 from sims.core.effect import ALL_PLACES, Effect
 from sims.core.files import Content, write_all_atomically
-from sims.core.plain_values import join_first_names
+from sims.core.plain_values import format_run_names
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator
 from sims.recording.recording import Recording
@@ -73,7 +73,7 @@ def render_page(
         _TEMPLATE,
         sheet=sheet,
         still=printed_figure,
-        runs=_format_runs([run.name for run in sheet.recording.training()]),
+        runs=format_run_names([run.name for run in sheet.recording.training()], _NAMED_RUNS),
         elsewhere=joined(list(sheet.elsewhere())),
         class_file=CLASS_FILE,
         class_text=mjcf.contents.get(CLASS_FILE, ""),
@@ -106,11 +106,6 @@ def _describe_rest_forces(diagram: DriveDiagram) -> str:
     if diagram.without:
         text += f" Not included, because they have an internal state: {', '.join(diagram.without)}."
     return text
-
-
-def _format_runs(runs: Sequence[str]) -> str:
-    """Format the names of runs, such as ``runs a, b and 3 more``."""
-    return f"run{'s' if len(runs) > 1 else ''} {join_first_names(runs, _NAMED_RUNS)}"
 
 
 TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility"})

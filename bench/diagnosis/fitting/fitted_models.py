@@ -24,6 +24,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
+from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array
 
 EffectNames = tuple[str, ...]
@@ -431,9 +432,8 @@ class ModelSet:
 
 def _format_starts(starts: Sequence[FitStart]) -> str:
     """Return a short description of the models of these starts, for the progress display."""
-    names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
-    others_text = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return f"{names[0]}{others_text}" if names else "nothing"
+    names = [" + ".join(start.effects) or "the base model" for start in starts]
+    return join_first_names(names, 1) or "nothing"
 
 
 def _name_stage(starts: Sequence[FitStart]) -> str:

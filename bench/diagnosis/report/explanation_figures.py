@@ -59,6 +59,7 @@ from bench.figures.style import (
     make_panel_grid,
     measure_text_width,
 )
+from sims.core.plain_values import format_count
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
@@ -407,9 +408,8 @@ def _format_split_size(split: DataSplit) -> str:
     """Format the size of a data split, such as ``3 runs, 1200 samples of 2 channels``."""
     runs, channels = len(split.times), split.observed.shape[2]
     samples = int(np.isfinite(split.observed).any(axis=2).sum())
-    run_count = "1 run" if runs == 1 else f"{runs} runs"
     channel_text = f" of {channels} channels" if channels > 1 else ""
-    return f"{run_count}, {samples} samples{channel_text}"
+    return f"{format_count(runs, 'run')}, {samples} samples{channel_text}"
 
 
 def _make_legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:

@@ -25,6 +25,7 @@ from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
 from bench.diagnosis.fitting.fitted_models import count_identified_states
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from sims.core.plain_values import format_count
 from sims.core.simulator import Array
 
 HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
@@ -210,7 +211,7 @@ class HeldOutRuns:
         if not starts:
             return fits
         control = self.evaluator.search_control
-        models = "one model" if len(starts) == 1 else f"{len(starts)} models"
+        models = format_count(len(starts), "model")
         control.begin_stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
             fitter = TrajectoryFitter(
