@@ -53,6 +53,8 @@ CONFOUNDING_CORRELATION = 0.95
 """Minimum correlation of two parameters that are reported as confounded."""
 CANDIDATES_PER_BLOCK = 256
 """Number of candidates that are projected together, which limits the memory."""
+MAX_LISTED_CAUSES = 8
+"""Maximum number of causes with their own line, and of names in a list, in the terminal."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
 
@@ -330,15 +332,8 @@ def _classify_parameter(
     )
 
 
-def format_identifiability(
-    assessments: Sequence[ParameterIdentifiability], max_count: int = 8
-) -> list[str]:
-    """Format the free parameters and the best identifiable causes as lines for the terminal.
-
-    Args:
-        assessments: Result of `assess_identifiability`.
-        max_count: Maximum number of causes with their own line, and of names in a list.
-    """
+def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
+    """Format the free parameters and the best identifiable causes as lines for the terminal."""
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
     causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
@@ -346,14 +341,16 @@ def format_identifiability(
     lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
     identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
-    lines += [f"  {_format_parameter(number)}" for number in identifiable[:max_count]]
+    lines += [f"  {_format_parameter(number)}" for number in identifiable[:MAX_LISTED_CAUSES]]
     for level, members in (
-        ("also identifiable", identifiable[max_count:]),
+        ("also identifiable", identifiable[MAX_LISTED_CAUSES:]),
         *list(causes.items())[1:],
     ):
         if members:
-            lines.append(f"  {level}: {join_first_names(_count_effects(members), max_count)}")
-    if any(len(members) > max_count for members in causes.values()):
+            lines.append(
+                f"  {level}: {join_first_names(_count_effects(members), MAX_LISTED_CAUSES)}"
+            )
+    if any(len(members) > MAX_LISTED_CAUSES for members in causes.values()):
         lines.append("  all causes with their intervals: the same command with --json")
     return lines
 

@@ -94,15 +94,12 @@ class DiagnoserReportData:
         """Yield each diagnoser with its mark style (colour, dash and marker)."""
         return ((name, get_mark_style(place)) for place, name in enumerate(self.order))
 
-    def make_interval_series(
-        self, y: str, *, is_shifted: bool = False, **where: str
-    ) -> tuple[Series, ...]:
+    def make_interval_series(self, *, is_shifted: bool = False, **where: str) -> tuple[Series, ...]:
         """Make one series of points with error bars for each diagnoser.
 
         A series names the rows and columns that it shows; the chart reads them from its table.
 
         Args:
-            y: column with the value.
             is_shifted: whether the points of the diagnosers are shifted sideways, so that they do
                 not overlap on a category axis.
             **where: values of further columns that select the rows of the series.
@@ -111,7 +108,7 @@ class DiagnoserReportData:
         return tuple(
             Series(
                 name,
-                y,
+                "share",
                 line_style,
                 {"diagnoser": name, **where},
                 "low",
@@ -123,17 +120,16 @@ class DiagnoserReportData:
             for place, (name, line_style) in enumerate(self.get_line_styles())
         )
 
-    def make_line_series(self, y: str, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
+    def make_line_series(self, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
         """Make one line with error bars for each diagnoser that occurs in a table.
 
         Args:
-            y: column with the value.
             frame: the table.
             **where: values of further columns that select the rows of the line.
         """
         names_in_table = set(frame["diagnoser"])
         return tuple(
-            Series(name, y, line_style, {"diagnoser": name, **where}, "low", "high")
+            Series(name, "share", line_style, {"diagnoser": name, **where}, "low", "high")
             for name, line_style in self.get_line_styles()
             if name in names_in_table
         )
@@ -231,7 +227,7 @@ def _make_board(data: DiagnoserReportData) -> list[Panel]:
     )
     # A margin of 3 %, so that marks at 0 and 100 % are visible.
     y_axis = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
-    series, percent = data.make_interval_series("share"), 100 * TARGET_FALSE_ALARM_RATE
+    series, percent = data.make_interval_series(), 100 * TARGET_FALSE_ALARM_RATE
     rules = (ReferenceLine(percent, f"{percent:g} %", "x"),)
     return [Panel("", "board", "alarms", series, x_axis, y_axis, rules=rules)]
 
@@ -246,7 +242,7 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
     counts = table.groupby("metric")["of"].max()
     names = tuple(f"{_SHARE_METRICS[name]}\nn={int(counts[name])}" for name in _list_shares(data))
     x_axis = Axis("what is counted; at most n answers or intervals", names=names)
-    series = data.make_interval_series("share", is_shifted=True)
+    series = data.make_interval_series(is_shifted=True)
     return [Panel("", "shares", "place", series, x_axis, _SHARE_AXIS)]
 
 
@@ -261,7 +257,7 @@ def _make_power(data: DiagnoserReportData) -> list[Panel]:
     x_axis = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
     panels = []
     for metric, title in (("named", "Named, in a set of at most two"), ("seen", "Detected")):
-        lines = data.make_line_series("share", table, metric=metric)
+        lines = data.make_line_series(table, metric=metric)
         panels.append(Panel(title, "power", "size", lines, x_axis, _SHARE_AXIS, {"what": title}))
     return panels
 
@@ -277,7 +273,7 @@ def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
     ideal_series = Series(
         "calibrated p-value", "share", make_mark_style(GREY, (4.0, 3.0)), {"diagnoser": ""}
     )
-    lines = data.make_line_series("share", data.tables["calibration"])
+    lines = data.make_line_series(data.tables["calibration"])
     x_axis = Axis("level", "log", ticks=P_VALUE_LEVELS)
     y_axis = Axis(
         "share of clean recordings with p below the level", scales=("linear",), ends=_SHARE_LIMITS
@@ -294,7 +290,7 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
         data: graded answers and result tables of all diagnosers.
     """
     x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
-    correct = data.make_interval_series("share", is_shifted=True)
+    correct = data.make_interval_series(is_shifted=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)
     share_axis = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)
     count_axis = Axis("answers of this size", scales=("linear",), holds=(0.0,))
@@ -311,7 +307,7 @@ def _make_cost(data: DiagnoserReportData) -> list[Panel]:
         "simulations_median": "simulations for an answer, median",
         "processor_seconds_median": "processor time for an answer [s], median",
     }
-    series = data.make_interval_series("share")
+    series = data.make_interval_series()
     return [
         Panel("", "cost", column, series, Axis(label, "log"), y_axis, {"cost": label})
         for column, label in labels.items()

@@ -266,13 +266,9 @@ class SimulationCache:
     A fit simulates a trial, accepts it, and then needs it again as the centre of finite
     differences; starts are compared before they are fitted. A third of the simulations of a robot
     are such repetitions.
-
-    Args:
-        limit: maximum size of the cached results, in bytes.
     """
 
-    def __init__(self, limit: int = CACHE_BYTES) -> None:
-        self._limit = limit
+    def __init__(self) -> None:
         self._held: dict[bytes, Array] = {}
         self._bytes = 0
 
@@ -303,5 +299,5 @@ class SimulationCache:
             # Store a copy: a view would keep the results of a whole call in memory.
             self._held[key] = row.copy()
             self._bytes += row.nbytes
-        while self._bytes > self._limit:
+        while self._bytes > CACHE_BYTES:
             self._bytes -= self._held.pop(next(iter(self._held))).nbytes

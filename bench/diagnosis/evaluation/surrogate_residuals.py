@@ -26,6 +26,8 @@ from sims.core.simulator import Array
 
 BURN_IN_SAMPLES = 200
 """Number of initial samples of a surrogate that are discarded, to remove its zero initial state."""
+MAX_ORDER = 6
+"""Maximum order of an autoregression."""
 YULE_WALKER_RIDGE = 1e-9
 """Share of the variance added to the Yule-Walker matrix, which a pure tone makes singular."""
 MAX_ROOT = 0.999
@@ -54,7 +56,6 @@ def draw_surrogates(
     observed_mask: Mask,
     count: int,
     rng: np.random.Generator,
-    max_order: int = 6,
     project_out: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
@@ -70,14 +71,12 @@ def draw_surrogates(
         observed_mask: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
         count: number of surrogates.
         rng: random numbers for the innovations.
-        max_order: maximum order of the autoregression.
         project_out: callback that returns the residual of a fit to noise (count, R, T, C); without
             it the bias is not corrected.
     """
     channels = residual.shape[2]
     weights = [
-        _fit_autoregression(residual[..., c], observed_mask[..., c], max_order)
-        for c in range(channels)
+        _fit_autoregression(residual[..., c], observed_mask[..., c]) for c in range(channels)
     ]
     # White noise has no correlation that a fit could reduce.
     if project_out is not None and any(w.size for w in weights):
@@ -189,7 +188,7 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     return innovations
 
 
-def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> Array:
+def _fit_autoregression(values: Array, observed_mask: Mask) -> Array:
     """Fit an autoregression by the Yule-Walker equations, with the order of Akaike's criterion.
 
     The model is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and independent u_t.
@@ -199,14 +198,13 @@ def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> A
     Args:
         values: (R, T) residual of one channel.
         observed_mask: (R, T) whether a sample is recorded.
-        max_order: maximum number of weights.
 
     Returns:
         Weights a_k (p,) of eq. (1); empty if fewer than `MIN_INNOVATIONS` innovations are complete.
     """
     filled = np.where(observed_mask, values, 0.0)
     covariances = _estimate_autocovariances(
-        filled, observed_mask, min(max_order, observed_mask.shape[1] - 1)
+        filled, observed_mask, min(MAX_ORDER, observed_mask.shape[1] - 1)
     )
     weights = _select_order_by_aic(covariances, int(observed_mask.sum()))
     return (

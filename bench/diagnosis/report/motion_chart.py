@@ -66,20 +66,17 @@ class MotionTable(NamedTuple):
     absent: int
 
 
-def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) -> MotionTable:
+def build_motion_table(report: DiagnosisReportData) -> MotionTable:
     """Build the table of samples that the interactive chart shows.
 
-    The rows are divided among the runs and channels. If there are too many runs, the best ones are
-    left out; if runs have too many samples, only the extremes of short parts are shown.
-
-    Args:
-        report: Report data.
-        max_rows: Approximate maximum number of samples.
+    About `MAX_ROWS` rows are divided among the runs and channels. If there are too many runs, the
+    best ones are left out; if runs have too many samples, only the extremes of short parts are
+    shown.
     """
     runs = rank_runs(report)
     count = len(report.channels)
-    shown_runs = runs[: max(1, max_rows // (MIN_ROWS_PER_CHANNEL * count))]
-    samples_per_run = max(MIN_ROWS_PER_CHANNEL, max_rows // (len(shown_runs) * count))
+    shown_runs = runs[: max(1, MAX_ROWS // (MIN_ROWS_PER_CHANNEL * count))]
+    samples_per_run = max(MIN_ROWS_PER_CHANNEL, MAX_ROWS // (len(shown_runs) * count))
     parts = [
         _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
     ]

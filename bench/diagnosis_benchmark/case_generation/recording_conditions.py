@@ -158,7 +158,6 @@ def draw_conditions(
     system: str,
     rng: np.random.Generator,
     hidden: Sequence[str] = (),
-    short: bool = False,
     requested: RequestedConditions = ANY_CONDITIONS,
 ) -> RecordingConditions:
     """Draw recording conditions in which the hidden effects can be observed.
@@ -169,13 +168,12 @@ def draw_conditions(
         system: name of the system, such as ``pendulum``.
         rng: random generator.
         hidden: names of the hidden effects.
-        short: whether there are always three runs.
         requested: conditions that are not drawn.
     """
     # Rate in Hz and length of a run in s.
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
-    runs = 3 if short else int(rng.choice([3, 4, 5, MAX_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
+    runs = int(rng.choice([3, 4, 5, MAX_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
     # These values are drawn in any case, so that later draws do not depend on the request.
     rate, runs = requested.rate or rate, requested.runs or runs
     times = np.arange(round(rate * seconds)) / rate

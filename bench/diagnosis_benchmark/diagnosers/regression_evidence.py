@@ -111,7 +111,7 @@ class RegressionEvidence:
         held_out: indices of the held-out runs.
     """
 
-    def __init__(self, case: DiagnosisCase, has_held_out: bool = True) -> None:
+    def __init__(self, case: DiagnosisCase) -> None:
         """Find the noise of each channel and fit the base model.
 
         Runs for fitting come first, held-out runs after them. Systems without an engine of their
@@ -120,10 +120,9 @@ class RegressionEvidence:
 
         Args:
             case: task of a diagnoser: recording, simulator and effects, without the hidden causes.
-            has_held_out: whether held-out runs are fitted too.
         """
         recording = case.recording
-        runs = [*recording.training(), *(recording.held_out() if has_held_out else ())]
+        runs = [*recording.training(), *recording.held_out()]
         # The simulator of a robot uses the step that its model file states.
         engine = None if case.kind.own_engine else "batch"
         self.evaluator = RunEvaluator(

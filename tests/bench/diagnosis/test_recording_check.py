@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
+from bench.diagnosis import identifiability
 from bench.diagnosis.explain import explain
 from bench.diagnosis.identifiability import format_identifiability
 from bench.diagnosis.recording_check import check_identifiability
@@ -94,10 +95,11 @@ def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
         check_identifiability(tmp_path / "none.csv")
 
 
-def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
+def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(identifiability, "MAX_LISTED_CAUSES", 3)
     numbers = check_identifiability(recorded(tmp_path))
     causes = [n for n in numbers if not n.free]
-    lines = format_identifiability(numbers, max_count=3)
+    lines = format_identifiability(numbers)
     sure = [n.name for n in causes if n.word == "identifiable"]
     assert len(sure) > 6
     assert f"{len(sure)} identifiable" in lines[2]

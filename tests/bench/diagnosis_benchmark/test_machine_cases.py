@@ -189,7 +189,8 @@ def test_residuals_have_the_size_of_the_hidden_effect(system, effect, tmp_path):
     item = draw_case("single", system, 11, effect, 6.0, RequestedConditions(50, 3))
     case = case_of(item, tmp_path)
     assert item.size == 6.0
-    evidence = RegressionEvidence(case, has_held_out=False)
+    fitted_runs = replace(case.recording, runs=case.recording.training())
+    evidence = RegressionEvidence(replace(case, recording=fitted_runs))
     sigma = restore_conditions(item.name, system, item.asked).noise_sigmas
     left = np.sqrt(np.mean(np.square(evidence.residual[evidence.observed_mask] / sigma)))
     evidence.close()

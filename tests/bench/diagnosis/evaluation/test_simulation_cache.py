@@ -1,5 +1,6 @@
 import numpy as np
 
+from bench.diagnosis.evaluation import run_data
 from bench.diagnosis.evaluation.run_data import SimulationCache
 
 ROW = np.zeros((2, 1)).nbytes
@@ -37,8 +38,9 @@ def test_what_it_holds_is_its_own():
     assert fill_cache(cache, [b"a"], {}) == ([1], [])
 
 
-def test_beyond_its_limit_the_oldest_are_dropped():
-    cache = SimulationCache(limit=2 * ROW)
+def test_beyond_its_limit_the_oldest_are_dropped(monkeypatch):
+    monkeypatch.setattr(run_data, "CACHE_BYTES", 2 * ROW)
+    cache = SimulationCache()
     made = {key: float(place) for place, key in enumerate([b"a", b"b", b"c", b"d"])}
     # One call may request more results than the cache can hold.
     assert fill_cache(cache, [b"a", b"b", b"c"], made) == ([0, 1, 2], [b"a", b"b", b"c"])
