@@ -7,7 +7,7 @@ salt, it is a part of a hash of salt and case name, which reveals neither.
 from __future__ import annotations
 
 import hashlib
-import tempfile
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -29,10 +29,11 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
 )
-from bench.diagnosis_benchmark.machine_cases import hidden_causes, machine_case_sampling
+from bench.diagnosis_benchmark.machine_cases import hidden_causes
 from bench.diagnosis_benchmark.machine_cases import machine_case_sampling as machines
 from sims import effects as library
 from sims.core.document_fields import Document
+from sims.core.files import Content, write_files
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     check_entries,
@@ -40,6 +41,7 @@ from sims.core.toml_validation import (
     get_type_hints_of,
     make_error,
 )
+from sims.recording.recording_writer import format_description, format_table
 from sims.systems.servo import Servo
 
 ALL_SYSTEMS = (*case_sampling.SYSTEMS, *machines.MACHINE_NAMES)
@@ -135,19 +137,40 @@ def render_recording(case: BenchmarkCase) -> RecordingFiles:
     Args:
         case: the case; its true causes are not among the texts.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        if case.system in machines.MACHINE_NAMES:
-            path = machine_case_sampling.write_case(case, Path(folder))
-        else:
-            path = case_sampling.write_case(case, folder, truth=False)
-        description = path.with_suffix(".toml")
-        other_files = [
-            file for file in sorted(Path(folder).iterdir()) if file not in (path, description)
-        ]
-        other_texts = {file.name: file.read_text("utf-8") for file in other_files}
-        return RecordingFiles(path.read_text("utf-8"), description.read_text("utf-8"), other_texts)
+    record = (
+        machines.record_case if case.system in machines.MACHINE_NAMES else case_sampling.record_case
+    )
+    recording, declared, extra_files = record(case)
+    table = format_table(recording.runs, _TABLE_DIGITS)
+    return RecordingFiles(table, format_description(recording, declared, Path()), extra_files)
 
 
+def write_case(case: BenchmarkCase, folder: Path, truth: bool = True) -> Path:
+    """Write the recording of a case as NAME.csv and NAME.toml.
+
+    Args:
+        case: case of the benchmark: its recording conditions and hidden causes.
+        folder: folder for the files.
+        truth: whether to write the case with its true causes to NAME.truth.json too.
+
+    Returns:
+        Path of the CSV file.
+    """
+    texts, path = render_recording(case), folder / f"{case.name}.csv"
+    contents: dict[Path, Content] = {
+        path: texts.table,
+        path.with_suffix(".toml"): texts.description,
+        **{folder / name: text for name, text in texts.extra_files.items()},
+    }
+    if truth:
+        truth_text = json.dumps(case.to_document(), indent=1) + "\n"
+        contents[path.with_suffix(".truth.json")] = truth_text
+    write_files(contents)
+    return path
+
+
+_TABLE_DIGITS = 9
+"""Number of significant digits of the recordings."""
 MAX_EFFECT_SIZE = 30.0
 """Maximum size of a hidden effect, in units of the noise."""
 _MAX_CASES = 10_000

@@ -49,13 +49,13 @@ def write_recording(
     if not recording.runs:
         raise InputError(f"{table}: expected at least one run, found none")
     texts: dict[Path, Content] = {
-        table: _format_table(recording.runs, digits),
-        get_description_path(table): _format_description(recording, declared, table.parent),
+        table: format_table(recording.runs, digits),
+        get_description_path(table): format_description(recording, declared, table.parent),
     }
     write_files({**texts, **(extra_files or {})})
 
 
-def _format_table(runs: Sequence[Run], digits: int) -> str:
+def format_table(runs: Sequence[Run], digits: int) -> str:
     """Return the text of the CSV table with all runs.
 
     The columns are the run, the time, inputs, channels and extra signals.
@@ -149,7 +149,7 @@ def _describe_source(recording: Recording, folder: Path) -> dict[str, Any]:
     return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in model_entries.items() if v}}
 
 
-def _format_description(recording: Recording, declared: DeclaredSignals, folder: Path) -> str:
+def format_description(recording: Recording, declared: DeclaredSignals, folder: Path) -> str:
     """Return the text of the description in TOML: units, constants, and what is known of each run.
 
     `folder` is the folder of the recording; a model file is stated relative to it.

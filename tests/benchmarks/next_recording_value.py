@@ -35,13 +35,13 @@ import simgap
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     find_equivalent_effects,
     restore_conditions,
-    write_case,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     simulate_with_mujoco,
     simulate_with_scipy,
 )
+from bench.diagnosis_benchmark.case_set import write_case
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
@@ -94,7 +94,7 @@ def _evaluate_question(call):
     except UndrawableError:
         return None
     with tempfile.TemporaryDirectory() as folder:
-        before = write_case(item, folder, truth=False)
+        before = write_case(item, Path(folder), truth=False)
         proposed = simgap.design(before, seconds=SECONDS, longest=longest, jobs=1)
         known = _set_of(proposed.explanation)
         if known is None or len(_classes(item, known)) < 2 or proposed.design is None:

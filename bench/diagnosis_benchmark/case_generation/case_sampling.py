@@ -1,13 +1,11 @@
 """Sampling of cases for ball, pendulum and slider.
 
-`draw_case` chooses what is hidden and how strongly. `write_case` writes the recording and, in a
-separate file, the true causes. Everything that is drawn follows from the name of the case; a case
-is a recipe without data.
+`draw_case` chooses what is hidden and how strongly. `record_case` simulates the recording.
+Everything that is drawn follows from the name of the case; a case is a recipe without data.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +17,7 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     BenchmarkCase,
+    RecordedCase,
     RecordingConditions,
     RequestedConditions,
     draw_conditions,
@@ -36,7 +35,6 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 from sims import effects as library
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
-from sims.recording.recording_writer import write_recording
 
 SYSTEMS = ("ball", "pendulum", "slider")
 SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
@@ -279,36 +277,14 @@ def _compute_unexplained_size(
     )
 
 
-def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
-    """Write the recording of a case as NAME.csv and NAME.toml.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-        folder: folder for the files.
-        truth: whether to write NAME.truth.json too.
-
-    Returns:
-        Path of the CSV file.
-    """
+def record_case(case: BenchmarkCase) -> RecordedCase:
+    """Simulate the recording of a case, with sensor noise."""
     setting = restore_conditions(case)
-    runs = _simulate_runs(case, setting)
-    system = SIMULATORS[case.system].system
     noise = setting.noise.sigma if case.stated else {}
     constants = {} if case.system == "slider" else setting.constants
-    path = Path(folder) / f"{case.name}.csv"
-    other_files = (
-        {path.with_suffix(".truth.json"): json.dumps(case.to_document(), indent=1) + "\n"}
-        if truth
-        else {}
-    )
-    write_recording(
-        path,
-        Recording(path, case.system, "", constants, noise, runs),
-        system,
-        digits=9,
-        extra_files=other_files,
-    )
-    return path
+    runs = _simulate_runs(case, setting)
+    recording = Recording(Path(), case.system, "", constants, noise, runs)
+    return RecordedCase(recording, SIMULATORS[case.system].system)
 
 
 def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:

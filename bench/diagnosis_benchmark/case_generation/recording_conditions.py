@@ -5,7 +5,7 @@ They are parameters, runs, inputs, channels and noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 )
 from sims.core.document_fields import Document
 from sims.core.simulator import Array, Scenario
+from sims.recording.recording import DeclaredSignals, Recording
 from sims.systems.pendulum import Pendulum
 
 GROUND_PARALLEL_EFFECTS = (
@@ -492,6 +493,20 @@ def draw_size(kind: str, size: float | None, rng: np.random.Generator) -> float:
     """
     low = 3.0 if kind in ("double", "foreign") else 1.0
     return size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
+
+
+class RecordedCase(NamedTuple):
+    """Recording of a case.
+
+    Attributes:
+        recording: the recording; the path of a model file is its name.
+        declared: system, for the units.
+        extra_files: texts of other files, by file name.
+    """
+
+    recording: Recording
+    declared: DeclaredSignals
+    extra_files: Mapping[str, str] = {}
 
 
 def make_case_rng(name: str, purpose: str) -> np.random.Generator:

@@ -21,6 +21,7 @@ from bench.diagnosis_benchmark.case_generation.cause_sizes import (
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     BenchmarkCase,
+    RecordedCase,
     RequestedConditions,
     draw_size,
     make_case_rng,
@@ -42,7 +43,6 @@ from sims.core.simulator import Array, Channel
 from sims.core.system import System
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference
-from sims.recording.recording_writer import write_recording
 from sims.systems.servo import Servo
 
 MACHINE_NAMES = tuple(MACHINES)
@@ -418,27 +418,18 @@ class _ArmSignals(System):
     inputs = tuple(Channel(f"u.{name}", "N*m") for name in MACHINES["arm2"].motors)
 
 
-def write_case(case: BenchmarkCase, folder: Path) -> Path:
-    """Write the recording, its description and, for an arm, its model file.
+def record_case(case: BenchmarkCase) -> RecordedCase:
+    """Simulate the recording of a case, with sensor noise; that of an arm has a model file.
 
-    The files state what a user knows: units, constants or the model file, held-out runs and
-    sometimes the noise, but neither the hidden causes nor the true parameters.
-
-    Args:
-        case: case of the benchmark: its recording conditions and hidden causes.
-        folder: folder for the files.
-
-    Returns:
-        Path of the CSV file.
+    It states what a user knows: units, constants or the model file, held-out runs and sometimes the
+    noise, but neither the hidden causes nor the true parameters.
     """
     conditions = restore_conditions(case.name, case.system, case.asked)
-    plant = conditions.make_machine(case.effects)
-    readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
+    plant, times = conditions.make_machine(case.effects), conditions.runs.times
+    readings = read_encoders(simulate_machine(plant, conditions.runs), plant, times)
     rng = make_case_rng(case.name, "noise")
     is_arm = case.system == "arm2"
     declared = _ArmSignals if is_arm else Servo.system
-    path, model = folder / "recording.csv", folder / MODEL_FILE_NAME
-    times = conditions.runs.times
     runs = []
     for number, run in enumerate(readings):
         recorded = conditions.noise.add_to(run, rng)
@@ -447,28 +438,14 @@ def write_case(case: BenchmarkCase, folder: Path) -> Path:
         channels = dict(zip(case.channels, recorded.T, strict=True))
         held_out = number >= case.runs - conditions.held_out
         runs.append(Run(str(number), times, channels, inputs, {}, {}, held_out))
-    stated_constants = (
-        {}
-        if is_arm
-        else {
-            name: v
-            for name, v in conditions.numbers.items()
-            if name not in conditions.free_parameters
-        }
-    )
-    write_recording(
-        path,
-        Recording(
-            path,
-            case.system,
-            "",
-            stated_constants,
-            conditions.noise.sigma if case.stated else {},
-            tuple(runs),
-            model=ModelFileReference(model, {}, {}) if is_arm else None,
-        ),
-        declared,
-        digits=9,
-        extra_files={model: render_arm_mjcf(conditions.numbers)} if is_arm else {},
-    )
-    return path
+    noise = conditions.noise.sigma if case.stated else {}
+    if is_arm:
+        model = ModelFileReference(Path(MODEL_FILE_NAME), {}, {})
+        recording = Recording(Path(), case.system, "", {}, noise, tuple(runs), model=model)
+        model_text = render_arm_mjcf(conditions.numbers)
+        return RecordedCase(recording, declared, {MODEL_FILE_NAME: model_text})
+    stated_constants = {
+        name: v for name, v in conditions.numbers.items() if name not in conditions.free_parameters
+    }
+    recording = Recording(Path(), case.system, "", stated_constants, noise, tuple(runs))
+    return RecordedCase(recording, declared)

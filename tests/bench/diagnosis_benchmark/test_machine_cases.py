@@ -16,7 +16,7 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     BenchmarkCase,
     RequestedConditions,
 )
-from bench.diagnosis_benchmark.case_set import list_coefficient_names, render_recording
+from bench.diagnosis_benchmark.case_set import list_coefficient_names, render_recording, write_case
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import RegressionEvidence
 from bench.diagnosis_benchmark.grading import _count_classes, grade_answer
 from bench.diagnosis_benchmark.machine_cases.hidden_causes import (
@@ -28,7 +28,6 @@ from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import (
     draw_case,
     render_arm_mjcf,
     restore_conditions,
-    write_case,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     MACHINES,

@@ -15,14 +15,13 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     SYSTEMS,
     draw_case,
     restore_conditions,
-    write_case,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
 )
-from bench.diagnosis_benchmark.case_set import find_equivalent_effects
+from bench.diagnosis_benchmark.case_set import find_equivalent_effects, write_case
 from bench.diagnosis_benchmark.grading import MAX_SET_SIZE, grade_answer
 from sims import effects as library
 from tests.exams.exam import (

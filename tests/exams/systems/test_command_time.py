@@ -4,7 +4,7 @@ import pytest
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis_benchmark.case_generation import joint_reference
-from bench.diagnosis_benchmark.case_generation.case_sampling import write_case
+from bench.diagnosis_benchmark.case_set import write_case
 from tests.exams.systems.system_cases import questions
 
 EARLY = {"input.hold", "input.delay"}

@@ -14,7 +14,6 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     draw_case,
     find_coefficients,
     restore_conditions,
-    write_case,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     MIN_DISTINCT_SIZE,
@@ -30,6 +29,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     simulate_with_mujoco,
     simulate_with_scipy,
 )
+from bench.diagnosis_benchmark.case_set import write_case
 from sims.core.simulator import Scenario
 from sims.recording.recording import read_recording
 from tests.exams.exam import UndrawableError
