@@ -90,7 +90,7 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
     Raises:
         InputError: the folder has no comparison, no runs, or no runs with the metric.
     """
-    stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_list_target_columns(folder)])
+    stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_TARGET_KEY_COLUMNS])
     if stored.runs.empty:
         raise InputError(f"{folder}: contains no runs")
     name = metric or select_primary_metric(stored.runs).metric
@@ -101,24 +101,6 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
     columns = [c for c in runs if str(c).startswith(_TARGET_KEY_COLUMNS)]
     targets = stored.runs[stored.runs["k"] == 0].groupby("target")[columns].first()
     return ComparisonSide(folder, stored, curves, targets)
-
-
-def _list_target_columns(folder: Path) -> list[str]:
-    """List the columns of a comparison's runs that identify a target.
-
-    These are its true parameters and its start. Empty if the table cannot be
-    read; a later step reports the error.
-    """
-    from pyarrow import parquet
-
-    path = folder / "runs.parquet"
-    # Errors of the folder are reported by the code that reads it.
-    if not path.is_file():
-        return []
-    try:
-        return [n for n in parquet.read_schema(path).names if n.startswith(_TARGET_KEY_COLUMNS)]
-    except (OSError, ValueError):
-        return []
 
 
 @dataclass(frozen=True)

@@ -277,17 +277,17 @@ def build_error_table(
     for (experiment, tuner, kind), part in rows.keys.groupby(
         ["experiment", "tuner", "range"], sort=False
     ):
-        tuner_rows = part.index.to_numpy()
+        is_part = rows.keys.index.isin(part.index)
         # Simulations and seconds of a training; zero for a tuner that is not trained.
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
         seconds = [
-            np.full(len(points), np.nan) if s is None else s[tuner_rows][:, points].mean(axis=0)
+            np.full(len(points), np.nan) if s is None else s[is_part][:, points].mean(axis=0)
             for s in spent_seconds
         ]
-        counts = len(tuner_rows), int(rows.failed[tuner_rows].sum())
+        counts = len(part), int(rows.failed[is_part].sum())
         for metric, curve in curves.items():
             values = _summarise_over_targets(
-                curve, tuner_rows, points, (str(tuner), str(kind), metric)
+                curve.select_mask(is_part), points, (str(tuner), str(kind), metric)
             )
             for point_index, simulations in enumerate(points):
                 errors = values[:, point_index]
@@ -304,24 +304,19 @@ def build_error_table(
 
 
 def _summarise_over_targets(
-    curves: RunCurves,
-    rows: NDArray[np.int64],
-    points: list[int],
-    names: tuple[str, str, str],
+    curves: RunCurves, points: list[int], names: tuple[str, str, str]
 ) -> Array:
-    """Compute median, mean, low and high over targets of the runs in `rows`.
+    """Compute median, mean, low and high over targets.
 
     Args:
-        curves: values of all runs.
-        rows: indices of the runs.
+        curves: values of the runs.
         points: numbers of simulations.
         names: names that determine the stream of the bootstrap.
 
     Returns:
         (4, len(points)) values.
     """
-    _, groups = curves.select_mask(np.isin(np.arange(len(curves.used)), rows)).group_by_target()
-    values = average_over_seeds(curves.values[rows][:, points], groups)
+    values = _get_values(compute_target_curves(curves, points))
     low, high = compute_bootstrap_interval(values, compute_resampled_means, *names)
     with warnings.catch_warnings():
         # NumPy warns about columns of NaN alone; the result NaN is shown in the table.

@@ -272,7 +272,8 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
 
     Args:
         folder: Folder of the comparison.
-        columns: Columns of the runs to read, if present; None for all.
+        columns: Columns of the runs to read, if present; a name that ends with an underscore stands
+            for all that begin with it; None for all.
 
     Raises:
         InputError: A file is missing or violates `storage.table_schemas`, or runs are missing.
@@ -291,7 +292,12 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
     plan = read_plan(folder) if is_unfinished else None
     files = check_files(folder, experiment, is_unfinished=is_unfinished, plan=plan)
     stored_names = parquet.read_schema(path).names
-    read_names = [name for name in stored_names if columns is None or name in columns]
+    prefixes = tuple(name for name in columns or () if name.endswith("_"))
+    read_names = [
+        name
+        for name in stored_names
+        if columns is None or name in columns or name.startswith(prefixes)
+    ]
     runs = parquet.read_table(path, columns=read_names).to_pandas()
     return StoredComparison(
         experiment,
