@@ -184,14 +184,8 @@ def model_in(
     bases = find_recorded_bases(list_channel_names(get_subtable(description, meta, "channels")))
     if bases and not engine.get("fix_base"):
         engine["recorded_bases"] = bases
-    return ModelFileReference(
-        Path(model), actuators, engine, _read_free_parameters(description, meta)
-    )
-
-
-def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the robot parameters that the description leaves free."""
-    return check_name_list(path, "free", meta.get("free", []), 'names, as ["damping@*"]')
+    free = check_name_list(description, "free", meta.get("free", []), 'names, as ["damping@*"]')
+    return ModelFileReference(Path(model), actuators, engine, free)
 
 
 def read_system_name(path: str | Path) -> str:

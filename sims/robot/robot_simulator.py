@@ -27,7 +27,6 @@ from sims.robot.dynamics.activation_filters import (
     ActivationFilter,
     activation_filters,
     extend_into_past,
-    is_rk4_integrator,
     select_initial_activations,
 )
 from sims.robot.dynamics.applied_inputs import (
@@ -70,6 +69,7 @@ from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (
     INTEGRATOR_IDS,
+    RK4_INTEGRATOR_ID,
     IntegratorSettings,
     RobotEngine,
     read_integrator_settings,
@@ -508,7 +508,7 @@ class RobotSimulator(SystemSimulator):
         """
         engine = self.engine
         assert isinstance(engine, RobotEngine)
-        is_rk4 = is_rk4_integrator(int(engine.numerics.to_model_options()["integrator"]))
+        is_rk4 = engine.numerics.to_model_options()["integrator"] == RK4_INTEGRATOR_ID
         return activation_filter.compute_activations(
             controls, initial_activations, self.time_step, is_rk4
         )

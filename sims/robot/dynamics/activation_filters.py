@@ -20,7 +20,6 @@ import numpy as np
 
 from sims.core.simulator import Array, Scenario
 from sims.effects.compiled_recursions import LINEAR, run_recursion
-from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import Actuator, RobotModel, cache_per_robot, filters
 
 ACTIVATION_PREFIX = "act."
@@ -127,11 +126,6 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
             )
         )
     return tuple(filters_found)
-
-
-def is_rk4_integrator(integrator: int) -> bool:
-    """Return whether MuJoCo's integrator of this number is of fourth order."""
-    return integrator == RK4_INTEGRATOR_ID
 
 
 def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:

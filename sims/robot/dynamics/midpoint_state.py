@@ -141,7 +141,7 @@ class MidpointPredictor:
             has_new_command: (L,) whether commands have changed since the previous step; they are
                 already set.
         """
-        x, v, a, drive, bias = self._get_field_values()
+        x, v, a, drive, bias = (field[:, places] for field, places in self._fields)
         # The initial acceleration lacks the applied forces, so it is not used for prediction.
         first, self._first = self._first, False
         a = np.zeros_like(a) if first else a
@@ -149,10 +149,6 @@ class MidpointPredictor:
             return JointStates(x, v, a, drive, bias, drive, bias)
         loads, midpoint_loads = self._compute_transmission_loads(has_new_command, first)
         return JointStates(x, v, a, *loads, *midpoint_loads)
-
-    def _get_field_values(self) -> list[Array]:
-        """Return the present values of the fields, (L, D) each."""
-        return [field[:, places] for field, places in self._fields]
 
     def _compute_transmission_loads(
         self, has_new_command: Mask, first: bool

@@ -375,7 +375,8 @@ class _Actuator:
         self.gain = fields["actuator_gainprm"][0, self.id]
         self.bias = fields["actuator_biasprm"][0, self.id]
         # The factor 1 + a and the offset b of (1) from causes that are in the fields already.
-        self.command = fields.setdefault("command", _get_command_scaling(robot))[0, self.id]
+        unchanged = np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
+        self.command = fields.setdefault("command", unchanged)[0, self.id]
 
     def _get_integer_field(self, name: str) -> int:
         return int(self.fields[name][0, self.id])
@@ -431,11 +432,6 @@ class _Actuator:
         if np.isfinite(low) and np.isfinite(high):
             self.fields["actuator_ctrllimited"][0, self.control] = True
             self.fields["actuator_ctrlrange"][0, self.control] = (low, high)
-
-
-def _get_command_scaling(robot: RobotModel) -> Any:
-    """Return the unchanged factor and offset (1, N, 2) of each actuator's command."""
-    return np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
 
 
 _NOT_LINEAR = "its actuator is not a gain and a bias of one control"

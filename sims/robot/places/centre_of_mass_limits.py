@@ -40,7 +40,7 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
         (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
         axes of the body's frame.
     """
-    model, data = _get_reference_state(robot)
+    model, data = robot.compiled, _make_reference_data(robot.compiled)
     body_id = robot.body(body).id
     points = np.array(list(_iterate_link_points(model, data, body_id)))
     low, high = points.min(axis=0), points.max(axis=0)
@@ -155,30 +155,22 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     Returns:
         Observable axes, 0, 1, 2 for x, y, z.
     """
-    return _compute_observable_axes(robot.compiled, robot.body(body).id)
-
-
-def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
-    """Return the axes along which an offset of a body's centre of mass changes the motion.
-
-    A body that rotates about parallel hinges only shows no offset along them. `axes` collects, in
-    world coordinates, the hinge axes between the body and the world. See `observable_axes`.
-    """
     import mujoco
 
+    model, number = robot.compiled, robot.body(body).id
     hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
     data = _make_reference_data(model)
-    axes = []
-    body = number
-    while body:
-        first, count = model.body_jntadr[body], model.body_jntnum[body]
+    axes = []  # of the hinges between the body and the world, in world coordinates
+    carrier = number
+    while carrier:
+        first, count = model.body_jntadr[carrier], model.body_jntnum[carrier]
         for joint in range(first, first + count):
             kind = int(model.jnt_type[joint])
             if kind == hinge:
                 axes.append(data.xaxis[joint])
             elif kind != slide:
                 return (0, 1, 2)
-        body = int(model.body_parentid[body])
+        carrier = int(model.body_parentid[carrier])
     if not axes:
         return ()
     if any(abs(float(axis @ axes[0])) < MIN_PARALLEL_COSINE for axis in axes):
@@ -187,10 +179,6 @@ def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
     # For a diagonal direction the nearest frame axis is omitted, since the two others suffice.
     nearest_axis = int(np.argmax(np.abs(along).round(9)))
     return tuple(axis for axis in range(3) if axis != nearest_axis)
-
-
-def _get_reference_state(robot: RobotModel) -> tuple[Any, Any]:
-    return robot.compiled, _make_reference_data(robot.compiled)
 
 
 @lru_cache(maxsize=8)
@@ -237,18 +225,13 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
         tilt_direction = np.cross(np.eye(3)[axis], file_axis)
         forces_by_sign = []
         for sign in (1.0, -1.0):
-            model.jnt_axis[joint.id] = _normalise(file_axis + sign * TILT_STEP * tilt_direction)
+            axis_vector = file_axis + sign * TILT_STEP * tilt_direction
+            model.jnt_axis[joint.id] = axis_vector / np.linalg.norm(axis_vector)
             forces_by_sign.append(_compute_random_state_forces(model, robot.joints))
         change = (forces_by_sign[0] - forces_by_sign[1]) / (2.0 * TILT_STEP)
         if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(forces_by_sign[0]).max()).any():
             observable.append(axis)
     return tuple(observable)
-
-
-def _normalise(vector: Array) -> Array:
-    """Return the vector scaled to length 1."""
-    result: Array = vector / np.linalg.norm(vector)
-    return result
 
 
 def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array:
