@@ -10,11 +10,14 @@ from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
-from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.simulator import make_unknown_name_error
 from sims.recording.recorded_poses import ANGLES, POSITION_AXES
 from sims.robot.friction_form import FrictionForm
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing.collision_hulls import CollisionShapes
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 Format = Literal["mjcf", "urdf"]
 JointKind = Literal["hinge", "slide", "ball", "free"]
@@ -199,16 +202,17 @@ class RobotModel:
 
     def with_friction_form(self, form: FrictionForm) -> RobotModel:
         """Return the robot with another form of the dry friction that effects add."""
-        robot = replace(self, friction_form=form)
-        # The compiled model does not depend on the form, so it is reused.
-        robot.__dict__["compiled"] = self.compiled
-        return robot
+        return self._with_same_model(friction_form=form)
 
     def with_contacts(self, contacts: tuple[str, ...]) -> RobotModel:
         """Return the robot with the contacts at which effects are candidates."""
-        other = replace(self, contacts=contacts)
-        other.__dict__["compiled"] = self.compiled
-        return other
+        return self._with_same_model(contacts=contacts)
+
+    def _with_same_model(self, **changes: Any) -> RobotModel:
+        """Return the robot with changes on which the compiled model does not depend."""
+        robot = replace(self, **changes)
+        robot.__dict__["compiled"] = self.compiled
+        return robot
 
     @property
     def is_on_ground(self) -> bool:
@@ -395,17 +399,11 @@ class RobotModel:
         Raises:
             InputError: there is no such joint; the message lists the existing ones.
         """
-        matching_joint: Joint = self._find_by_name(
-            "joint", name, {joint.name: joint for joint in self.joints}
-        )
-        return matching_joint
+        return self._find_by_name("joint", name, {joint.name: joint for joint in self.joints})
 
     def actuator(self, name: str) -> Actuator:
         """Return the actuator with a name; errors as in `joint`."""
-        matching_actuator: Actuator = self._find_by_name(
-            "actuator", name, {a.name: a for a in self.actuators}
-        )
-        return matching_actuator
+        return self._find_by_name("actuator", name, {a.name: a for a in self.actuators})
 
     def body(self, name: str) -> Body:
         """Return the body with a name, or the body into which a link with the name is fused.
@@ -415,10 +413,9 @@ class RobotModel:
         """
         bodies = {body.name: body for body in self.bodies}
         fused = (self.aliases or {}).get(name, name)
-        matching_body: Body = self._find_by_name("body", fused if fused in bodies else name, bodies)
-        return matching_body
+        return self._find_by_name("body", fused if fused in bodies else name, bodies)
 
-    def _find_by_name(self, kind: str, name: str, elements: Mapping[str, Any]) -> Any:
+    def _find_by_name(self, kind: str, name: str, elements: Mapping[str, _T]) -> _T:
         """Return an element of the robot by name.
 
         Args:
@@ -430,15 +427,10 @@ class RobotModel:
             InputError: the robot has no such element; the message lists the known names.
         """
         if name not in elements:
-            error = make_unknown_name_error(
+            raise make_unknown_name_error(
                 f"{kind} of {self.path.name}", name, list(elements) or ["none"]
             )
-            raise InputError(str(error))
         return elements[name]
-
-
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
 
 
 def cache_per_robot(
