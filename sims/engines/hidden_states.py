@@ -125,36 +125,6 @@ class AugmentedSystem(System):
         )
 
 
-class _BaseForce(Force):
-    """Force on the system's own coordinates; `_wrap_effect` makes one."""
-
-    inner: ClassVar[Force]
-
-    def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the force of the base effect, padded with zeros.
-
-        Args:
-            c: (K, L, 1) coefficients.
-            moment: state snapshot of the augmented system.
-        """
-        return pad_force(self.inner.force(c, _get_base_snapshot(moment)), moment)
-
-
-class _BaseFriction(Friction):
-    """Dry friction on the system's own coordinates; `_wrap_effect` makes one."""
-
-    inner: ClassVar[Friction]
-
-    def limit(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the friction limit of the base effect.
-
-        Args:
-            c: (K, L, 1) coefficients.
-            moment: state snapshot of the augmented system.
-        """
-        return self.inner.limit(c, _get_base_snapshot(moment))
-
-
 def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Trajectories:
     """Integrate batch elements, on some of which hidden-state effects may be active.
 
@@ -253,11 +223,14 @@ def make_augmented_system(
 @cache
 def _wrap_effect(effect: type[Effect]) -> type[Effect]:
     """Return an effect that acts on the system's own coordinates of the augmented system."""
-    if not issubclass(effect, (Force, Friction)):
-        return effect
-    base = _BaseForce if issubclass(effect, Force) else _BaseFriction
-    attributes = {"name": effect.name, "coefficients": effect.coefficients, "inner": effect()}
-    return type("PlainEffect", (base,), {**attributes, "says": effect.says})
+    methods: dict[str, Any] = {}
+    if issubclass(effect, Force):
+        methods["force"] = lambda self, c, moment: pad_force(
+            effect.force(self, c, _get_base_snapshot(moment)), moment
+        )
+    elif issubclass(effect, Friction):
+        methods["limit"] = lambda self, c, moment: effect.limit(self, c, _get_base_snapshot(moment))
+    return type("PlainEffect", (effect,), methods) if methods else effect
 
 
 def _get_base_snapshot(moment: StateSnapshot) -> StateSnapshot:
