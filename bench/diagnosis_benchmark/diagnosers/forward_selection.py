@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +25,6 @@ from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search.candidate_directions import compute_directions
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
     EffectColumn,
     RegressionEvidence,
@@ -69,11 +70,8 @@ class _ForwardSelection(Diagnoser):
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
         """Name the selected effects, with alternatives that the criterion cannot exclude."""
-        evidence = RegressionEvidence(case)
-        try:
+        with closing(RegressionEvidence.collect(case)) as evidence:
             return self._select_effects(evidence)
-        finally:
-            evidence.close()
 
     def _select_effects(self, evidence: RegressionEvidence) -> Answer:
         """Add the best effect to the model, one at a time, and answer with the selected effects.
@@ -92,7 +90,7 @@ class _ForwardSelection(Diagnoser):
         best = _add_refit(evidence, evidence.base.fit)
         base_model, candidates = best, list[RefittedModel]()
         causes: list[tuple[str, tuple[str, ...]]] = []
-        while len(causes) < MAX_EFFECTS and not self.is_sufficient(best, samples):
+        while len(causes) < MAX_EFFECTS and not self._is_sufficient(best, samples):
             candidates = [
                 _add_refit(evidence, fit) for fit in _refit_with_one_more_effect(evidence, best.fit)
             ]
@@ -126,7 +124,8 @@ class _ForwardSelection(Diagnoser):
 
         The verdict is "adequate" if the base model suffices, "unknown" if the effects explain less
         than `MIN_GAP_CLOSED` of the excess sum of squares, "partial" if they explain more but not
-        all, and otherwise "named", or "ambiguous" with alternatives.
+        all, and otherwise "named", or "ambiguous" with alternatives. A criterion without p-value,
+        such as BIC, gives neither "unknown" nor "partial".
 
         Args:
             evidence: fitted base model and directions of the effects.
@@ -138,24 +137,31 @@ class _ForwardSelection(Diagnoser):
         intervals = _compute_intervals(evidence, best)
         parameters = {n: e for n, e in intervals.items() if "." not in n}
         p_value = self.compute_p_value(first, samples)
-        if not causes:
-            verdict = "adequate" if self.is_sufficient(best, samples) else "unknown"
-            return Answer(verdict, (), parameters, p_value)
-        floor = float(samples - best.numbers)
-        gap = max(first.squares - floor, 1e-9)
+        # A criterion that only compares models finds the selected one good enough.
+        is_explained = p_value is None or self._is_sufficient(best, samples)
         named_causes = tuple(
             NamedCause(name, alternatives, _select_effect_intervals(intervals, name), p_value)
             for name, alternatives in causes
         )
-        if (
-            not self.is_sufficient(best, samples)
-            and (first.squares - best.squares) / gap < MIN_GAP_CLOSED
-        ):
+        if is_explained:
+            verdict = "named" if causes else "adequate"
+            if any(alternatives for _, alternatives in causes):
+                verdict = "ambiguous"
+            return Answer(verdict, named_causes, parameters, p_value)
+        gap = max(first.squares - float(samples - best.numbers), 1e-9)
+        if not causes or (first.squares - best.squares) / gap < MIN_GAP_CLOSED:
             return Answer("unknown", (), parameters, p_value)
-        if not self.is_sufficient(best, samples):
-            return Answer("partial", named_causes, parameters, p_value)
-        open_sets = any(alternatives for _, alternatives in causes)
-        return Answer("ambiguous" if open_sets else "named", named_causes, parameters, p_value)
+        return Answer("partial", named_causes, parameters, p_value)
+
+    def _is_sufficient(self, model: RefittedModel, samples: int) -> bool:
+        """Return whether noise alone may explain the residual, so that the search can stop.
+
+        Args:
+            model: model with its effects, refitted to the runs.
+            samples: number of samples.
+        """
+        p_value = self.compute_p_value(model, samples)
+        return p_value is not None and p_value > FALSE_ALARM_RATE
 
     near: float
 
@@ -169,24 +175,15 @@ class _ForwardSelection(Diagnoser):
         """
 
     @abstractmethod
-    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
-        """Return whether a model is sufficient, so that the search can stop.
+    def compute_p_value(self, model: RefittedModel, samples: int) -> float | None:
+        """Compute the p-value of a model under the hypothesis that nothing is missing.
 
         Args:
             model: model with its effects, refitted to the runs.
             samples: number of samples.
-        """
-
-    @abstractmethod
-    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
-        """Compute the p-value of the base model under the hypothesis that nothing is missing.
-
-        Args:
-            first: model without effects, refitted to the runs.
-            samples: number of samples.
 
         Returns:
-            The p-value, or None if the criterion gives none.
+            The p-value, or None if the criterion gives none: it then only compares models.
         """
 
 
@@ -205,54 +202,14 @@ class ForwardBIC(_ForwardSelection):
         """
         return float(samples * np.log(model.squares / samples) + model.numbers * np.log(samples))
 
-    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
-        """Return False: BIC only compares models; the search continues while a model is better.
+    def compute_p_value(self, model: RefittedModel, samples: int) -> float | None:
+        """Return None: BIC only compares models; the search continues while a model is better.
 
         Args:
             model: unused.
             samples: unused.
         """
-        return False
-
-    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
-        """Return None: BIC gives no p-value.
-
-        Args:
-            first: unused.
-            samples: unused.
-        """
         return None
-
-    def _make_answer(
-        self,
-        evidence: RegressionEvidence,
-        first: RefittedModel,
-        best: RefittedModel,
-        causes: Sequence[tuple[str, tuple[str, ...]]],
-        samples: int,
-    ) -> Answer:
-        """Give the verdict "adequate", "named", or, if effects have alternatives, "ambiguous".
-
-        BIC compares models but does not say whether one is good enough, so that the verdicts
-        "unknown" and "partial" are impossible.
-
-        Args:
-            evidence: fitted base model and directions of the effects.
-            first: the base model; unused here.
-            best: selected model with its effects, refitted to the runs.
-            causes: each selected effect with its alternatives.
-            samples: number of samples; unused here.
-        """
-        intervals = _compute_intervals(evidence, best)
-        parameters = {n: e for n, e in intervals.items() if "." not in n}
-        named_causes = tuple(
-            NamedCause(name, alternatives, _select_effect_intervals(intervals, name))
-            for name, alternatives in causes
-        )
-        verdict = "named" if named_causes else "adequate"
-        if any(alternatives for _, alternatives in causes):
-            verdict = "ambiguous"
-        return Answer(verdict, named_causes, parameters)
 
 
 class ForwardChi2(_ForwardSelection):
@@ -270,30 +227,15 @@ class ForwardChi2(_ForwardSelection):
         """
         return model.squares
 
-    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
-        """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`.
-
-        Args:
-            model: model with its effects, refitted to the runs.
-            samples: number of samples.
-        """
-        return self._compute_p_value(model, samples) > FALSE_ALARM_RATE
-
-    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
-        """Compute the chi-squared p-value of the base model.
-
-        Args:
-            first: model without effects, refitted to the runs.
-            samples: number of samples.
-        """
-        return self._compute_p_value(first, samples)
-
-    @staticmethod
-    def _compute_p_value(model: RefittedModel, samples: int) -> float:
+    def compute_p_value(self, model: RefittedModel, samples: int) -> float | None:
         """Compute the probability that noise alone gives a sum of squares as large as this one.
 
         The sum of squares is chi-squared distributed with `samples` minus fitted numbers degrees of
         freedom if the noise is white and the model is correct.
+
+        Args:
+            model: model with its effects, refitted to the runs.
+            samples: number of samples.
         """
         from scipy.special import chdtrc
 
@@ -332,11 +274,9 @@ def _refit_with_one_more_effect(
         The best fit for each effect.
     """
     evaluator = evidence.evaluator
-    names = [name for name in evaluator.library if name not in current_fit.effects]
-    evidence = _replace_base_model(evidence, current_fit)
-    directions = compute_directions(evaluator, current_fit, names)
-    # The cached property; its value for the base model would include the effects of the model.
-    evidence.__dict__["sensitivity_directions"] = directions
+    names = tuple(name for name in evaluator.library if name not in current_fit.effects)
+    # Directions of further effects must be computed at the current model.
+    evidence = replace(evidence, base=replace(evidence.base, fit=current_fit), names=names)
     residual, effects = evidence.build_trajectory_regression().project_out_base()
     best = find_strongest_columns(residual, effects, evidence.effect_columns)
     order = sorted(best, key=lambda name: -best[name][0])[:REFITS_PER_ROUND]
@@ -356,27 +296,6 @@ def _refit_with_one_more_effect(
         if name not in by_name or fit.cost < by_name[name].cost:
             by_name[name] = fit
     return list(by_name.values())
-
-
-def _replace_base_model(
-    evidence: RegressionEvidence, current_fit: TrajectoryFit
-) -> RegressionEvidence:
-    """Copy the evidence, with another fitted model in place of the base model.
-
-    Directions of further effects must be computed at the current model. Cached properties are not
-    copied, because they belong to the old model.
-
-    Args:
-        evidence: evidence about the base model.
-        current_fit: fit of the other model.
-    """
-    copied = object.__new__(RegressionEvidence)
-    copied_attributes = ("evaluator", "noise", "stated", "base", "fitted", "held_out")
-    copied.__dict__.update({name: evidence.__dict__[name] for name in copied_attributes})
-    copied.base = type(evidence.base)(
-        current_fit, evidence.base.insensitive_parameters, evidence.base.unidentified_parameters
-    )
-    return copied
 
 
 def _choose_starts(

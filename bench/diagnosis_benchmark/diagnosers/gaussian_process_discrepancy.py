@@ -9,7 +9,7 @@ the residual of the held-out runs better than zero does, something is missing.
 from __future__ import annotations
 
 import warnings
-from itertools import pairwise
+from contextlib import closing
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
     RegressionData,
     RegressionEvidence,
+    compute_block_means,
+    compute_standard_error,
 )
 
 FALSE_ALARM_RATE = 0.01
@@ -43,11 +45,8 @@ class GaussianProcessDiscrepancy(Diagnoser):
 
         Otherwise the verdict is "adequate": a residual that cannot be predicted is noise.
         """
-        evidence = RegressionEvidence(case)
-        try:
+        with closing(RegressionEvidence.collect(case)) as evidence:
             rows = evidence.build_acceleration_regression()
-        finally:
-            evidence.close()
         p_value = _compute_gain_p_value(
             rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out), case.rng
         )
@@ -95,9 +94,8 @@ def _compute_gain_p_value(
         process.fit(fitted_inputs[training_indices], fitted.residual[training_indices])
     predicted = process.predict(held_out_inputs)
     gains = np.square(held_out.residual) - np.square(held_out.residual - predicted)
-    edges = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
-    block_means = np.array([gains[a:b].mean() for a, b in pairwise(edges.tolist())])
-    standard_error = float(block_means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
+    block_means = compute_block_means(gains, HELD_OUT_BLOCK_COUNT)
+    standard_error = compute_standard_error(block_means)
     if standard_error == 0:
         return 1.0
     return float(students.sf(block_means.mean() / standard_error, HELD_OUT_BLOCK_COUNT - 1))

@@ -16,6 +16,7 @@ import json
 import os
 import shlex
 import subprocess
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -63,8 +64,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
     Args:
         case: task of a diagnoser: recording, simulator and effects, without the hidden causes.
     """
-    evidence = RegressionEvidence(case)
-    try:
+    with closing(RegressionEvidence.collect(case)) as evidence:
         names = list(evidence.evaluator.channels)
         sigma = dict(zip(names, map(float, evidence.noise.sigma), strict=True))
         residual = evidence.residual / np.asarray(evidence.noise.sigma)
@@ -86,8 +86,6 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
                     },
                 }
             )
-    finally:
-        evidence.close()
     return {
         "simulator": (case.kind.__doc__ or "").split("\n")[0],
         "constants": dict(case.recording.constants),

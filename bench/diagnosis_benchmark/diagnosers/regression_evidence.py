@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,24 +100,33 @@ class RegressionData:
         return residual, effects
 
 
+@dataclass(eq=False)
 class RegressionEvidence:
     """Base model fitted to the recording of a case, and the directions of the effects.
 
+    The directions of the effects are computed when they are first used.
+
     Attributes:
-        evaluator: the runs and the simulator.
+        evaluator: the runs for fitting, then the held-out runs, and the simulator.
         noise: noise of each channel, stated or estimated.
-        stated: whether the noise of each channel is stated.
         base: fitted base model.
         fitted: indices of the runs for fitting.
         held_out: indices of the held-out runs.
+        names: names of the effects.
     """
 
-    def __init__(self, case: DiagnosisCase) -> None:
+    evaluator: RunEvaluator
+    noise: NoiseModel
+    base: BaseFit
+    fitted: range
+    held_out: range
+    names: tuple[str, ...]
+
+    @classmethod
+    def collect(cls, case: DiagnosisCase) -> RegressionEvidence:
         """Find the noise of each channel and fit the base model.
 
-        Runs for fitting come first, held-out runs after them. Systems without an engine of their
-        own are simulated by the batch engine. The directions of the effects are computed when they
-        are first used.
+        Systems without an engine of their own are simulated by the batch engine.
 
         Args:
             case: task of a diagnoser: recording, simulator and effects, without the hidden causes.
@@ -125,16 +135,11 @@ class RegressionEvidence:
         runs = [*recording.training(), *recording.held_out()]
         # The simulator of a robot uses the step that its model file states.
         engine = None if case.kind.own_engine else "batch"
-        self.evaluator = RunEvaluator(
-            case.kind, recording, runs, engine, candidates=list(case.library)
-        )
-        floor = compute_noise_floor(self.evaluator, recording)
-        self.noise = NoiseModel.make_white(floor.sigma)
-        self.stated: Mask = floor.is_stated
-        self.base: BaseFit = fit_base_model(self.evaluator, self.noise)
-        count = len(recording.training())
-        self.fitted = range(count)
-        self.held_out = range(count, len(runs))
+        evaluator = RunEvaluator(case.kind, recording, runs, engine, candidates=list(case.library))
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
+        base, count = fit_base_model(evaluator, noise), len(recording.training())
+        runs_for_fitting, held_out = range(count), range(count, len(runs))
+        return cls(evaluator, noise, base, runs_for_fitting, held_out, tuple(evaluator.library))
 
     def close(self) -> None:
         """Release the resources of the engine."""
@@ -155,7 +160,7 @@ class RegressionEvidence:
     @cached_property
     def sensitivity_directions(self) -> DirectionSet:
         """Directions of all effects."""
-        return compute_directions(self.evaluator, self.base.fit, self.evaluator.library)
+        return compute_directions(self.evaluator, self.base.fit, self.names)
 
     @cached_property
     def effect_columns(self) -> list[EffectColumn]:
@@ -451,6 +456,22 @@ def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
         ]
         first_column += unknown.size
     return columns
+
+
+def compute_block_means(values: Array, count: int) -> Array:
+    """Compute the means of consecutive blocks (count,), as neighbouring samples are correlated.
+
+    Args:
+        values: values of the samples, (N,).
+        count: number of blocks.
+    """
+    edges = np.linspace(0, len(values), count + 1).astype(int)
+    return np.array([values[a:b].mean() for a, b in pairwise(edges.tolist())])
+
+
+def compute_standard_error(values: Array) -> float:
+    """Compute the standard error of the mean of independent values."""
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def find_strongest_columns(

@@ -12,8 +12,7 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from itertools import pairwise
+from contextlib import closing, suppress
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -22,6 +21,8 @@ from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
     EffectColumn,
     RegressionEvidence,
+    compute_block_means,
+    compute_standard_error,
     find_strongest_columns,
 )
 from sims.core.simulator import Array
@@ -61,13 +62,10 @@ class _SparseRegression(Diagnoser):
         most significant gives the answer. More than `MAX_TERMS` terms mean that no small model
         exists: "unknown".
         """
-        evidence = RegressionEvidence(case)
-        try:
+        with closing(RegressionEvidence.collect(case)) as evidence:
             results = [
                 self._run_regression(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS
             ]
-        finally:
-            evidence.close()
         valid_results = [result for result in results if result is not None]
         if not valid_results:
             return Answer("unidentifiable")
@@ -248,32 +246,23 @@ def _select_by_one_standard_error(
     """
     zero_model = np.zeros(library.shape[1])
     candidates = [zero_model, *models]
-    errors = np.array([_compute_block_mean_squares(residual - library @ c) for c in candidates])
+    errors = np.array(
+        [
+            compute_block_means(np.square(residual - library @ c), HELD_OUT_BLOCK_COUNT)
+            for c in candidates
+        ]
+    )
     best = int(errors.mean(axis=1).argmin())
     gain = errors[0] - errors[best]
-    sigmas = float(gain.mean() / max(_compute_standard_error(gain), 1e-12)) if best else 0.0
+    sigmas = float(gain.mean() / max(compute_standard_error(gain), 1e-12)) if best else 0.0
     if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
         return zero_model, sigmas
     allowed_models = []
     for c, error in zip(candidates[1:], errors[1:], strict=True):
         excess = error - errors[best]
-        if excess.mean() <= _compute_standard_error(excess):
+        if excess.mean() <= compute_standard_error(excess):
             allowed_models.append(c)
     return min(allowed_models or [candidates[best]], key=np.count_nonzero), sigmas
-
-
-def _compute_block_mean_squares(error: Array) -> Array:
-    """Compute the mean squared errors of consecutive blocks, (BLOCKS,).
-
-    Blocks are used because the errors of neighbouring samples are correlated.
-    """
-    edges = np.linspace(0, len(error), HELD_OUT_BLOCK_COUNT + 1).astype(int)
-    return np.array([np.square(error[a:b]).mean() for a, b in pairwise(edges.tolist())])
-
-
-def _compute_standard_error(differences: Array) -> float:
-    """Compute the standard error of the mean of differences."""
-    return float(differences.std(ddof=1) / np.sqrt(len(differences)))
 
 
 def _find_equivalent_effects(

@@ -10,6 +10,8 @@ projected out.
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 
 from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
@@ -40,16 +42,13 @@ class WhitenessTest(Diagnoser):
         the answer is "unknown"; effects that correlate almost as well as the best are its
         alternatives.
         """
-        evidence = RegressionEvidence(case)
-        try:
+        with closing(RegressionEvidence.collect(case)) as evidence:
             p_value = _compute_whiteness_p_value(evidence)
             if p_value >= FALSE_ALARM_RATE:
                 return Answer("adequate", p_value=p_value)
             rows = evidence.build_trajectory_regression()
             residual, effects = rows.project_out_base()
             best = find_strongest_columns(residual, effects, evidence.effect_columns)
-        finally:
-            evidence.close()
         total = float(residual @ residual)
         correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
         order = sorted(correlated, key=lambda name: -correlated[name])

@@ -189,7 +189,7 @@ def test_residuals_have_the_size_of_the_hidden_effect(system, effect, tmp_path):
     case = case_of(item, tmp_path)
     assert item.size == 6.0
     fitted_runs = replace(case.recording, runs=case.recording.training())
-    evidence = RegressionEvidence(replace(case, recording=fitted_runs))
+    evidence = RegressionEvidence.collect(replace(case, recording=fitted_runs))
     sigma = restore_conditions(item.name, system, item.asked).noise_sigmas
     left = np.sqrt(np.mean(np.square(evidence.residual[evidence.observed_mask] / sigma)))
     evidence.close()
