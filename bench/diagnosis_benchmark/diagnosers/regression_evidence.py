@@ -59,6 +59,18 @@ class EffectColumn:
     effect: str
     places: tuple[int, ...]
 
+    def select_directions(self, effects: Array) -> Array:
+        """Return the directions of the column that are not zero, with length one, (N, D).
+
+        Args:
+            effects: all directions, (N, K).
+        """
+        part = effects[:, list(self.places)]
+        scale = np.sqrt(np.square(part).sum(axis=0))
+        # Columns below 1e-9 are zero up to rounding, and cannot be normalised.
+        directions: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]
+        return directions
+
 
 @dataclass(frozen=True)
 class RegressionData:
@@ -443,19 +455,14 @@ def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     Returns:
         Columns, (R, T, C, q + n), for q free parameters and n unknown initial states of all runs.
     """
-    parameter_count = fit.free_indices.size
-    runs, length, channels, _ = fit.jacobian.shape
-    unknown_states = [np.flatnonzero(~evaluator.known_state_mask[r]) for r in range(runs)]
-    column_count = parameter_count + sum(unknown.size for unknown in unknown_states)
-    columns = np.zeros((runs, length, channels, column_count))
-    columns[..., :parameter_count] = fit.jacobian[..., :parameter_count]
-    first_column = parameter_count
-    for r, unknown in enumerate(unknown_states):
-        columns[r, :, :, first_column : first_column + unknown.size] = fit.jacobian[r][
-            ..., parameter_count + unknown
-        ]
-        first_column += unknown.size
-    return columns
+    from scipy.linalg import block_diag
+
+    parameters, states = np.split(fit.jacobian, [fit.free_indices.size], axis=3)
+    runs, length, channels, state_count = states.shape
+    own_columns = block_diag(*states.reshape(runs, length * channels, state_count))
+    unknown = ~evaluator.known_state_mask.ravel()
+    state_columns = own_columns[:, unknown].reshape(runs, length, channels, int(unknown.sum()))
+    return np.concatenate([parameters, state_columns], axis=3)
 
 
 def compute_block_means(values: Array, count: int) -> Array:
@@ -492,12 +499,9 @@ def find_strongest_columns(
     """
     best: dict[str, tuple[float, EffectColumn]] = {}
     for column in columns:
-        part = effects[:, list(column.places)]
-        scale = np.sqrt(np.square(part).sum(axis=0))
-        # Columns below 1e-9 are zero up to rounding, and cannot be normalised.
-        if not (scale > 1e-9).any():
+        part = column.select_directions(effects)
+        if not part.size:
             continue
-        part = part[:, scale > 1e-9] / scale[scale > 1e-9]
         normal_matrix = part.T @ part + 1e-9 * np.eye(part.shape[1])
         projected_residual = part.T @ residual
         gain = float(projected_residual @ np.linalg.solve(normal_matrix, projected_residual))

@@ -279,19 +279,13 @@ def _find_equivalent_effects(
         columns: one column for each effect.
         effects: columns of all directions, (N, K).
     """
-
-    def units(column: EffectColumn) -> Array:
-        """Return the directions of a column that are not zero, with length one, (N, D)."""
-        part = effects[:, list(column.places)]
-        scale = np.sqrt(np.square(part).sum(axis=0))
-        unit: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]
-        return unit
-
-    selected_units = next(units(column) for column in columns if column.effect == name)
+    selected_units = next(
+        column.select_directions(effects) for column in columns if column.effect == name
+    )
     correlations = {}
     for column in columns:
         if column.effect not in selected_effects:
-            column_units = units(column)
+            column_units = column.select_directions(effects)
             correlations[column.effect] = (
                 float(np.abs(selected_units.T @ column_units).max()) if column_units.size else 0.0
             )
