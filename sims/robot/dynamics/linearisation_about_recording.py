@@ -248,18 +248,13 @@ class MeasuredLinear(RunLinearisation):
         model's own step) are composed in the same way. H is computed by finite differences.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
-        forces = tangent.quotients.forces.shape[2]
-        intervals = self.knots.size - 1
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = self._compose(self._tangent.defects)
-        states = np.tile(np.eye(state_size), (intervals, 1, 1))
-        force = np.zeros((intervals, state_size, forces))
+        states = np.tile(np.eye(state_size), (self.knots.size - 1, 1, 1))
         points, quotients = tangent.point_of_step, tangent.quotients
         # The first step of all intervals at once, then the second, and so on.
         for steps, active in self._list_active_intervals():
-            a = quotients.states[points[steps]]
-            states[active] = a @ states[active]
-            force[active] = a @ force[active] + quotients.forces[points[steps]]
+            states[active] = quotients.states[points[steps]] @ states[active]
         count = self._motion.x.shape[0]
         unit_changes = np.broadcast_to(
             STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
@@ -276,7 +271,7 @@ class MeasuredLinear(RunLinearisation):
         return IntervalMaps(
             states=states,
             defects=defects,
-            forces=force,
+            forces=self._input_responses[:, :, : quotients.forces.shape[2]],
             inputs=self._input_responses,
             readings=readings,
             predicted=self.observed,
