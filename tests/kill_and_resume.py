@@ -28,8 +28,8 @@ import tomli_w
 
 from bench.benchmark.isolation.tuner_processes import remove_stale_folders
 from bench.benchmark.storage.result_folder import read_configuration
-from bench.benchmark.storage.run_journal import read_finished_statuses
 from tests.conftest import PLUGINS
+from tests.finished_statuses import read_finished_statuses
 from tests.local_cluster import cluster, command_line
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND

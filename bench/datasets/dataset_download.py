@@ -75,15 +75,14 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
         raise InputError(
             f"{name}: expected at least {_SAMPLES_PER_RUN * _DECIMATION} samples of 1 ms"
         )
-    lines = ["run,t,q,qd"]
-    for run in range(runs):
-        for i in range(_SAMPLES_PER_RUN):
-            k = run * _SAMPLES_PER_RUN + i
-            t = i * _DECIMATION * _PERIOD_MS / 1000
-            lines.append(f"{run + 1},{t:.7g},{q[k]:.7g},{qd[k]:.7g}")
+    run_indices, samples = np.divmod(np.arange(runs * _SAMPLES_PER_RUN), _SAMPLES_PER_RUN)
+    t = samples * _DECIMATION * _PERIOD_MS / 1000
+    columns = (run_indices + 1, t, q[: t.size], qd[: t.size])
+    table = io.StringIO()
+    np.savetxt(table, np.stack(columns, axis=1), "%.7g", ",", header="run,t,q,qd", comments="")
     held_out = range(_HELD_OUT_FROM, runs + 1)
     description = _FREE_SWING + "".join(f"\n[runs.{run}]\nheld_out = true\n" for run in held_out)
-    return {"recording.csv": "\n".join(lines) + "\n", "recording.toml": description}
+    return {"recording.csv": table.getvalue(), "recording.toml": description}
 
 
 def _join_records(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -181,26 +181,14 @@ def list_segments(folder: Path, ending: str) -> list[Path]:
     return paths
 
 
-def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
-    """Read the statuses of the finished runs of a study, by index in the plan.
-
-    Another process may be writing there at the same time.
-
-    Raises:
-        InputError: A file is damaged.
-    """
-    return {
-        plan_index: status
-        for _, statuses in read_statuses_by_file(folder)
-        for plan_index, status in statuses.items()
-    }
-
-
 def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunStatus]]]:
-    """Yield the statuses of the finished runs of a study by file; see `read_finished_statuses`.
+    """Yield the statuses of the finished runs of a study, by index in the plan, by file.
 
     Files are journals of single runs, and parts, into which full journals are converted. Another
     process may do this at the same time, so a journal may disappear, or its runs come twice.
+
+    Raises:
+        InputError: A file is damaged.
     """
     # Journals first: a journal that becomes a part in the meantime is then found among the parts.
     for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.storage.run_journal import read_finished_statuses
 from bench.cli.main import main
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS
+from tests.finished_statuses import read_finished_statuses
 from tests.plugins.chaos import STATUSES
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND

@@ -7,9 +7,9 @@ import time
 import pandas as pd
 import pytest
 
-from bench.benchmark.storage.run_journal import read_finished_statuses
 from bench.cli.main import main
 from tests.bench.runner.test_comparison_study import CHAOS, SPRING_PLUGIN, same, simgap, write
+from tests.finished_statuses import read_finished_statuses
 from tests.local_cluster import cluster
 from tests.without_drawing import COMMAND
 

@@ -16,13 +16,13 @@ from bench.benchmark.runner.stored_study import prepare_study
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.benchmark.storage.run_journal import (
     RunJournal,
-    read_finished_statuses,
     read_plan,
     write_plan,
 )
 from bench.core.plugin_registries import load_plugins
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS
+from tests.finished_statuses import read_finished_statuses
 from tests.sample_experiments import spring_experiment
 
 EFFECT = """
@@ -35,6 +35,7 @@ class Mine(LinearDrag):
 RECORDING = "run,t,q\n" + "".join(
     f"{run},{0.05 * i:.2f},{0.5 - 0.01 * i * run}\n" for run in (1, 2) for i in range(20)
 )
+
 DESCRIPTION = """
 system = "pendulum"
 [channels.q]

@@ -7,13 +7,13 @@ import pytest
 from bench.benchmark.storage.run_journal import (
     SEGMENTS_FOLDER,
     RunJournal,
-    read_finished_statuses,
     read_plan,
     read_records,
     write_plan,
 )
 from bench.benchmark.storage.run_status import RunStatus
 from sims.core.simulator import InputError
+from tests.finished_statuses import read_finished_statuses
 
 
 def columns(place, k=3):
