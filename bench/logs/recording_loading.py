@@ -25,6 +25,7 @@ from bench.core.resource_estimates import (
 from sims.core.argument_checks import Expected, Name
 from sims.core.files import hash_file
 from sims.core.plain_values import MAX_NUMBER, format_count
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import InputError, Simulator
 from sims.core.toml_validation import get_subtable
 from sims.recording.column_mapping import list_mapped_files
@@ -537,7 +538,7 @@ def _compute_rms_noise(recordings: Sequence[Recording]) -> dict[str, float]:
     """Return the root mean square noise of each channel, if all recordings state it."""
     shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
     return {
-        name: float(np.sqrt(np.mean([recording.noise[name] ** 2 for recording in recordings])))
+        name: compute_rms([recording.noise[name] for recording in recordings])
         for name in recordings[0].noise
         if name in shared
     }

@@ -40,6 +40,7 @@ from bench.diagnosis.fitting.base_fit import (
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.verdict import Cause, RecordingFault
 from sims.core.plain_values import join_first_names
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
 from sims.recording.recording import Recording
@@ -534,7 +535,7 @@ def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) 
         noise: noise of each channel.
     """
     scaled = (residual / noise.sigma)[is_recorded]
-    rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
+    rms = compute_rms(scaled) if scaled.size else 0.0
     return rms if np.isfinite(rms) else np.inf
 
 

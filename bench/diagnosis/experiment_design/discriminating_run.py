@@ -29,6 +29,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
 )
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from sims.core.document_fields import OPTIONAL, Document
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Scenario
 
 MIN_DISCRIMINATION_SIGMAS = 2.0
@@ -389,4 +390,4 @@ def _compute_discrimination(
         thetas, [run.scenario] * 2, np.stack([run.states] * 2)
     )
     whitened_difference = (predictions[0] - predictions[1]) / sigma
-    return float(np.sqrt(np.square(whitened_difference).mean()))  # (1)
+    return compute_rms(whitened_difference)  # (1)

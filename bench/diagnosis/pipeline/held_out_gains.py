@@ -18,6 +18,7 @@ from bench.diagnosis.validation.gain_and_intervals import (
     compute_held_out_gain,
 )
 from bench.diagnosis.verdict import HeldOutResult, to_finite_or_none
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 
 NOISE_RATIO = 1.05
@@ -71,7 +72,7 @@ class HeldOutGains:
             return indices[usual_unit]
         before = held_out_fits[()].simulated
         ratios = {
-            unit: _compute_rmse(runs, before, channels) / _compute_rms(self.noise_sigma[channels])
+            unit: _compute_rmse(runs, before, channels) / compute_rms(self.noise_sigma[channels])
             for unit, channels in indices.items()
         }
         largest = max(ratios, key=lambda unit: ratios[unit])
@@ -81,7 +82,7 @@ class HeldOutGains:
     @property
     def _noise_floor(self) -> float:
         """RMS of the noise floor over the channels that count."""
-        return _compute_rms(self.noise_sigma[self._channels])
+        return compute_rms(self.noise_sigma[self._channels])
 
     def measure(self) -> HeldOutResult | None:
         """Measure by how much the causes improve the prediction of held-out runs.
@@ -183,9 +184,4 @@ def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]
     """
     observed_mask = np.isfinite(evaluator.observed)[..., channels]
     error = (evaluator.observed - simulated)[..., channels][observed_mask]
-    return _compute_rms(error)
-
-
-def _compute_rms(values: Array) -> float:
-    """Return the root mean square of values of any shape."""
-    return float(np.sqrt(np.square(values).mean()))
+    return compute_rms(error)

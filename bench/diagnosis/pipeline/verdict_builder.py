@@ -18,6 +18,7 @@ from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.score_test import estimate_tail_p_value
 from bench.diagnosis.verdict import Candidate, Cause, Verdict
+from sims.core.root_mean_square import compute_rms
 
 
 def build_verdict(result: SearchResult) -> Verdict:
@@ -161,7 +162,7 @@ def _compute_held_out_excess(result: SearchResult) -> float | None:
         return None
     sigma = result.runs.floor.sigma
     normalised_residual = (runs.observed - held_out_fits[()].simulated) / sigma
-    return float(np.sqrt(np.square(normalised_residual[np.isfinite(runs.observed)]).mean())) - 1.0
+    return compute_rms(normalised_residual[np.isfinite(runs.observed)]) - 1.0
 
 
 def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun:

@@ -37,6 +37,7 @@ from bench.figures.style import (
     make_panel_grid,
     measure_text_width,
 )
+from sims.core.root_mean_square import compute_rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -201,7 +202,7 @@ def _compute_residual_rms(view: RunView, c: int, model: str) -> float:
     """
     residual = view.compute_residual(model, c)
     finite = residual[np.isfinite(residual)]
-    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
+    return compute_rms(finite) if finite.size else 0.0
 
 
 def _draw_motion(

@@ -45,6 +45,7 @@ from bench.diagnosis.report.report_data import (
     ParameterChange,
 )
 from bench.diagnosis.verdict import Cause, HeldOutResult, RecordingFault, Verdict
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 
 TERMINAL_WIDTH = 100
@@ -453,8 +454,7 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     floor = held_out.noise_floor if held_out is not None else None
     units = list(dict.fromkeys(c.unit for c in report.channels))
     for unit in units:
-        noises = [c.sigma for c in report.channels if c.unit == unit]
-        combined_noise = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
+        combined_noise = compute_rms([c.sigma for c in report.channels if c.unit == unit])
         if isclose(combined_noise, floor or 0.0, rel_tol=NOISE_TOLERANCE):
             return unit
     return units[0] if len(units) == 1 else "1"

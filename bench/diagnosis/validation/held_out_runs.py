@@ -26,6 +26,7 @@ from bench.diagnosis.fitting.fitted_models import count_identified_states
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.plain_values import format_count
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 
 HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
@@ -247,7 +248,7 @@ class HeldOutRuns:
                 - np.einsum("rtcs,rs->rtc", fit.jacobian, state_changes)
             )
             sizes = (linearisation_error / self.noise.sigma)[self.seen]
-            rms = float(np.sqrt(np.square(sizes).mean()))
+            rms = compute_rms(sizes)
         # The comparison is negated because NaN compares as false.
         return not rms < LINEARISATION_ERROR_TOLERANCE
 

@@ -56,6 +56,7 @@ from bench.diagnosis.validation.gain_and_intervals import (
     compute_fisher_blocks,
     invert_scaled,
 )
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 from sims.recording.recording import Run
 
@@ -128,7 +129,7 @@ def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariat
         "time", "the order of runs", np.arange(len(evaluator.runs), dtype=np.float64)
     )
     for name in evaluator.runs[0].inputs:
-        sizes = [float(np.sqrt(np.mean(np.square(run.inputs[name])))) for run in evaluator.runs]
+        sizes = [compute_rms(run.inputs[name]) for run in evaluator.runs]
         yield RunCovariate("command", f"the size of {name}", np.array(sizes))
     for name in evaluator.runs[0].extra:
         columns = [run.extra.get(name, np.empty(0)) for run in evaluator.runs]
@@ -171,7 +172,7 @@ def _compute_motion_covariates(
         run_covariates.append(
             (
                 float(positions.std()),
-                float(np.sqrt(np.mean(velocities**2))),
+                compute_rms(velocities),
                 mean_direction,
                 positions.mean(),
             )

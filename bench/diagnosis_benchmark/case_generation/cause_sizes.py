@@ -23,11 +23,6 @@ BRACKET_MARGIN = 0.05
 """Smallest distance of a trial from the ends of a bracket, as a share of its logarithmic width."""
 
 
-def compute_rms(values: Array) -> float:
-    """Compute the root mean square of all values."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def compute_orthonormal_basis(columns: Array) -> Array:
     """Compute an orthonormal basis (N, K) of the span of columns by singular value decomposition.
 

@@ -16,13 +16,14 @@ from itertools import product
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import arrange_slopes, compute_rms
+from bench.diagnosis_benchmark.case_generation.cause_sizes import arrange_slopes
 from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     EffectCoefficients,
 )
 from sims import effects as library
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 
 FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale

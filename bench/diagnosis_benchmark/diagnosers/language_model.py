@@ -23,6 +23,7 @@ import numpy as np
 
 from bench.core.diagnoser import VERDICTS, Answer, Diagnoser, DiagnosisCase
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import RegressionEvidence
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 
 COMMAND_VARIABLE = "SIMGAP_DIAGNOSER_COMMAND"
@@ -81,7 +82,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
                         name: _thin_series(values[:count, i]) for i, name in enumerate(names)
                     },
                     "residual_rms": {
-                        name: _round_value(float(np.sqrt(np.mean(values[:count, i] ** 2))))
+                        name: _round_value(compute_rms(values[:count, i]))
                         for i, name in enumerate(names)
                     },
                 }

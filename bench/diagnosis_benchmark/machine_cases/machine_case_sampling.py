@@ -15,7 +15,6 @@ import numpy as np
 from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     arrange_slopes,
     compute_orthonormal_basis,
-    compute_rms,
     find_strength_for_size,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
@@ -39,6 +38,7 @@ from bench.diagnosis_benchmark.machine_cases.reference_motion import (
     read_encoders,
     simulate_machine,
 )
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Channel
 from sims.core.system import System
 from sims.recording.recording import Recording, Run

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 
@@ -225,7 +226,7 @@ def _compute_interpolation_error(times: Array, values: Array, stride: int) -> fl
     if not is_left_out.any():
         return 0.0
     errors = CubicSpline(times[is_node], values[is_node])(times[is_left_out]) - values[is_left_out]
-    return float(np.sqrt(np.mean(np.square(errors))))
+    return compute_rms(errors)
 
 
 def _thin_run(run: Run, stride: int) -> Run:

@@ -27,6 +27,7 @@ from bench.logs.importing.normalised_positions import (
 )
 from bench.logs.importing.run_logs import MAX_RUNS, RunLogs
 from bench.logs.quality.signal_checks import MIN_CORRELATION, VelocityComparison
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import Run
 from sims.recording.unit_conversion import compute_unit_scale
@@ -622,7 +623,7 @@ class ColumnAssigner:
         if u.size < 3 or np.ptp(u) == 0 or np.ptp(q) == 0:
             return False
         # A torque may also correlate with a position, but does not share its mean and size.
-        distance = float(np.sqrt(np.mean((u - q) ** 2)))
+        distance = compute_rms(u - q)
         return bool(
             np.corrcoef(u, q)[0, 1] > MIN_FOLLOWING_CORRELATION
             and distance < MAX_FOLLOWING_DISTANCE * float(np.std(q))

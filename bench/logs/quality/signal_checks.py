@@ -23,6 +23,7 @@ import numpy as np
 from bench.logs.quality.noise_estimation import estimate_noise
 from bench.logs.quality.quality_finding import QualityFinding
 from sims.core.plain_values import append_unit, join_first_names
+from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Channel, Simulator
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
@@ -369,7 +370,7 @@ class VelocityComparison(NamedTuple):
             return None
         interval = float(np.median(steps))
         sample_changes = np.concatenate([np.diff(part.position) for part in series])
-        rms_sample_change = float(np.sqrt(np.mean(sample_changes**2)))
+        rms_sample_change = compute_rms(sample_changes)
         if not rms_sample_change > 0:
             return None
         # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
@@ -382,7 +383,7 @@ class VelocityComparison(NamedTuple):
         dq, s, dv = dq[is_known], s[is_known], dv[is_known]
         if is_known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
             return None
-        if np.sqrt(np.mean(dq**2)) < MIN_RMS_CHANGE_SIGMAS * sigma:
+        if compute_rms(dq) < MIN_RMS_CHANGE_SIGMAS * sigma:
             return None
         return VelocityComparison(dq, s, dv, interval)
 

@@ -13,7 +13,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
+from sims.core.root_mean_square import compute_rms
 from tests.exams.contacts.contact_robots import (
     NAMES,
     draw_numbers,

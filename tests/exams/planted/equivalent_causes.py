@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
+from sims.core.root_mean_square import compute_rms
 from tests.exams.coefficient_fit import fit_coefficients
 from tests.exams.planted.planted_motion import (
     HELD_OUT,

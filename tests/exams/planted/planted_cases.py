@@ -16,9 +16,9 @@ import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     compute_orthonormal_basis,
-    compute_rms,
     find_strength_for_size,
 )
+from sims.core.root_mean_square import compute_rms
 from tests.exams.exam import (
     Case,
     Exam,

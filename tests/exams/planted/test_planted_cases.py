@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
+from sims.core.root_mean_square import compute_rms
 from tests.exams.exam import UndrawableError
 from tests.exams.planted.planted_cases import GAP, PlantedQuestion, questions
 from tests.exams.planted.planted_motion import Change

@@ -12,9 +12,9 @@ import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.cause_sizes import (
     compute_orthonormal_basis,
-    compute_rms,
     find_strength_for_size,
 )
+from sims.core.root_mean_square import compute_rms
 from tests.exams.coefficient_fit import fit_coefficients
 from tests.exams.robots import planted_effects
 from tests.exams.robots.reference_world import COARSE, World

@@ -9,8 +9,8 @@ import tomllib
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
+from sims.core.root_mean_square import compute_rms
 from tests.exams.robots import planted_effects, robot_cases
 from tests.exams.robots.cause_sizing import CompetingCauses
 from tests.exams.robots.reference_world import Run, World
