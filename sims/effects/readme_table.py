@@ -60,7 +60,8 @@ def _format_range(c: Coefficient, kind_index: int) -> str:
     text = f"{low:g} … {high:g}"
     if unit != "1":
         text += f" {unit}"
-    return text + (" (*)" if c.of else "")
+    # A time has its own unit on every system.
+    return text + (" (*)" if c.of not in ("", "shift") else "")
 
 
 if __name__ == "__main__":

@@ -83,7 +83,8 @@ def parse_parquet_column(column: ColumnSpec, values: pa.ChunkedArray) -> pa.Arra
 
     try:
         # After damage, the bytes of a text may be invalid UTF-8.
-        values.validate(full=True)
+        for chunk in values.chunks:
+            chunk.validate(full=True)
     except pa.ArrowInvalid as error:
         raise CellError(None, column.name, column.expected_text, get_first_line(error)) from None
     kind = values.type

@@ -18,6 +18,8 @@ class CandidateDirection:
         coefficients: (k,) coefficients that are simulated.
         can_be_negative: whether the scaling coefficient may be negative.
         is_single_size: whether the direction is valid only at this size.
+        is_only_proposed: whether the effect is proposed with this size for a fit alone, and not
+            selected together with others.
     """
 
     effect: str
@@ -26,3 +28,4 @@ class CandidateDirection:
     coefficients: Array
     can_be_negative: bool
     is_single_size: bool = False
+    is_only_proposed: bool = False

@@ -42,7 +42,7 @@ import numpy as np
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
-from bench.diagnosis.kalman.filter_and_smoother import IndexArray
+from bench.diagnosis.kalman.filter_and_smoother import IndexArray, Mask
 from bench.diagnosis.prediction_error.response_products import InnerProducts, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
@@ -77,6 +77,7 @@ class Regression:
         count: N.
         contains: effects that each effect contains, by name.
         always: columns that are part of every set and belong to no effect.
+        only_proposed: columns of single effects that are not selected together with others.
     """
 
     groups: Sequence[DirectionGroup]
@@ -84,6 +85,7 @@ class Regression:
     count: int
     contains: Mapping[str, Sequence[str]] = field(default_factory=dict)
     always: tuple[int, ...] = ()
+    only_proposed: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         """Sum the products of eq. (1) over all runs, and group the columns by effect."""
@@ -93,6 +95,13 @@ class Regression:
         self._batches = batch_groups(self.groups)
         self.effects = list(dict.fromkeys(group.effect for group in self.groups))
         self._nuisance = DirectionGroup("", self.always, (False,) * len(self.always))
+
+    @cached_property
+    def _is_selectable(self) -> Mask:
+        """Which groups may be selected together with others (n,)."""
+        return np.array(
+            [self.only_proposed.isdisjoint(group.column_indices) for group in self.groups]
+        )
 
     @cached_property
     def _products_within_groups(self) -> list[Array]:
@@ -269,7 +278,7 @@ class Regression:
         """
         chosen = list(begin)
         while len(chosen) < max_groups:
-            gains = self.compute_net_gains(chosen)
+            gains = np.where(self._is_selectable, self.compute_net_gains(chosen), -np.inf)
             best = int(np.argmax(gains))
             if gains[best] <= 0.0:
                 break
@@ -589,7 +598,8 @@ def regress(
     groups = [g for g in group_probes(probes) if not set(g.column_indices) & set(always)]
     samples = int(followed.runs.recorded.sum())
     products = ResponseProducts(list(rows), list(innovations))
-    return Regression(groups, products, samples, contains, (count - 1, *always))
+    only_proposed = frozenset(i for i, probe in enumerate(probes) if probe.is_only_proposed)
+    return Regression(groups, products, samples, contains, (count - 1, *always), only_proposed)
 
 
 def follow_linear_with_effects(

@@ -220,9 +220,10 @@ def _make_shift_probes(
 ) -> Iterator[CandidateDirection]:
     """Yield delays and lags of commands of several sizes, in addition to a small one.
 
-    Sensors that read late have none. The states of a robot are the measured ones, so that the true
-    states are later readings. A regression on these is invalid, because the innovations of a filter
-    are independent of earlier readings only.
+    They are proposed alone, since a selection that begins with a lag in place of a wrong servo goes
+    astray. Sensors that read late have none. The states of a robot are the measured ones, so that
+    the true states are later readings. A regression on these is invalid, because the innovations of
+    a filter are independent of earlier readings only.
 
     Args:
         effect: the effect.
@@ -239,6 +240,7 @@ def _make_shift_probes(
             coefficient_index=0,
             coefficients=np.array([size]),
             can_be_negative=False,
+            is_only_proposed=True,
         )
 
 
