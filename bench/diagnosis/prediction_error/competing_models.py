@@ -24,9 +24,7 @@ from bench.diagnosis.prediction_error.dry_friction_fits import (
     is_friction_sufficient,
     make_dry_friction_start,
 )
-from bench.diagnosis.prediction_error.effect_proposals import (
-    SearchContext,
-)
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.filters_with_effects import (
     COMPETING_MODEL_MARGIN,
     GAUSS_NEWTON_STEPS,
@@ -399,7 +397,7 @@ class _CompetingEffect(NamedTuple):
     Attributes:
         effect: its name.
         c: (k,) its coefficients from the regression.
-        loss: loss in twice the log-likelihood; infinite if a regression cannot tell it.
+        loss: loss in twice the log-likelihood; infinite if it is not computed.
     """
 
     effect: str

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,8 +64,25 @@ FIRST_LAG_INTERVALS = 2.0
 FIRST_SHARE = 0.1
 """Initial coefficient, as a share of the specified friction or of the typical force."""
 
-Proposals = list[tuple[str, Array]]
+Proposals = dict[str, Array]
 """Names of effects, each with its initial coefficients (k,)."""
+
+
+class ProposedEffects(NamedTuple):
+    """Effects worth trying next, by the reason why they are proposed.
+
+    Attributes:
+        by_regression: the effects with the largest gains by regression.
+        only_simulated: those with the next largest gains, and the delays and lags that may replace
+            one of `by_regression`. They are simulated, but neither fitted nor filtered.
+        offset_and_friction: an encoder offset, and less dry friction.
+        joint_model: effects of the standard joint and servo models, the most useful first.
+    """
+
+    by_regression: Proposals
+    only_simulated: Proposals
+    offset_and_friction: Proposals
+    joint_model: Proposals
 
 
 @dataclass
@@ -78,7 +96,7 @@ class EffectProposals:
 
     filters: ModelFilters
     columns: LibraryColumns
-    _for_base: dict[int, tuple[Proposals, Proposals, Proposals]] = field(default_factory=dict)
+    _for_base: dict[int, ProposedEffects] = field(default_factory=dict)
     _base_steps: dict[str, tuple[Array, float]] = field(default_factory=dict)
 
     def of(
@@ -105,24 +123,20 @@ class EffectProposals:
         proposed = self._propose_effects(current) if current.names else self._for_base.get(count)
         if proposed is None:
             proposed = self._for_base[count] = self._propose_effects(current)
-        by_regression, others, joint_model = proposed
-        if is_fitted:
-            by_regression = by_regression[:MAX_REGRESSION_PROPOSALS]
-        by_regression = by_regression + others
-        names = dict(by_regression)
-        joint_model = [(name, c) for name, c in joint_model if name not in names]
+        names = proposed.by_regression | proposed.offset_and_friction
+        if not is_fitted:
+            names = proposed.only_simulated | names
+        joint_model = [(name, c) for name, c in proposed.joint_model.items() if name not in names]
         present_model = FitStart(
             current.names, current.followed.theta, evaluator.initial_state_guesses
         )
         return [
             add_effect_to_start(evaluator, present_model, name, c)
-            for name, c in by_regression + joint_model[:max_joint_proposals]
+            for name, c in [*names.items(), *joint_model[:max_joint_proposals]]
         ]
 
     def list_alone(
-        self,
-        max_joint_proposals: int = MAX_JOINT_PROPOSALS,
-        is_fitted: bool = True,
+        self, max_joint_proposals: int = MAX_JOINT_PROPOSALS, is_fitted: bool = True
     ) -> list[FitStart]:
         """Return models with one effect that may explain the runs alone.
 
@@ -138,23 +152,25 @@ class EffectProposals:
             if self.filters.act_where_forces_are_missing(start.effects)
         ]
 
-    def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals, Proposals]:
-        """Return proposals by regression, of offsets and less friction, and of the joint model."""
-        by_regression = self._propose_by_regression(current)
-        fitted = dict(by_regression[:MAX_REGRESSION_PROPOSALS])
+    def _propose_effects(self, current: FilteredSet) -> ProposedEffects:
+        """Return all effects that are proposed in addition to a set."""
+        ranked = list(self._propose_by_regression(current).items())
+        by_regression = dict(ranked[:MAX_REGRESSION_PROPOSALS])
         # A filter does not follow late readings, so that the regression misjudges them.
-        shifts = {
+        similar_shifts = {
             similar: c
-            for name, c in fitted.items()
+            for name, c in by_regression.items()
             for similar in list_similar_shifts(self.filters.evaluator, name)
-            if similar not in fitted
         }
-        further = dict(by_regression[MAX_REGRESSION_PROPOSALS:])
-        by_regression = [*fitted.items(), *(further | shifts).items()]
-        excluded, joint = {*current.names, *fitted}, current.followed.joints_by_loss[0]
-        joint_model = self._propose_joint_model(current.followed, joint, excluded)
-        others = self._propose_offset_and_friction(joint, {*excluded, *dict(by_regression)})
-        return by_regression, others, joint_model
+        only_simulated = dict(ranked[MAX_REGRESSION_PROPOSALS:]) | similar_shifts
+        excluded = {*current.names, *by_regression}
+        joint = current.followed.joints_by_loss[0]
+        return ProposedEffects(
+            by_regression,
+            {name: c for name, c in only_simulated.items() if name not in excluded},
+            self._propose_offset_and_friction(joint, excluded),
+            self._propose_joint_model(current.followed, joint, excluded),
+        )
 
     def _propose_by_regression(self, current: FilteredSet) -> Proposals:
         """Propose the effects with the largest net gain by regression, with their coefficients.
@@ -171,7 +187,7 @@ class EffectProposals:
         else:
             regression = self.columns.base_regression
         gains = regression.compute_net_gains()
-        proposals: dict[str, Array] = {}
+        proposals: Proposals = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
             families = [name for name in proposals if name.endswith("@*")]
@@ -183,7 +199,7 @@ class EffectProposals:
                 break
             solution = regression.solve([group])[1][0]
             proposals[group.effect] = self.columns.coefficients(group, solution)
-        return list(proposals.items())
+        return proposals
 
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Return an encoder offset of a joint, and less dry friction than the model file specifies.
@@ -206,11 +222,11 @@ class EffectProposals:
             coefficients[friction] = FIRST_SHARE * min(
                 compute_coefficient_bounds(evaluator, friction)[0][0], 0.0
             )
-        return [
-            (name, np.array([c]))
+        return {
+            name: np.array([c])
             for name, c in coefficients.items()
             if c and name in evaluator.library and name not in excluded
-        ]
+        }
 
     def _propose_joint_model(
         self, followed: FollowedRuns, joint: int, excluded: Collection[str]
@@ -255,7 +271,7 @@ class EffectProposals:
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 proposals.append((gain, name, np.array([change])))
         proposals.sort(key=lambda proposal: -proposal[0])
-        return [(name, c) for _, name, c in proposals]
+        return {name: c for _, name, c in proposals}
 
     def _compute_first_change(self, followed: FollowedRuns, name: str) -> tuple[float, float]:
         """Return the first Gauss-Newton change of an effect alone, and its gain."""

@@ -97,6 +97,12 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
     )
 
 
+def _list_joints(evaluator: RunEvaluator, name: str) -> set[int]:
+    """Return the indices of the joints at which an effect acts."""
+    count = len(evaluator.simulator.system.coordinates)
+    return {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
+
+
 def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
     """Return the single joint at which an effect changes the generalised force.
 
@@ -140,8 +146,7 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
         evaluator: the runs.
         name: name of the effect; at a body, the joints are those that carry it.
     """
-    count = len(evaluator.simulator.system.coordinates)
-    joints = {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
+    joints = _list_joints(evaluator, name)
     if evaluator.available_effects[name].at == "body":
         joints = _list_joints_of_body(evaluator, name.partition("@")[2])
     return {
@@ -154,11 +159,11 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
 
 
 def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
-    """Return the delays and lags that may move the readings as a delay or lag does.
+    """Return the delays and lags that may change the readings as a given delay or lag does.
 
-    A command that comes late moves the readings nearly as sensors that read late. Compared are
-    effects at the same joint, effects at all places, and with both of them an effect that has a
-    single place.
+    A command that comes late changes the readings nearly as sensors that read late do. Similar are
+    delays and lags at the same joint, and those at all places. An effect that has a single place,
+    as the command of a robot with one drive, is similar to both.
 
     Args:
         evaluator: the runs.
@@ -166,8 +171,7 @@ def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
     """
     if not is_time_shift(evaluator.available_effects[name]):
         return []
-    count = len(evaluator.simulator.system.coordinates)
-    joints = {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
+    joints = _list_joints(evaluator, name)
 
     def has_one_place(effect: str) -> bool:
         return f"{effect.partition('@')[0]}@*" not in evaluator.library

@@ -439,7 +439,7 @@ class BenchmarkCase(Document):
             find_coefficients: finds the coefficients of a cause with this size; None if it
                 finds none.
             compute_unexplained: computes, from the coefficients of the causes by name, the RMS
-                residual that the best wrong answer leaves; None if there is none.
+                residual that the best wrong answer leaves, or None without such an answer.
 
         Returns:
             The case; None if it is rejected or no coefficients give this size.
@@ -471,7 +471,7 @@ def name_case(
         kind: one of `CASE_KINDS`.
         system: name of the system.
         effect: hidden effect, or a word for it; left out if empty.
-        size: requested size; left out if there is none.
+        size: requested size; None leaves it out of the name.
         requested: requested recording conditions; those that are drawn are left out.
         number: number that distinguishes the case from others.
         separator: text between the parts.
