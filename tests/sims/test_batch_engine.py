@@ -250,7 +250,7 @@ def test_an_element_depends_on_itself_alone(system):
     theta[20:25, len(cls.parameters) :] = 0.0
     runs = []
     for k in range(5):
-        t = np.arange(150 - 20 * k) / (40.0 + 20 * k)
+        t = np.arange(75 - 10 * k) / (40.0 + 20 * k)
         command = {
             channel.name: steps(rng, t.size, 1.0) + (channel.name == "torque_enable")
             for channel in cls.inputs

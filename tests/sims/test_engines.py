@@ -11,7 +11,6 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from sims import effects
 from sims.core.effect import Coefficient, Force, Friction
@@ -152,25 +151,6 @@ def test_with_effects_engines_converge_too(system, fixed):
         )
         assert order(STEPS[system], errors) > 1.7
         assert errors[-1] < 0.1 * errors[0]
-
-
-@pytest.mark.parametrize("engine", OTHERS)
-def test_the_servo_against_an_accurate_integrator(engine):
-    kt, ohm, inertia = 0.5, 4.0, 2e-3 + 0.49 * 0.1**2
-    run = scenario("servo")
-
-    def law(t, state, i):
-        duty = np.clip(200 * 0.00287738 * (run.inputs["goal"][i] - state[0]), -1, 1)
-        torque = kt * (duty * 7.4 - kt * state[1]) / ohm * run.inputs["torque_enable"][i]
-        return [state[1], (torque - 0.49 * 9.81 * 0.1 * np.sin(state[0])) / inertia]
-
-    q, state = [0.2], [0.2, 0.0]
-    for i in range(run.times.size - 1):
-        state = solve_ivp(law, (0, 0.01), state, args=(i,), rtol=1e-10, atol=1e-12).y[:, -1]
-        q.append(state[0])
-    errors = [np.abs(motion("servo", engine, time_step=h)[:, 0] - q).max() for h in STEPS["servo"]]
-    assert order(STEPS["servo"], errors) == pytest.approx(2.0, abs=0.05)
-    assert errors[-1] < 3e-5
 
 
 def test_the_servo_is_stable_over_all_its_bounds():

@@ -85,22 +85,6 @@ def test_second_order_in_the_step_with_damping_and_torque(damping, torque):
         assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    "fixed", [{"drag.quadratic": 1e-3}, {"drag.linear": 1e-3, "drag.quadratic": 1e-3}]
-)
-def test_second_order_with_forces_from_outside(fixed):
-    times = np.array([0.0, 0.13, 0.5, 1.0])
-    scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, 0.05)})
-    known = {"damping": fixed.get("drag.linear", 0.0), "quadratic": fixed["drag.quadratic"]}
-    reference = exact(times, 1.5, -2.0, torque=lambda _: 0.05, **known)
-    steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
-    errors = np.array(
-        [np.abs(swing(scenario, fixed=fixed, time_step=h) - reference).max(axis=1) for h in steps]
-    )
-    for channel in (0, 1):
-        assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
-
-
 def test_damping_carried_by_the_joint_is_damping_put_in_from_outside():
     # With a second effect the engine evaluates forces at every step; its coefficient is too small
     # to change the motion.
@@ -138,11 +122,3 @@ def test_whirling_is_not_limited():
     )
     np.testing.assert_allclose(qd, 300.0, rtol=1e-12)
     assert q[-1] == pytest.approx(297.0, rel=1e-12)
-
-
-def test_first_sample_is_the_initial_state_and_observe_orders():
-    scenario = Scenario(np.array([5.0, 5.1]), {"q": 0.3, "qd": -1.0})
-    theta = np.array([[INERTIA]])
-    both = Pendulum().simulate(theta, scenario)
-    np.testing.assert_array_equal(both[0, 0], [0.3, -1.0])
-    np.testing.assert_array_equal(Pendulum(observe=["qd"]).simulate(theta, scenario), both[..., 1:])

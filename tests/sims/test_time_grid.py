@@ -177,15 +177,6 @@ def test_scenarios_with_the_same_content_are_one_run():
     assert runs.scenario_index.tolist() == [0, 0, 1]
 
 
-def test_elements_of_unequal_length_end_in_nan():
-    slider = Slider(engine="batch")
-    runs = [Scenario(np.arange(n) / 10, {"v": 1.0}) for n in (3, 5)]
-    seen = slider.simulate_batch(np.ones((3, 1)), [runs[0], runs[1], runs[0]])
-    np.testing.assert_allclose(seen[0, :3, 0], [0.0, 0.1, 0.2], rtol=1e-12)
-    np.testing.assert_allclose(seen[1, :, 0], [0.0, 0.1, 0.2, 0.3, 0.4], rtol=1e-12)
-    assert np.isnan(seen[[0, 2], 3:]).all()
-
-
 def test_initial_states_may_be_given_by_element():
     slider, scenario = Slider(engine="batch"), Scenario(np.array([0.0, 0.5]), {"x": 9.0, "v": 2.0})
     seen = slider.simulate_batch(np.ones((2, 1)), [scenario] * 2, {"x": np.array([1.0, 3.0])})

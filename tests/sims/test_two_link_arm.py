@@ -109,13 +109,6 @@ def test_dry_friction_holds_what_pulls_less():
     assert abs(TwoLinkArm().simulate(theta[None], Scenario(TIMES, start))[0, -1, 0] - 0.05) > 1e-4
 
 
-def test_a_run_does_not_depend_on_the_runs_before():
-    arm, scenario = TwoLinkArm(), Scenario(TIMES, START, {"u1": np.sin(TIMES)})
-    once = arm.simulate(np.stack([RUBBING, DAMPED, RUBBING]), scenario)
-    np.testing.assert_array_equal(once[0], once[2])
-    np.testing.assert_array_equal(once[1], TwoLinkArm().simulate(DAMPED[None], scenario)[0])
-
-
 def test_a_copy_has_a_world_of_its_own():
     arm, scenario = TwoLinkArm(), Scenario(TIMES, START)
     before = arm.simulate(RUBBING[None], scenario)

@@ -5,7 +5,6 @@ effect at zero, and with a current README page.
 import ast
 import inspect
 import textwrap
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,6 @@ from tests.sims.effects.effect_systems import (
     SYSTEMS,
     batch_coefficients,
     moment,
-    run,
 )
 
 HOOKS = {
@@ -45,12 +43,6 @@ HOOKS = {
     "level": (Level,),
 }
 UNITS = pint.UnitRegistry()
-
-
-def test_the_designed_vocabulary_is_registered_and_importable():
-    registered = {entry.name for entry in entry_points(group="simgap.effects")}
-    assert set(NAMES) <= registered
-    assert [effects.get_effect(name).name for name in NAMES] == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -97,15 +89,6 @@ def test_units_parse_and_ranges_hold_zero_or_begin_above_it(name):
     assert all(first.range(kind)[0] <= 0 for kind in SYSTEM_KINDS), (
         "the first coefficient must be able to switch it off"
     )
-
-
-@pytest.mark.parametrize(("name", "system"), PAIRS)
-def test_coefficients_become_parameters_with_units(name, system):
-    effect = effects.get_effect(name)
-    parameters = make_effect_parameters(effect, SYSTEMS[system])
-    assert len(parameters) == len(effect.on(SYSTEMS[system])) >= 1
-    assert all(p.unit for p in parameters)
-    assert all(p.name.startswith(name) for p in parameters)
 
 
 def test_units_of_input_and_reading_are_those_of_the_system():
@@ -188,22 +171,6 @@ def test_friction_and_forces_are_safe_at_rest(name, system):
         if isinstance(effect, (Force, Friction)):
             given = effect.force(c, rest) if isinstance(effect, Force) else effect.limit(c, rest)
             assert np.isfinite(given).all()
-
-
-INITIAL = {
-    "ball": {"z": 1.5, "vx": 1.0},
-    "pendulum": {"qd": 1.0},
-    "servo": {"q": 0.3},
-    "slider": {"v": 0.5},
-}
-
-
-@pytest.mark.parametrize(("name", "system"), PAIRS)
-def test_zero_changes_no_bit_of_a_run(name, system):
-    times = np.arange(60) * 0.02
-    inputs = {c.name: np.where(times > 0.4, 0.5, 0.1) for c in SYSTEMS[system].inputs}
-    base = run(system, times, inputs=inputs, **INITIAL[system])
-    assert np.array_equal(run(system, times, {name: 0.0}, inputs=inputs, **INITIAL[system]), base)
 
 
 def test_the_table_in_the_readme_is_current():

@@ -34,22 +34,6 @@ def test_input_delay_is_an_exact_shift(delay, within):
     assert x == pytest.approx(since**2 / 2, abs=within)
 
 
-@pytest.mark.parametrize("lag", [0.01, 0.2])
-def test_input_lag_is_the_step_response(lag):
-    _, v = slide({"input.lag": lag}, STEP)
-    since = np.maximum(TIMES - 0.5, 0.0)
-    assert v == pytest.approx(since - lag * -np.expm1(-since / lag), abs=1e-9)
-
-
-def test_input_gain_and_bias():
-    assert compute_applied_input({"input.gain": -0.25}, STEP) == pytest.approx(
-        0.75 * STEP[:-1], abs=1e-9
-    )
-    assert compute_applied_input({"input.bias": -0.25}, STEP) == pytest.approx(
-        STEP[:-1] - 0.25, abs=1e-9
-    )
-
-
 def test_input_hold_goes_straight_from_sample_to_sample():
     """The input of each interval is the mean of its end samples; a coefficient of 0.3 mixes it with
     the held input.
@@ -94,35 +78,6 @@ def test_a_chain_starts_settled():
     assert readings == pytest.approx(3.2, abs=1e-12)
 
 
-def test_deadband_and_saturation():
-    wave = 2 * np.sin(4 * TIMES)
-    expected = np.sign(wave) * np.maximum(np.abs(wave) - 0.5, 0)
-    assert compute_applied_input({"input.deadband": 0.5}, wave) == pytest.approx(
-        expected[:-1], abs=1e-9
-    )
-    assert compute_applied_input({"input.saturation": 0.5}, wave) == pytest.approx(
-        np.clip(wave, -0.5, 0.5)[:-1], abs=1e-9
-    )
-
-
-def test_the_width_of_backlash_shows_at_a_reversal():
-    width = 0.6
-    triangle = 2 * np.abs(
-        (TIMES + 0.5) % 2 - 1
-    )  # falls from 1 to 0 at 0.5 s, rises to 2 at 1.5 s, falls again
-    given, got = triangle[:-1], compute_applied_input({"backlash": width}, triangle)
-    top = int(np.argmax(given))
-    rising = given[:top] > width
-    assert got[:top][rising & (TIMES[:top] > 0.5)] == pytest.approx(
-        given[:top][rising & (TIMES[:top] > 0.5)] - width / 2, abs=1e-9
-    )
-    falling = slice(top, top + 40)
-    assert got[falling] == pytest.approx(np.minimum(got[top], given[falling] + width / 2), abs=1e-9)
-    assert np.ptp(got[TIMES[:-1] > 0.5]) == pytest.approx(
-        np.ptp(given[TIMES[:-1] > 0.5]) - width, abs=0.05
-    )
-
-
 @pytest.mark.parametrize("delay", [0.1, 0.1234])
 def test_sensor_delay_is_an_exact_shift(delay):
     times = np.arange(0, 2, 0.02)
@@ -133,15 +88,6 @@ def test_sensor_delay_is_an_exact_shift(delay):
         np.tile(prompt[0], (int((times < delay).sum()), 1)), abs=0
     )
     assert late[times > delay] == pytest.approx(prompt[1:], abs=1e-7)
-
-
-@pytest.mark.parametrize("lag", [0.005, 0.2])
-def test_sensor_lag_follows_a_ramp_by_its_lag(lag):
-    x, v = slide({"sensor.lag": lag}, x=1.0, v=3.0)
-    assert x == pytest.approx(1 + 3 * (TIMES - lag * -np.expm1(-TIMES / lag)), abs=1e-9)
-    assert v == pytest.approx(
-        3.0, abs=1e-9
-    )  # every channel starts at its first value, in steady state
 
 
 def test_sensor_gain_bias_and_drift_change_one_channel():
@@ -155,22 +101,6 @@ def test_a_skewed_clock_stretches_the_record():
     stretched = run("pendulum", TIMES * 1.04, q=0.8)
     assert skewed == pytest.approx(stretched, abs=1e-7)
     assert np.abs(skewed - run("pendulum", TIMES, q=0.8)).max() > 0.1
-
-
-def test_a_limit_of_the_rate_makes_a_ramp_of_a_step():
-    """A step of 2 N at 4 N/s takes 0.5 s; the impulse is that of the ramp, to rounding error."""
-    _, v = slide({"input.rate": 4.0}, STEP)
-    since = np.maximum(TIMES - 0.5, 0.0)
-    rising = np.minimum(since, 0.5)
-    impulse = 2.0 * rising**2 + 2.0 * (since - rising)
-    assert 2.0 * v == pytest.approx(impulse, abs=1e-9)
-
-
-def test_what_is_slower_than_the_limit_of_the_rate_passes_as_it_is():
-    wave = np.sin(3 * TIMES)
-    slow, fast = compute_applied_input({"input.rate": 200.0}, wave), compute_applied_input({}, wave)
-    assert slow == pytest.approx(fast, abs=5e-3)
-    assert slow != pytest.approx(compute_applied_input({"input.rate": 2.0}, wave), abs=0.1)
 
 
 def test_an_eccentric_encoder_is_off_by_a_sine_of_the_angle():
