@@ -74,14 +74,6 @@ def test_files_state_known_values_and_not_the_hidden_cause(item, tmp_path):
     )
 
 
-@pytest.mark.parametrize("kind", ["white", "ar1", "quantised"])
-def test_noise_has_the_stated_size(kind):
-    noise = SensorNoise({"q.a": 1e-3, "qd.a": 5e-3}, kind, 0.6, 0.4)
-    smooth = np.column_stack([np.linspace(0, 3, 20_000), np.linspace(0, -7, 20_000)])
-    rest = noise.add_to(smooth, np.random.default_rng(0)) - smooth
-    np.testing.assert_allclose(rest.std(axis=0), [1e-3, 5e-3], rtol=0.04)
-
-
 def test_every_effect_can_be_drawn_at_every_place(item):
     setting = robot_cases.setting_of(item.name)
     rng = np.random.default_rng(0)
