@@ -25,6 +25,10 @@ CASES = {
     "dry friction and drag": ("friction.coulomb", "drag.quadratic"),
     "dry friction by Stribeck, spring": ("friction.stribeck", "spring.linear"),
 }
+PENDULUM = """
+<mujoco><worldbody><body><joint type="hinge" axis="0 1 0" armature="1e-4"/>
+<inertial mass="0.49" pos="0 0 -0.1" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>
+"""
 Cost = tuple[float, float]
 """Processor and wall time per batch element, ms."""
 
@@ -45,11 +49,7 @@ def native(batch_size: int, threads: int = 1) -> Callable[[], None]:
     import mujoco
     from mujoco import batch
 
-    from sims.systems import pendulum_mujoco_world
-
-    constants = {"mass": 0.49, "length": 0.1, "gravity": 9.81}
-    model = mujoco.MjModel.from_xml_string(pendulum_mujoco_world.model(constants))
-    pendulum_mujoco_world.load(model, 5e-3, constants)
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
     model.opt.timestep = STEP
     model.dof_frictionloss[:] = FRICTION
     many = batch.Batch(model, batch_size, threads)

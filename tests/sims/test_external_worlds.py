@@ -12,24 +12,20 @@ import pytest
 from sims.core.simulator import InputError
 from sims.engines.external import world_interface
 from sims.system_simulator import SystemSimulator
-from sims.systems.slider import SliderSystem
+from sims.systems.ball import BallSystem
 from tests.sims.simulation_cases import SIMULATORS
 
 ENGINES = {"pybullet": "bullet_world", "mujoco": "mujoco_world"}
 PROTOCOLS = {
-    ("bullet_world", True): (
-        world_interface.BulletWorldModule,
-        world_interface.BulletBallWorldModule,
-    ),
-    ("bullet_world", False): (world_interface.BulletJointWorldModule,),
-    ("mujoco_world", True): (world_interface.MujocoWorldModule,),
-    ("mujoco_world", False): (world_interface.MujocoJointWorldModule,),
+    "bullet_world": (world_interface.BulletWorldModule, world_interface.BulletBallWorldModule),
+    "mujoco_world": (world_interface.MujocoWorldModule,),
 }
 CASES = [
     (system, name, protocol)
     for system in SIMULATORS
+    if SIMULATORS[system].system.bounces
     for name in ENGINES.values()
-    for protocol in PROTOCOLS[name, SIMULATORS[system].system.bounces]
+    for protocol in PROTOCOLS[name]
 ]
 
 
@@ -67,23 +63,22 @@ def module_with(**content):
 
 
 WHOLE = {
-    "gravity": lambda constants: lambda x: 0.0,
     "build": lambda client, constants: 0,
-    "load": lambda client, body, inertia, constants: True,
+    "build_native": lambda client, constants, settings: 0,
 }
 BROKEN = [
-    ({"gravity": 9.81}, "has no function gravity(constants)"),
     ({"build": None}, "has no function build(client, constants)"),
+    ({"build": 9.81}, "has no function build(client, constants)"),
     (
-        {"load": lambda model, inertia, constants: True},
-        "has no function load(client, body, inertia, constants)",
+        {"build_native": lambda client, constants, given: 0},
+        "has no function build_native(client, constants, settings)",
     ),
 ]
 
 
 def test_a_whole_module_lacks_nothing_whatever_its_arguments_are_called():
     assert not world_interface.describe_missing_members(
-        module_with(**WHOLE), world_interface.BulletJointWorldModule
+        module_with(**WHOLE), world_interface.BulletBallWorldModule
     )
     assert not world_interface.describe_missing_members(
         module_with(build=lambda a, b: 0), world_interface.BulletWorldModule
@@ -94,22 +89,9 @@ def test_a_whole_module_lacks_nothing_whatever_its_arguments_are_called():
 def test_a_missing_member_of_a_module_is_named(change, reason):
     assert (
         world_interface.describe_missing_members(
-            module_with(**{**WHOLE, **change}), world_interface.BulletJointWorldModule
+            module_with(**{**WHOLE, **change}), world_interface.BulletBallWorldModule
         )
         == reason
-    )
-
-
-def test_settings_are_given_by_name():
-    whole = module_with(build=WHOLE["build"], build_native=lambda client, constants, settings: 0)
-    assert not world_interface.describe_missing_members(
-        whole, world_interface.BulletBallWorldModule
-    )
-    other = module_with(build=WHOLE["build"], build_native=lambda client, constants, given: 0)
-    expected = "has no function build_native(client, constants, settings)"
-    assert (
-        world_interface.describe_missing_members(other, world_interface.BulletBallWorldModule)
-        == expected
     )
 
 
@@ -122,7 +104,7 @@ def test_an_engine_refuses_a_broken_module_by_name(engine, name, tmp_path, monke
     (package / f"{name}.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
 
-    class Broken(SliderSystem):
+    class Broken(BallSystem):
         __module__ = "broken_system.system"
 
     class Ours(SystemSimulator):
@@ -130,7 +112,7 @@ def test_an_engine_refuses_a_broken_module_by_name(engine, name, tmp_path, monke
 
     try:
         with pytest.raises(
-            InputError, match=f"module broken_system.{name} has no function gravity"
+            InputError, match=f"module broken_system.{name} has no function (build|model)"
         ):
             Ours(engine=engine)
     finally:

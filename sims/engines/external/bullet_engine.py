@@ -1,7 +1,8 @@
 """PyBullet engine: forces through Bullet's force and torque interfaces, impacts by its solver.
 
-The module ``<system>_bullet_world`` in the system's package builds the world of a system; its
-interface is specified in `sims.engines.external.world_interface`.
+A system with one coordinate is a body on a hinge or guide. For a bouncing system, the module
+``<system>_bullet_world`` in its package builds the world; its interface is specified in
+`sims.engines.external.world_interface`.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from sims.engines.external.external_engine import (
 )
 from sims.engines.external.world_interface import (
     BulletBallWorldModule,
-    BulletJointWorldModule,
     BulletWorldModule,
+    find_unsupported_joint_reason,
     find_world_module,
 )
 
@@ -117,31 +118,34 @@ class BulletEngine:
 
         With `native_settings`, Bullet's own contact and air damping move a ball. Otherwise
         a system that bounces gets impacts at their exact times, and any other system is a
-        body on a joint. If the system has no world for Bullet, only the reason is
-        stored.
+        body on a joint. If Bullet cannot simulate the system, only the reason is stored.
         """
         self.largest_step = largest_step
         self._rollout: RolloutFunction | None = None
-        protocol = BulletWorldModule if system.bounces else BulletJointWorldModule
-        if native_settings is not None:
-            protocol = BulletBallWorldModule
+        if not system.bounces:
+            self._reason = find_unsupported_joint_reason(system)
+            is_hinge = system.kind == "rotary"
+            kind = "JOINT_REVOLUTE" if is_hinge else "JOINT_PRISMATIC"
+            self._world = bullet_world.PersistentBulletWorld(
+                partial(bullet_world.build_jointed_body, kind)
+            )
+            joint = bullet_world.BulletJoint(self._world, is_hinge)
+            self._rollout = partial(joint_integration.integrate_joint, joint)
+            return
+        protocol = BulletWorldModule if native_settings is None else BulletBallWorldModule
         module, self._reason = find_world_module(system, "bullet_world", protocol)
         if module is None:
             return
-        build = cast(BulletWorldModule, module).build
-        if native_settings is not None:
-            build = partial(
-                cast(BulletBallWorldModule, module).build_native, settings=native_settings
-            )
-        self._world = bullet_world.PersistentBulletWorld(build)
-        if native_settings is not None:
-            native_ball = BulletNativeBall(self._world, native_settings)
-            self._rollout = partial(ball_integration.integrate_native_ball, native_ball)
-        elif system.bounces:
+        if native_settings is None:
+            self._world = bullet_world.PersistentBulletWorld(cast(BulletWorldModule, module).build)
             self._rollout = partial(ball_integration.integrate_ball, BulletBall(self._world))
         else:
-            joint = bullet_world.BulletJoint(self._world, cast(BulletJointWorldModule, module))
-            self._rollout = partial(joint_integration.integrate_joint, joint)
+            build = cast(BulletBallWorldModule, module).build_native
+            self._world = bullet_world.PersistentBulletWorld(
+                partial(build, settings=native_settings)
+            )
+            native_ball = BulletNativeBall(self._world, native_settings)
+            self._rollout = partial(ball_integration.integrate_native_ball, native_ball)
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""

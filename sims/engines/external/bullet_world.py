@@ -13,8 +13,6 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from sims.engines.external.world_interface import BulletJointWorldModule
-
 NO_LIMIT = 1e100
 """Speed limit in m/s or rad/s that has no effect; by default Bullet clips speeds at 100."""
 
@@ -108,37 +106,29 @@ class PersistentBulletWorld:
         self.invalidate()
 
 
-def create_jointed_body(
-    client: int,
-    kind: int,
-    axis: tuple[float, float, float],
-    mass: float,
-    centre: tuple[float, float, float],
-) -> int:
-    """Create a body on one joint without friction that is fixed to the world.
+def build_jointed_body(kind: str, client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001
+    """Build a body on one joint without friction and gravity; its centre of mass is on the joint.
 
     Args:
-        client: Id of the world.
         kind: ``JOINT_REVOLUTE`` or ``JOINT_PRISMATIC``, at the origin.
-        axis: Axis of the joint.
-        mass: Mass of the body, kg.
-        centre: Centre of mass at joint position 0, m.
+        client: Id of an empty world.
+        constants: unused; the forces of the system depend on them, and the body does not.
 
     Returns:
         The id of the body, whose joint has the index 0.
     """
     pybullet = import_pybullet()
     body: int = pybullet.createMultiBody(
-        linkMasses=[mass],
+        linkMasses=[1.0],
         linkCollisionShapeIndices=[-1],
         linkVisualShapeIndices=[-1],
         linkPositions=[(0.0, 0.0, 0.0)],
         linkOrientations=[(0.0, 0.0, 0.0, 1.0)],
-        linkInertialFramePositions=[centre],
+        linkInertialFramePositions=[(0.0, 0.0, 0.0)],
         linkInertialFrameOrientations=[(0.0, 0.0, 0.0, 1.0)],
         linkParentIndices=[0],
-        linkJointTypes=[kind],
-        linkJointAxis=[axis],
+        linkJointTypes=[getattr(pybullet, kind)],
+        linkJointAxis=[(1.0, 0.0, 0.0)],
         physicsClientId=client,
     )
     # By default Bullet adds air resistance, sleeping, a speed limit of 100, and a motor that brakes
@@ -163,21 +153,21 @@ def create_jointed_body(
 class BulletJoint:
     """Body on one hinge or guide; see `sims.engines.external.joint_integration.JointBody`."""
 
-    def __init__(self, world: PersistentBulletWorld, module: BulletJointWorldModule) -> None:
-        """Take the load and gravity functions of the system's world module."""
-        self._world = world
-        self._load = module.load
-        self._gravity = module.gravity
+    def __init__(self, world: PersistentBulletWorld, is_hinge: bool) -> None:
+        self._world, self._is_hinge = world, is_hinge
 
-    def reset_world(self, constants: dict[str, float]) -> None:
-        """Prepare a world for these constants; `set_step` and `set_state` set everything else."""
-        self._constants, self.compute_gravity_force = constants, self._gravity(constants)
-        self._client, self._body = self._world.get_body(constants)
+    def reset_world(self) -> None:
+        """Prepare a world; `set_step` and `set_state` set everything else."""
+        self._client, self._body = self._world.get_body({})
 
-    def set_step(self, step: float, inertia: float) -> bool:
-        """Set step (s) and inertia; return False if Bullet cannot represent them."""
-        import_pybullet().setTimeStep(step, self._client)
-        return self._load(self._client, self._body, inertia, self._constants)
+    def set_step(self, step: float, inertia: float) -> None:
+        """Set step (s) and inertia (kg or kg*m^2)."""
+        pybullet = import_pybullet()
+        pybullet.setTimeStep(step, self._client)
+        changes: dict[str, Any] = (
+            {"localInertiaDiagonal": (inertia,) * 3} if self._is_hinge else {"mass": inertia}
+        )
+        pybullet.changeDynamics(self._body, 0, physicsClientId=self._client, **changes)
 
     def set_state(self, x: float, w: float) -> None:
         """Set the joint's position and velocity.
@@ -200,4 +190,4 @@ class BulletJoint:
         return x, w
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity")}
+        return {"_world": self._world, "_is_hinge": self._is_hinge}

@@ -1,15 +1,16 @@
 """Integrate a one-coordinate system with an engine, at second order in the step.
 
-The engine's velocity w belongs to the time half a step before the position. With force f(t, x, v,
-u) in addition to the gravity G(x), each step of length h from (x, v) is
+The engine moves a body with the inertia M of the system on a hinge or a guide; all forces f(t, x,
+v, u), gravity among them, are applied to the joint. The engine's velocity w belongs to the time
+half a step before the position. Each step of length h from (x, v) is
 
-    start:  w  = v + h/2 (G(x) + f(t, x, v, u)) / M                        (1)
+    start:  w  = v + h/2 f(t, x, v, u) / M                                 (1)
     engine: x' = x + h w                                                   (2)
-    end:    v' = w + h/2 (G(x') + f(t', x', v', u)) / M                    (3)
+    end:    v' = w + h/2 f(t', x', v', u) / M                              (3)
 
 where (1) is applied as one force over the step,
 
-    F = (w - w_before) M / h - G(x)                                        (4)
+    F = (w - w_before) M / h                                               (4)
 
 and (3) is solved for v' by one Newton step, so that damping is stable however strong it is (the two
 halves together are the trapezoidal rule in v), and dry friction is exact in each half
@@ -37,21 +38,18 @@ VELOCITY_STEP = 1e-3
 
 
 class JointBody(Protocol):
-    """Body on one hinge or guide in an engine."""
+    """Body on one hinge or guide in an engine, without gravity."""
 
-    def reset_world(self, constants: dict[str, float]) -> None:
-        """Prepare the world for a rollout with these constants."""
+    def reset_world(self) -> None:
+        """Prepare the world for a rollout."""
         ...
 
-    def set_step(self, step: float, inertia: float) -> bool:
+    def set_step(self, step: float, inertia: float) -> None:
         """Set step size and generalised inertia.
 
         Args:
             step: step size in seconds.
             inertia: generalised inertia in kg or kg*m^2.
-
-        Returns:
-            False if the engine cannot represent the inertia.
         """
         ...
 
@@ -64,12 +62,8 @@ class JointBody(Protocol):
         """
         ...
 
-    def compute_gravity_force(self, x: float) -> float:
-        """Return the generalised force of the engine's own gravity at position x."""
-        ...
-
     def advance(self, force: float) -> tuple[float, float]:
-        """Advance by one step with a generalised force in addition to gravity.
+        """Advance by one step with a generalised force.
 
         Returns:
             Position and the engine's velocity after the step.
@@ -81,20 +75,18 @@ class LinearisedForces:
     """Forces on one coordinate, linear in the velocity around the last evaluation.
 
     Attributes:
-        weight: force of the engine's own gravity at the last evaluation.
         limit: limit of dry friction.
     """
 
-    def __init__(self, joint: JointBody, element: ElementWork, inertia: float) -> None:
+    def __init__(self, element: ElementWork, inertia: float) -> None:
         """Start with zero forces; both states of a step are evaluated in one call.
 
         `inertia` is the inertia at the joint, in kg m^2 on a hinge or kg on a guide.
         """
-        self._joint = joint
         self._forces = ElementForces(element, 2)
         self._inertia = inertia
         self.set_inputs = self._forces.set_inputs
-        self.weight = self.limit = self._velocity = self._force = self._slope = 0.0
+        self.limit = self._velocity = self._force = self._slope = 0.0
 
     def linearise(self, t: float, x: float, v: float) -> None:
         """Evaluate all forces at a state, and their slope by the velocity as a difference quotient.
@@ -110,7 +102,6 @@ class LinearisedForces:
         # The second velocity is farther from zero, where forces may be discontinuous.
         velocity_step = math.copysign(VELOCITY_STEP, v)
         force, perturbed_force = self._forces.evaluate_at_velocities(t, x, (v, v + velocity_step))
-        self.weight = self._joint.compute_gravity_force(x)
         self.limit = self._forces.limit
         self._velocity = v
         self._force = force
@@ -125,7 +116,7 @@ class LinearisedForces:
 
         A force that increases with the velocity is taken without its slope.
 
-        It solves v' = w + h/2 (G(x') + f(t', x', v', u)) / M (3) by one Newton step.
+        It solves v' = w + h/2 f(t', x', v', u) / M (3) by one Newton step.
 
         Args:
             w: the engine's velocity.
@@ -178,7 +169,8 @@ def integrate_velocity(
     if velocity and limit:
         slope = subtract_dry_friction(velocity, force, limit) * inverse
         final_velocity = velocity + slope * duration
-        if final_velocity * velocity >= 0:
+        # A product of both would underflow to zero for the remainder of a rounding error.
+        if (final_velocity < 0) == (velocity < 0):
             return final_velocity
         # The body stops at time -v / slope; the remaining time begins there.
         duration += velocity / slope
@@ -198,15 +190,15 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
         element: batch element: initial state, steps, constants and effects.
 
     Returns:
-        The trajectory; NaN if the engine cannot represent the element.
+        The trajectory; NaN if it diverges, or if the inertia is not positive.
     """
-    joint.reset_world(element.plain_constants)
+    joint.reset_world()
     # Moment of inertia in kg m^2, or mass in kg.
     inertia = float(element.system.mass(element.theta, element.constants)[0, 0])
     failed = np.full((element.recorded_steps.size, 1), np.nan)
     if not inertia > 0.0:
         return failed, failed, failed
-    forces = LinearisedForces(joint, element, inertia)
+    forces = LinearisedForces(element, inertia)
     x = float(element.x[0, 0])
     v = float(element.v[0, 0])
     t = 0.0
@@ -223,12 +215,11 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
             v, forces.compute_force(v), forces.limit, inverse, 0.5 * h
         )  # (1)
         if h != step:
-            if not joint.set_step(h, inertia):
-                break
+            joint.set_step(h, inertia)
             w = 2.0 * v - start  # then the applied force equals the true force
             joint.set_state(x, w)
             step = h
-        x, w = joint.advance((start - w) * inertia / h - forces.weight)  # (4), (2)
+        x, w = joint.advance((start - w) * inertia / h)  # (4), (2)
         if not math.isfinite(x + w):
             break
         t += h

@@ -34,7 +34,6 @@ from sims.core.mujoco_import import disable_step_profiler
 from sims.engines.external import ball_integration
 from sims.engines.external.ball_integration import BallState
 from sims.engines.external.external_engine import Vector
-from sims.engines.external.world_interface import MujocoJointWorldModule
 
 _IMPACT_STEP_SECONDS = 1e-4
 """Length of the time step of an impact in seconds.
@@ -104,28 +103,51 @@ class CompiledWorld:
         self._model = self._data = self._built_for = None
 
 
+_BODY_INERTIA = 1e-14
+"""Mass and moment of inertia of a body on a joint: MuJoCo requires positive values."""
+
+
+def write_joint_model(joint_type: str, constants: Mapping[str, float]) -> str:  # noqa: ARG001
+    """Return the MuJoCo model (MJCF) of a body with hardly any inertia on one joint.
+
+    `MujocoJoint` sets the joint's inertia as its armature, which MuJoCo uses only if the body's
+    centre of mass is beyond the joint. There is no gravity.
+
+    Args:
+        joint_type: ``hinge`` or ``slide``.
+        constants: unused; the forces of the system depend on them, and the body does not.
+    """
+    inertia = f"{_BODY_INERTIA} {_BODY_INERTIA} {_BODY_INERTIA}"
+    return f"""
+    <mujoco>
+      <option gravity="0 0 0"/>
+      <worldbody>
+        <body>
+          <joint type="{joint_type}" axis="1 0 0"/>
+          <inertial mass="{_BODY_INERTIA}" pos="0 0 -1e-3" diaginertia="{inertia}"/>
+        </body>
+      </worldbody>
+    </mujoco>"""
+
+
 class MujocoJoint:
     """Body on one hinge or guide; see `sims.engines.external.joint_integration.JointBody`."""
 
-    def __init__(self, world: CompiledWorld, module: MujocoJointWorldModule) -> None:
-        """Take the load and gravity functions of the system's world module."""
+    def __init__(self, world: CompiledWorld) -> None:
         self._world = world
-        self._load = module.load
-        self._gravity = module.gravity
 
-    def reset_world(self, constants: dict[str, float]) -> None:
-        """Prepare a world for these constants, in its initial state."""
-        self._constants, self.compute_gravity_force = constants, self._gravity(constants)
-        self._model, self._data = self._world.get_reset_world(constants)
+    def reset_world(self) -> None:
+        """Prepare a world in its initial state."""
+        self._model, self._data = self._world.get_reset_world({})
         self._x = self._data.qpos
         self._w = self._data.qvel
         self._force = self._data.qfrc_applied
         self._step = import_mujoco().mj_step
 
-    def set_step(self, step: float, inertia: float) -> bool:
-        """Set step (s) and inertia; return False if MuJoCo cannot represent them."""
+    def set_step(self, step: float, inertia: float) -> None:
+        """Set step (s) and inertia (kg or kg*m^2)."""
         self._model.opt.timestep = step
-        return self._load(self._model, inertia, self._constants)
+        self._model.dof_armature[0] = inertia - _BODY_INERTIA
 
     def set_state(self, x: float, w: float) -> None:
         """Set the joint's position and velocity.
@@ -144,7 +166,7 @@ class MujocoJoint:
         return self._x.item(), self._w.item()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity")}
+        return {"_world": self._world}
 
 
 class MujocoMover:

@@ -1,13 +1,14 @@
 """MuJoCo engine: forces through ``qfrc_applied``, impacts through its contact solver.
 
-The module ``<system>_mujoco_world`` in the system's package writes the world of a system; its
-interface is specified in `sims.engines.external.world_interface`.
+A system with one coordinate is a body on a hinge or guide. For a bouncing system, the module
+``<system>_mujoco_world`` in its package writes the world; its interface is specified in
+`sims.engines.external.world_interface`.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import cast
 
@@ -27,10 +28,11 @@ from sims.engines.external.mujoco_bodies import (
     MujocoJoint,
     MujocoSoftBall,
     import_mujoco,
+    write_joint_model,
 )
 from sims.engines.external.world_interface import (
-    MujocoJointWorldModule,
     MujocoWorldModule,
+    find_unsupported_joint_reason,
     find_world_module,
 )
 
@@ -116,18 +118,22 @@ class MujocoEngine:
 
         With `stiffness`, MuJoCo's own soft contact moves a ball. Otherwise a system that
         bounces gets impacts at their exact times, and any other system is a body on a
-        joint. If the system has no world for MuJoCo, only the reason is stored.
+        joint. If MuJoCo cannot simulate the system, only the reason is stored.
         """
         self.largest_step = largest_step
         self._worlds: list[CompiledWorld] = []
         self._rollouts: list[RolloutFunction] = []
-        protocol = MujocoWorldModule if system.bounces else MujocoJointWorldModule
-        module, self._reason = find_world_module(system, "mujoco_world", protocol)
-        if module is None:
+        self._reason = find_unsupported_joint_reason(system)
+        write_model: Callable[[Mapping[str, float]], str] = partial(
+            write_joint_model, "hinge" if system.kind == "rotary" else "slide"
+        )
+        if system.bounces:
+            module, self._reason = find_world_module(system, "mujoco_world", MujocoWorldModule)
+            if module is not None:
+                write_model = cast(MujocoWorldModule, module).model
+        if self._reason:
             return
-        self._worlds = [
-            CompiledWorld(cast(MujocoWorldModule, module).model) for _ in range(threads)
-        ]
+        self._worlds = [CompiledWorld(write_model) for _ in range(threads)]
         for world in self._worlds:
             rollout: RolloutFunction
             if stiffness is not None:
@@ -136,8 +142,7 @@ class MujocoEngine:
             elif system.bounces:
                 rollout = partial(ball_integration.integrate_ball, MujocoBall(world))
             else:
-                joint = MujocoJoint(world, cast(MujocoJointWorldModule, module))
-                rollout = partial(joint_integration.integrate_joint, joint)
+                rollout = partial(joint_integration.integrate_joint, MujocoJoint(world))
             self._rollouts.append(rollout)
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:

@@ -1,10 +1,10 @@
-"""Interface of the world modules that build a system in PyBullet or MuJoCo.
+"""Interface of the world modules that build a bouncing system in PyBullet or MuJoCo.
 
-A system that PyBullet can simulate has a module ``<system>_bullet_world`` in its package, one that
-MuJoCo can simulate a module ``<system>_mujoco_world``. The required members depend on the system: a
-body on a hinge or guide needs a function that sets its inertia, a bouncing ball does not. The
-protocols below specify them. A module that does not fulfil its protocol is rejected with the name
-of the missing member before any simulation.
+A bouncing system that PyBullet can simulate has a module ``<system>_bullet_world`` in its package,
+one that MuJoCo can simulate a module ``<system>_mujoco_world``. The protocols below specify the
+required members. A module that does not fulfil its protocol is rejected with the name of the
+missing member before any simulation. Systems with one coordinate need no module: the engines move a
+body with their inertia on a hinge or guide.
 """
 
 from __future__ import annotations
@@ -22,17 +22,6 @@ Constants = Mapping[str, float]
 """Known constants of a system by name, in SI units."""
 
 
-class JointWorldModule(Protocol):
-    """World module of a one-coordinate system: a body on one hinge or guide."""
-
-    def gravity(self, constants: Constants, /) -> Callable[[float], float]:
-        """Return a function from position to the generalised force of the engine's own gravity.
-
-        Positions are in m or rad, forces in N or N*m.
-        """
-        ...
-
-
 class BulletWorldModule(Protocol):
     """Module ``<system>_bullet_world`` of a system."""
 
@@ -46,26 +35,8 @@ class BulletWorldModule(Protocol):
         ...
 
 
-class BulletJointWorldModule(BulletWorldModule, JointWorldModule, Protocol):
-    """Module ``<system>_bullet_world`` of a one-coordinate system."""
-
-    def load(self, client: int, body: int, inertia: float, constants: Constants, /) -> bool:
-        """Set the generalised inertia of the body.
-
-        Args:
-            client: Bullet client of the world.
-            body: id of the body.
-            inertia: generalised inertia in kg or kg*m^2.
-            constants: constants of the system by name.
-
-        Returns:
-            False if Bullet cannot represent the inertia.
-        """
-        ...
-
-
 class BulletBallWorldModule(BulletWorldModule, Protocol):
-    """Module ``<system>_bullet_world`` of a bouncing ball, required for `native_contact`."""
+    """Module ``<system>_bullet_world`` with what `native_contact` requires in addition."""
 
     def build_native(self, client: int, constants: Constants, /, settings: Constants) -> int:
         """Build the world with Bullet's native contact.
@@ -89,27 +60,16 @@ class MujocoWorldModule(Protocol):
         ...
 
 
-class MujocoJointWorldModule(MujocoWorldModule, JointWorldModule, Protocol):
-    """Module ``<system>_mujoco_world`` of a one-coordinate system."""
-
-    def load(self, model: Any, inertia: float, constants: Constants, /) -> bool:
-        """Set the generalised inertia in a compiled model.
-
-        Args:
-            model: compiled model (``MjModel``).
-            inertia: generalised inertia in kg or kg*m^2.
-            constants: constants of the system by name.
-
-        Returns:
-            False if MuJoCo cannot represent the inertia.
-        """
-        ...
+def find_unsupported_joint_reason(system: type[System]) -> str:
+    """Return why a system cannot be a body on one hinge or guide; empty if it can."""
+    count = len(system.coordinates)
+    return "" if count == 1 else f"it has {count} coordinates, expected one (a hinge or guide)"
 
 
 def find_world_module(
     system: type[System], name: str, protocol: type
 ) -> tuple[ModuleType | None, str]:
-    """Find the world module of a system and check its interface.
+    """Find the world module of a bouncing system and check its interface.
 
     A world module builds the system as bodies of an external physics engine, such as MuJoCo or
     Bullet. It is in the package of the system.
