@@ -79,50 +79,49 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
     np.testing.assert_array_equal(recording.held_out()[0].times, [6, 7, 8])
 
 
+def check_refused(path, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read_recording(path, Cart)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("0.5,0.1", "0.5,abc", "log.csv, row 3, column x: expected a finite number, found 'abc'"),
+        ("0.5,0.1", "0.5,inf", "row 3, column x: expected a finite number, found 'inf'"),
+        ("0.5,0.1", "0.5,nan", "row 3, column x: expected a finite number, found 'nan'"),
+        ("1,0.5,", "1,,", "row 3, column t: expected a finite number, found ''"),
+        ("1,0.5,", "1,0,", "row 3, column t: expected more than 0 s, found 0 s"),
+        ("1,1.0,", "1,0.2,", "row 4, column t: expected more than 0.5 s, found 0.2 s"),
+        (",,0\n", ",,\n", "row 4, column u: expected a finite number, found ''"),
+        (",,0\n", ",,\n", "an input has no missing samples"),
+        ("run,t,x,u", "run,time,x,u", "expected column 't', found columns run, time, x, u"),
+        (",", ";", "row 1: expected columns run, t, u, x between commas, found semicolons"),
+        (",", "\t", "between commas, found tabs"),
+        ("\nb,0,", "\n\n\nb,x,", "row 7, column t: expected a finite number, found 'x'"),
+        ("0.1", "1_0", "row 3, column x: expected a finite number, found '1_0'"),
+        ("0.1", "٣", "row 3, column x: expected a finite number, found '٣'"),
+        ("0.1", "1e999", "row 3, column x: expected a finite number, found '1e999'"),
+        ("0.1", '"0.1', "row 6: not a CSV table: unexpected end of data"),
+        ("0.1", "a\x1b[31m", r"found 'a\\x1b\[31m'"),
+        ("run,t,x,u", "run,t,x,x", "row 1: column 'x' is given twice"),
+        ("run,t,x,u", "run,t,x,", "row 1: column 4 has no name"),
+    ],
+)
+def test_faulty_table_is_one_line_that_says_where(tmp_path, old, new, message):
+    assert old in CSV
+    assert "log.csv" in check_refused(written(tmp_path, CSV.replace(old, new)), message)
+
+
 @pytest.mark.parametrize(
     ("csv", "message"),
     [
-        (
-            CSV.replace("0.5,0.1", "0.5,abc"),
-            "log.csv, row 3, column x: expected a finite number, found 'abc'",
-        ),
-        (
-            CSV.replace("0.5,0.1", "0.5,inf"),
-            "row 3, column x: expected a finite number, found 'inf'",
-        ),
-        (
-            CSV.replace("0.5,0.1", "0.5,nan"),
-            "row 3, column x: expected a finite number, found 'nan'",
-        ),
-        (CSV.replace("1,0.5,", "1,,"), "row 3, column t: expected a finite number, found ''"),
-        (CSV.replace("1,0.5,", "1,0,"), "row 3, column t: expected more than 0 s, found 0 s"),
-        (CSV.replace("1,1.0,", "1,0.2,"), "row 4, column t: expected more than 0.5 s, found 0.2 s"),
-        (CSV.replace(",,0\n", ",,\n"), "row 4, column u: expected a finite number, found ''"),
-        (CSV.replace(",,0\n", ",,\n"), "an input has no missing samples"),
-        (
-            CSV.replace("run,t,x,u", "run,time,x,u"),
-            "expected column 't', found columns run, time, x, u",
-        ),
-        (
-            CSV.replace(",", ";"),
-            "row 1: expected columns run, t, u, x between commas, found semicolons",
-        ),
-        (CSV.replace(",", "\t"), "between commas, found tabs"),
         ("run,t,x,u\n", "expected rows of data, found none"),
         ("", "row 1: expected columns run, t, u, x between commas, found ''"),
         (CSV + "b,1,2,3,4,5\n", "row 7: expected 4 cells as in the header, found 6"),
         (CSV + "b,1,2\n", "row 7: expected 4 cells as in the header, found 3"),
-        (
-            CSV.replace("\nb,0,", "\n\n\nb,x,"),
-            "row 7, column t: expected a finite number, found 'x'",
-        ),
-        (CSV.replace("0.1", "1_0"), "row 3, column x: expected a finite number, found '1_0'"),
-        (CSV.replace("0.1", "٣"), "row 3, column x: expected a finite number, found '٣'"),
-        (CSV.replace("0.1", "1e999"), "row 3, column x: expected a finite number, found '1e999'"),
-        (CSV.replace("0.1", '"0.1'), "row 6: not a CSV table: unexpected end of data"),
-        (CSV.replace("0.1", "a\x1b[31m"), r"found 'a\\x1b\[31m'"),
-        (CSV.replace("run,t,x,u", "run,t,x,x"), "row 1: column 'x' is given twice"),
-        (CSV.replace("run,t,x,u", "run,t,x,"), "row 1: column 4 has no name"),
         (
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
             "column 'v' is not declared; log.toml declares u, x; add it with its unit under "
@@ -135,59 +134,69 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
         ("run,t,x,u\n1,0,,0\n1,1,,0\n", "column x has no sample; leave the channel out"),
     ],
 )
-def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
-    with pytest.raises(InputError, match=message) as caught:
-        read_recording(written(tmp_path, csv), Cart)
-    assert "\n" not in str(caught.value)
-    assert "log.csv" in str(caught.value)
+def test_table_with_faulty_rows_is_one_line_that_says_where(tmp_path, csv, message):
+    assert "log.csv" in check_refused(written(tmp_path, csv), message)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "m"', 'unit = "kg"', "channel x: expected a unit that converts to m, found 'kg'"),
+        (
+            'unit = "m"',
+            'unit = "ftt"',
+            "channel x: unknown unit 'ftt'; expected one that converts to m",
+        ),
+        (
+            'unit = "m"',
+            'unit = "degC"',
+            "channel x: expected a unit that converts to m, found 'degC'",
+        ),
+        (
+            'unit = "m"',
+            'unit = "9**9**9"',
+            "channel x: expected a unit that converts to m, found '9",
+        ),
+        ('unit = "m"', 'unit = "m\\u0000"', r"channel x: expected a unit .*, found 'm\\x00'"),
+        ('unit = "N"', 'unit = "m"', "input u: expected a unit that converts to N, found 'm'"),
+        (
+            'unit = "m"\n',
+            "",
+            'channel x: expected unit = "m" or one that converts to it, found None',
+        ),
+        (
+            '[channels.x]\nunit = "m"\nnoise = 0.01',
+            '[channels]\nx = "m"',
+            "expected a table with unit",
+        ),
+        (
+            "noise",
+            "nosie",
+            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, matrix, noise",
+        ),
+        (
+            "0.01",
+            "0",
+            r"channels.x.noise: expected more than 0 \(leave it out if unknown\), found 0",
+        ),
+        ("2.0", "-1", "constants.mass: expected more than 0 kg, found -1"),
+        ("2.0", "9" * 400, "constants.mass: expected a number, found 9999"),
+        ("2.0", "true", "constants.mass: expected a number, found True"),
+        ("channels.x", "channels.y", "unknown channel in .*log.toml 'y'; there are: x"),
+        ("mass", "mas", r"unknown entry in \[constants\] of .*'mas'; there are: drift, mass"),
+        ("2.0", '"heavy"', "constants.mass: expected a number, found 'heavy'"),
+        ("0.01", "nan", "channels.x.noise: expected a number, found nan"),
+        ('system = "cart"', "", 'expected system = "NAME", found None'),
+    ],
+)
+def test_faulty_description_is_one_line_that_says_where(tmp_path, old, new, message):
+    assert old in TOML
+    check_refused(written(tmp_path, toml=TOML.replace(old, new)), message)
 
 
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        (
-            TOML.replace('unit = "m"', 'unit = "kg"'),
-            "channel x: expected a unit that converts to m, found 'kg'",
-        ),
-        (
-            TOML.replace('unit = "m"', 'unit = "ftt"'),
-            "channel x: unknown unit 'ftt'; expected one that converts to m",
-        ),
-        (
-            TOML.replace('unit = "m"', 'unit = "degC"'),
-            "channel x: expected a unit that converts to m, found 'degC'",
-        ),
-        (
-            TOML.replace('unit = "m"', 'unit = "9**9**9"'),
-            "channel x: expected a unit that converts to m, found '9",
-        ),
-        (
-            TOML.replace('unit = "m"', 'unit = "m\\u0000"'),
-            r"channel x: expected a unit .*, found 'm\\x00'",
-        ),
-        (
-            TOML.replace('unit = "N"', 'unit = "m"'),
-            "input u: expected a unit that converts to N, found 'm'",
-        ),
-        (
-            TOML.replace('unit = "m"\n', ""),
-            'channel x: expected unit = "m" or one that converts to it, found None',
-        ),
-        (
-            TOML.replace('[channels.x]\nunit = "m"\nnoise = 0.01', '[channels]\nx = "m"'),
-            "expected a table with unit",
-        ),
-        (
-            TOML.replace("noise", "nosie"),
-            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, matrix, noise",
-        ),
-        (
-            TOML.replace("0.01", "0"),
-            r"channels.x.noise: expected more than 0 \(leave it out if unknown\), found 0",
-        ),
-        (TOML.replace("2.0", "-1"), "constants.mass: expected more than 0 kg, found -1"),
-        (TOML.replace("2.0", "9" * 400), "constants.mass: expected a number, found 9999"),
-        (TOML.replace("2.0", "true"), "constants.mass: expected a number, found True"),
         (
             TOML + "[runs.b]\nmass = 1\nconstants = {mass = 2}\n",
             "runs.b: constant mass is given twice",
@@ -201,16 +210,6 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
         ("title = 3\n" + TOML, "title: expected text, found 3"),
         ("a = " + "[" * 100_000, "not valid TOML"),
         ('"a\\nb" = 1', r"unknown entry of .*'a\\nb'"),
-        (
-            TOML.replace("channels.x", "channels.y"),
-            "unknown channel in .*log.toml 'y'; there are: x",
-        ),
-        (
-            TOML.replace("mass", "mas"),
-            r"unknown entry in \[constants\] of .*'mas'; there are: drift, mass",
-        ),
-        (TOML.replace("2.0", '"heavy"'), "constants.mass: expected a number, found 'heavy'"),
-        (TOML.replace("0.01", "nan"), "channels.x.noise: expected a number, found nan"),
         (TOML + "[runs.7]\nheld_out = true\n", r"unknown entry in \[runs\].*'7'; there are: 1, b"),
         (
             TOML + '[runs.b]\nheld_out = "yes"\n',
@@ -220,16 +219,13 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
             TOML + "[runs.b]\nheldout = true\n",
             "'heldout'; there are: constants, drift, file, folder, held_out, initial, mass",
         ),
-        (TOML.replace('system = "cart"', ""), 'expected system = "NAME", found None'),
         (TOML + "[oops]\n", "unknown entry of .*'oops'"),
         ("system = ", "not valid TOML"),
         (TOML + "[runs.1]\nheld_out = true\n[runs.b]\nheld_out = true\n", "every run .* held_out"),
     ],
 )
-def test_faulty_description_is_one_line_that_says_where(tmp_path, toml, message):
-    with pytest.raises(InputError, match=message) as caught:
-        read_recording(written(tmp_path, toml=toml), Cart)
-    assert "\n" not in str(caught.value)
+def test_description_with_faulty_tables_is_one_line_that_says_where(tmp_path, toml, message):
+    check_refused(written(tmp_path, toml=toml), message)
 
 
 def test_missing_files(tmp_path):

@@ -33,34 +33,23 @@ def added(write, **table):
     return read_robot(write(ARM), actuators={"m": {"joint": "elbow", **table}})
 
 
-def test_a_motor(write):
-    robot = added(write, kind="motor", gear=4)
-    assert robot.actuator("m").kind == "motor"
-    assert force(robot) == pytest.approx(4 * U)
-
-
-def test_a_position_servo(write):
-    robot = added(write, kind="position", kp=20, kv=3, gear=2)
-    assert robot.actuator("m").kind == "position"
-    assert force(robot) == pytest.approx(2 * (20 * (U - 2 * Q) - 3 * 2 * V))
-
-
-def test_a_velocity_servo(write):
-    robot = added(write, kind="velocity", kv=3)
-    assert robot.actuator("m").kind == "velocity"
-    assert force(robot) == pytest.approx(3 * (U - V))
-
-
-def test_a_pid_whose_damping_acts_on_the_joint(write):
-    robot = added(write, kind="pid", kp=20, ki=5, kv=3)
+@pytest.mark.parametrize(
+    ("table", "torque"),
+    [
+        ({"kind": "motor", "gear": 4}, 4 * U),
+        ({"kind": "position", "kp": 20, "kv": 3, "gear": 2}, 2 * (20 * (U - 2 * Q) - 3 * 2 * V)),
+        ({"kind": "velocity", "kv": 3}, 3 * (U - V)),
+        # The damping of this PID acts on the joint.
+        ({"kind": "pid", "kp": 20, "ki": 5, "kv": 3}, 20 * (U - Q) - 3 * V + 5 * STATE),
+    ],
+    ids=lambda table: table["kind"] if isinstance(table, dict) else "",
+)
+def test_an_actuator_exerts_what_its_kind_says(write, table, torque):
+    robot = added(write, **table)
     actuator = robot.actuator("m")
-    assert (
-        actuator.kind,
-        actuator.control,
-        actuator.controls,
-        robot.rate_controlled_actuators,
-    ) == ("pid", 1, 1, ())
-    assert force(robot) == pytest.approx(20 * (U - Q) - 3 * V + 5 * STATE)
+    assert (actuator.kind, actuator.control, actuator.controls) == (table["kind"], 1, 1)
+    assert robot.rate_controlled_actuators == ()
+    assert force(robot) == pytest.approx(torque)
 
 
 def test_a_pid_whose_derivative_acts_on_the_error(write):

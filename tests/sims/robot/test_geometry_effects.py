@@ -51,32 +51,6 @@ ANGLES = np.array([-1.0, 0.2, 0.9])
 WEIGHT = MASS * 9.81 * LENGTH
 
 
-@pytest.mark.parametrize(
-    ("effect", "c", "expected"),
-    [
-        # The reading is larger by c than the angle from the vertical.
-        ("joint.zero@hinge", (0.3,), -WEIGHT * np.sin(ANGLES - 0.3) / INERTIA),
-        # The component of gravity across an axis that is tilted by c.
-        ("joint.axis@hinge", (0.4, 0.0), None),
-        ("gravity.compensation@rod", (0.7,), -0.3 * WEIGHT * np.sin(ANGLES) / INERTIA),
-        (
-            "payload@rod",
-            (0.5, 0.0, 0.0, -0.3),
-            -(WEIGHT + 0.5 * 9.81 * 0.8) * np.sin(ANGLES) / (INERTIA + 0.5 * 0.8**2),
-        ),
-    ],
-)
-def test_a_pendulum_moves_as_in_the_textbook(effect, c, expected, tmp_path: Path) -> None:
-    """The angular acceleration at rest is the torque of gravity divided by the inertia."""
-    if expected is None:
-        # The distance of the centre of mass from the axis (0, cos, sin), and its inertia there.
-        distance = LENGTH * np.cos(0.4) + 0.2 * np.sin(0.4)
-        inertia = 0.02 * np.cos(0.4) ** 2 + 0.001 * np.sin(0.4) ** 2 + MASS * distance**2
-        expected = -MASS * 9.81 * np.cos(0.4) * distance * np.sin(ANGLES) / inertia
-    found = accelerations(pendulum(tmp_path), effect, *c)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
-
-
 def test_a_file_with_too_much_compensation_is_corrected(tmp_path: Path) -> None:
     """A coefficient of -1 removes the compensation of the file."""
     kind = pendulum(tmp_path, gravcomp=1.0)

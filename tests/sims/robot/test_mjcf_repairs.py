@@ -132,17 +132,6 @@ def test_includes_are_followed_from_the_models_folder(write):
     assert read_robot(path).digest != robot.digest
 
 
-def test_free_and_ball_joints_are_read(write):
-    text = """<mujoco><worldbody><body name="a"><freejoint name="root"/><geom size="1"/>
-      <body name="b"><joint name="hip" type="ball"/><geom size="1"/></body></body>
-      </worldbody></mujoco>"""
-    robot = read_robot(write(text))
-    assert [(joint.name, joint.kind, joint.velocity) for joint in robot.joints] == [
-        ("root", "free", 0),
-        ("hip", "ball", 6),
-    ]
-
-
 def test_a_mesh_that_mujoco_refuses(write):
     path = write(mjcf('<mesh name="m" file="bad.obj"/><mesh name="n" file="bad.stl"/>'))
     write(

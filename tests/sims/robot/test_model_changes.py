@@ -46,14 +46,6 @@ def test_a_cause_is_the_same_in_a_batch_element(
     assert "arm" in applied.model.names.decode()
 
 
-def test_a_family_is_its_members(tmp_path: Path) -> None:
-    """Each place has its own number."""
-    causes = {"drag.linear@*": {"coefficient@elbow": number(0.1), "coefficient@spin": number(0.2)}}
-    applied = apply_causes(robot(tmp_path), causes)
-    np.testing.assert_allclose(applied.model.dof_damping, [0.2, 0.2, 0.2])
-    assert [cause.name for cause in applied.held] == ["drag.linear@elbow", "drag.linear@spin"]
-
-
 DRIVEN = ARM.replace('name="m_elbow"', 'name="m_elbow" ctrllimited="true" ctrlrange="-2 1.5"')
 
 

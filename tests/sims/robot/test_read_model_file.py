@@ -2,7 +2,6 @@
 
 import pytest
 
-from sims.core.simulator import InputError
 from sims.robot.parsing.read_model_file import read_robot
 
 ARM = """
@@ -103,10 +102,3 @@ def test_what_is_read_and_set_enters_the_digest(write):
     assert len(first.digest) == 64
     assert read_robot(write(ARM.replace('mass="2"', 'mass="3"'))).digest != first.digest
     assert read_robot(write(ARM), engine={"timestep": 0.001}).digest != first.digest
-
-
-def test_what_is_not_a_model_is_refused(write):
-    path = write("<sdf/>")
-    with pytest.raises(InputError) as caught:
-        read_robot(path)
-    assert str(caught.value) == f"{path}: expected <mujoco> or <robot>, found <sdf>"

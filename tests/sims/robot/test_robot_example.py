@@ -48,24 +48,6 @@ def test_without_friction_it_moves_as_mujoco_moves_the_model(step, tolerance):
     np.testing.assert_allclose(own, simulated, rtol=0, atol=tolerance)
 
 
-def test_its_elbow_stops_where_dry_friction_stops_it():
-    """With a practically fixed shoulder and no gravity: a parabola, then rest."""
-    friction, speed = 0.03, 0.5
-    arm = robot_arm.Arm(armature=(1e9, 0.005), damping=(0, 0), gravity=0.0, friction=friction)
-    inertia = 0.009 + 0.8 * 0.15**2 + 0.005
-    elbow = arm.simulate(np.array([0, 0, 0, speed]), np.zeros((100, 2)))[:, 1]
-    time = np.minimum(np.arange(100) / robot_arm.RATE, speed * inertia / friction)
-    np.testing.assert_allclose(elbow, speed * time - friction / inertia * time**2 / 2, atol=1e-8)
-    assert len(set(elbow[60:])) == 1
-
-
-@pytest.mark.parametrize(("torque", "moves"), [(0.0299, False), (0.0301, True)])
-def test_its_elbow_sticks_until_the_force_exceeds_its_friction(torque, moves):
-    arm = robot_arm.Arm(gravity=0.0, friction=0.03)
-    positions = arm.simulate(np.zeros(4), np.tile([0.0, torque], (50, 1)))
-    assert np.any(positions) == moves
-
-
 def test_dry_friction_in_mujoco_sticks_as_it_does_there():
     """The model's own step is 2 ms; with MuJoCo's default settings the error is ten times as
     large.
