@@ -7,7 +7,6 @@ import pytest
 
 from tests.language.__main__ import main
 from tests.language.checks import Glossary, check_source, check_subjects, check_tree
-from tests.language.ratchet import load_remaining, update_remaining
 
 CLEAN = '''"""Fit all candidate models with Levenberg-Marquardt."""
 
@@ -128,30 +127,22 @@ def test_names_of_arguments_are_checked_as_identifiers_only(glossary):
     assert [finding.line for finding in check_source(source, "bench/f.py", glossary)] == [5]
 
 
-def test_a_clean_tree_has_no_findings_and_exit_code_0(tmp_path, capsys):
-    root = write_files(tmp_path, {"bench/model_fit.py": CLEAN, "README.md": "# Fit models\n"})
-    options = ["--root", str(root), "--remaining", str(tmp_path / "remaining.csv")]
-    assert main([*options, "bench", "README.md"]) == 0
-    assert capsys.readouterr().out == "0 findings, 0 more than remaining.csv allows\n"
-
-
-def test_one_finding_more_than_remaining_fails(tmp_path, capsys):
-    root = write_files(tmp_path, {"bench/model_fit.py": "told = 1\n"})
-    numbers = tmp_path / "remaining.csv"
-    options = ["--root", str(root), "--remaining", str(numbers), "bench"]
-    update_remaining({("identifiers", "told", "bench"): 1}, numbers)
-    assert main(options) == 0
-    write_files(root, {"bench/model_fit.py": "told = 1\ntold_lines = 2\n"})
-    assert main(options) == 1
-    assert "bench/model_fit.py:2: word 'told' in 'told_lines'" in capsys.readouterr().out
-
-
-def test_update_lowers_numbers_and_never_raises_one(tmp_path):
-    path = tmp_path / "remaining.csv"
-    lane, told, rival = (("identifiers", word, "bench") for word in ("lane", "told", "rival"))
-    update_remaining({lane: 5, told: 5}, path)
-    assert load_remaining(path) == {lane: 5, told: 5}
-    update_remaining({lane: 3, told: 7, rival: 1}, path)
-    assert load_remaining(path) == {lane: 3, told: 5}
-    update_remaining({told: 5}, path)
-    assert load_remaining(path) == {told: 5}
+@pytest.mark.parametrize(
+    ("source", "code", "last_lines"),
+    [
+        (CLEAN, 0, ["0 findings"]),
+        (
+            "told = 1\ntold_lines = 2\n",
+            1,
+            [
+                "bench/model_fit.py:2: word 'told' in 'told_lines': write 'specified, reported'",
+                "2 findings",
+            ],
+        ),
+    ],
+    ids=["clean", "two findings"],
+)
+def test_findings_are_printed_and_give_exit_code_1(tmp_path, capsys, source, code, last_lines):
+    root = write_files(tmp_path, {"bench/model_fit.py": source, "README.md": "# Fit models\n"})
+    assert main(["--root", str(root), "bench", "README.md"]) == code
+    assert capsys.readouterr().out.splitlines()[-len(last_lines) :] == last_lines
