@@ -34,15 +34,14 @@ def write_robot_recording(folder, stem, inputs, channels, runs, model, time_form
         channels: unit, and noise standard deviation or None, by name.
         runs: by name, whether the run is held out, times (T,), commands (T, U) and readings
             (T, C), and optionally the stated initial state.
-        model: (name, text) of the model file; the text is None for a file that exists already.
+        model: (name, text) of the model file.
         time_format: format of the times.
         **more: further tables of the description.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     name, text = model
-    if text is not None:
-        (folder / name).write_text(text)
+    (folder / name).write_text(text)
     lines, tables = [",".join(["run", "t", *inputs, *channels])], {}
     for run, (is_held_out, times, commands, readings, *initial) in runs.items():
         for t, row in zip(times, np.hstack([commands, readings]), strict=True):
@@ -52,7 +51,7 @@ def write_robot_recording(folder, stem, inputs, channels, runs, model, time_form
     path = folder / f"{stem}.csv"
     path.write_text("\n".join(lines) + "\n")
     description = {
-        "model": str(name),
+        "model": name,
         **more,
         "inputs": {key: {"unit": unit} for key, unit in inputs.items()},
         "channels": {

@@ -7,8 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from bench.diagnosis.explain import explain
 from sims.core.root_mean_square import compute_rms
 from tests.exams.exam import UndrawableError
+from tests.exams.explain_calls import Outcome
 from tests.exams.planted.planted_cases import GAP, PlantedQuestion, questions
 from tests.exams.planted.planted_motion import Change
 from tests.exams.planted.planted_robots import ROBOTS, MissingModelError, Robot
@@ -85,6 +87,25 @@ def test_a_model_file_with_the_planted_number_fits_the_data(name, tmp_path):
     model = tmp_path / "robot.xml"
     assert errors(changed_xml(model, item), item, path) == pytest.approx(1.0, abs=0.1)
     assert errors(mujoco.MjModel.from_xml_path(str(model)), item, path) > GAP[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "reacher/armature/1",
+        "reacher/frictionloss/0",
+        "double-pendulum-cart/frictionloss/0",
+        "double-pendulum/mass/0",
+        "iiwa/damping/0",
+    ],
+)
+def test_the_planted_cause_is_found_with_the_file_of_its_package(name, tmp_path):
+    """MJCF and URDF files of gymnasium, PyBullet and example-robot-data."""
+    item = drawn(name)
+    answer = explain(item.write(tmp_path)).answer
+    assert item.mark(Outcome(answer.to_document(), 0)).strict, "named alone, its number right"
+    assert answer.heldout.rmse_extended < 1.05 * answer.heldout.noise_floor
 
 
 def test_a_planted_mass_equals_a_changed_urdf():
