@@ -2,7 +2,6 @@
 
 import json
 import math
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -139,23 +138,3 @@ def test_an_unknown_topic_and_numbers_that_are_too_large(tmp_path):
             writer.add_message(channel, k, b'{"x": 1' + b"0" * 400 + b', "y": NaN}', k)
         writer.finish()
     assert np.isinf(read_log(tmp_path / "huge.mcap" / "a").get_column("x")).all()
-
-
-@pytest.mark.parametrize("style", BAGS)
-def test_a_file_that_is_cut_or_spoiled_is_one_line_or_read(style, tmp_path):
-    path = BAGS[style](tmp_path / "run.mcap")
-    topic = "states" if style == "protobuf" else "joint_states"
-    data = path.read_bytes()
-    rng = np.random.default_rng(7)
-    for number in range(40):
-        spoiled = bytearray(data)
-        if number % 2:
-            spoiled = spoiled[: rng.integers(0, len(data))]
-        else:
-            for place in rng.integers(0, len(data), 20):
-                spoiled[place] = rng.integers(0, 256)
-        bad = tmp_path / f"bad{number}.mcap"
-        bad.write_bytes(bytes(spoiled))
-        with suppress(InputError):
-            list(list_logs(bad))
-            read_log(bad / topic)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.cli.main import main
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats import ros_bags
@@ -87,21 +86,6 @@ def test_a_topic_is_a_log(bag):
     assert {"data[0]", "data[1]"} < set(commands.list_columns())
 
 
-def test_a_bag_goes_in_by_one_command(bag, tmp_path):
-    (tmp_path / "arm.xml").write_text(ARM)
-    out = tmp_path / "log.toml"
-    model = str(tmp_path / "arm.xml")
-    assert main(["import", str(bag), "--model", model, "--out", str(out)]) == 0
-    text = out.read_text()
-    assert 'file = "joint_states"\ncolumn = "position.hip"' in text
-    assert 'file = "hardware/position_commands"\ncolumn = "data[0]"' in text
-    assert f'folder = "{bag.name}"' in text
-    assert '[channels."qd.knee"]' in text
-    recording, _ = load_recording(out)
-    assert set(recording.runs[0].channels) == {"q.hip", "q.knee", "qd.hip", "qd.knee"}
-    assert np.isfinite(recording.runs[0].channels["q.hip"]).sum() > 100
-
-
 def test_a_file_of_a_bag_alone_is_a_bag(tmp_path):
     folder = written(tmp_path / "run", "mcap")
     (file,) = folder.glob("*.mcap")
@@ -121,28 +105,6 @@ def test_what_is_no_topic_of_numbers_is_one_line(bag, topic, message):
         read_log(bag / topic if topic else bag)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_a_bag_that_is_cut_or_spoiled_is_one_line_or_read(tmp_path, seed):
-    rng = np.random.default_rng(seed)
-    storage = ("mcap", "db3", "bag")[seed % 3]
-    whole = written(tmp_path / f"run.{storage}", storage)
-    file = whole if storage == "bag" else next(whole.glob(f"*.{storage}"))
-    raw = bytearray(file.read_bytes())
-    if seed % 2:
-        raw = raw[: int(rng.integers(len(raw)))]
-    else:
-        for place in rng.integers(len(raw), size=20):
-            raw[place] = int(rng.integers(256))
-    file.write_bytes(raw)
-    said = f"{whole}: "
-    try:
-        read_log(whole / "joint_states")
-    except InputError as error:
-        said = str(error)
-    assert said.startswith(str(whole))
-    assert "\n" not in said
 
 
 def test_what_is_not_wanted_is_not_kept(tmp_path):

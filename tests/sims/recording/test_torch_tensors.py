@@ -6,16 +6,12 @@ import subprocess
 import sys
 import zipfile
 from collections import OrderedDict
-from contextlib import suppress
 
 import numpy as np
 import pytest
 
-import simgap
-from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats.log_files import read_log
-from tests.sims.recording.test_ros_bags import ARM
 
 torch = pytest.importorskip("torch")
 
@@ -51,14 +47,10 @@ def test_containers_and_other_objects(tmp_path):
     assert read_log(saved(tmp_path / "one.pt", torch.ones(4))).list_columns() == ["tensor"]
 
 
-def test_a_log_of_tensors_is_imported_without_torch(tmp_path):
-    (tmp_path / "arm.xml").write_text(ARM)
+def test_a_log_of_tensors_is_read_without_torch(tmp_path):
     content = {"time": torch.tensor(TIMES), "q": torch.tensor(Q[:, ::-1].copy()),
                "joint_names": ["knee", "hip"]}  # fmt: skip
     saved(tmp_path / "log.pt", content)
-    simgap.import_logs([tmp_path / "log.pt"], tmp_path / "arm.xml", tmp_path / "log.toml")
-    recording, _ = load_recording(tmp_path / "log.toml", divide=False)
-    np.testing.assert_allclose(recording.runs[0].channels["q.hip"], Q[:, 0])
     code = f"""import sys
 from sims.recording.log_formats.log_files import read_log
 assert read_log({str(tmp_path / "log.pt")!r}).list_columns() == ["time", "q.knee", "q.hip"]
@@ -77,20 +69,9 @@ def test_nothing_is_unpickled(tmp_path):
 
 
 def test_what_is_no_archive_is_one_line(tmp_path):
-    path = saved(tmp_path / "log.pt", {"q": torch.ones(300, 2)})
     old = saved(tmp_path / "old.pt", {"q": torch.ones(3)}, _use_new_zipfile_serialization=False)
     with pytest.raises(InputError, match=r"old.pt: expected a PyTorch file as a zip archive"):
         read_log(old)
-    rng = np.random.default_rng(0)
-    data = path.read_bytes()
-    for _ in range(200):
-        spoilt = bytearray(data)
-        for place in rng.integers(0, len(data), 3):
-            spoilt[place] = rng.integers(0, 256)
-        (tmp_path / "bad.pt").write_bytes(bytes(spoilt))
-        # Any other exception fails the test.
-        with suppress(InputError):
-            read_log(tmp_path / "bad.pt")
     with zipfile.ZipFile(tmp_path / "many.pt", "w") as archive:
         # Lists nested a hundred times at each level: a small file that is endless when expanded.
         inner = b"](" + b"K\x01" * 2 + b"e"
