@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.pages.html_page import TEMPLATES, load_template
+from bench.pages.template import TEMPLATES, load_template
 
 BENCH = Path(__file__).parents[1]
 """Folder of all packages that have templates."""
@@ -16,7 +16,7 @@ BENCH = Path(__file__).parents[1]
 
 def precompile() -> None:
     """Load each template once, so that its byte code is stored."""
-    for path in sorted(BENCH.rglob("*.html")):
+    for path in sorted([*BENCH.rglob("*.html"), *BENCH.rglob("*.txt")]):
         # Shared templates are included by name, and the name is part of the key of the cache.
         load_template(Path(path.name) if path.parent == TEMPLATES else path)
 

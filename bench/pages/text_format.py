@@ -83,6 +83,16 @@ def format_number(value: float | None, digits: int = 3) -> str:
     return _format_sign(text) + _format_power(exponent)
 
 
+def format_significant(value: float | None, digits: int = 3) -> str:
+    """Format a number for a terminal, such as ``2.2e-04``; a hyphen for None.
+
+    Args:
+        value: Number.
+        digits: Number of significant digits.
+    """
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
 def format_estimate(value: float, low: float | None, high: float | None) -> str:
     """Format an estimate with interval, e.g. ``0.00333 (0.00330 to 0.00336)``.
 

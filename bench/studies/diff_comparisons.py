@@ -29,11 +29,9 @@ from bench.studies.diff_explanations import (
     FAMILYWISE_ERROR_RATE,
     describe_side,
     find_changes,
-    format_changes,
-    format_number,
+    format_diff,
     select_relevant_environment,
 )
-from sims.core.plain_values import align_columns
 from sims.core.simulator import Array, InputError
 
 COMPARED_SIMULATION_COUNTS = (3, 10)
@@ -275,19 +273,19 @@ class ComparisonDiff:
                 ]
                 yield float(failure_shares[0]), float(failure_shares[1])
 
-    def _format_status_changes(self) -> Iterator[str]:
-        """Yield changed status counts as text lines.
+    def _list_shown_statuses(self) -> list[dict[str, Any]]:
+        """List the changed status counts that are printed.
 
         Counts other than failures are included only if both comparisons have the same number of
         runs of the tuner.
         """
         runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
-        for change in self.statuses:
-            tuner = change["tuner"]
-            if change["status"] in FAILED_OR_SKIPPED_STATUSES or runs[0].get(tuner) == runs[1].get(
-                tuner
-            ):
-                yield f"{tuner}: {change['status']} {change['a']} -> {change['b']}"
+        return [
+            change
+            for change in self.statuses
+            if change["status"] in FAILED_OR_SKIPPED_STATUSES
+            or runs[0].get(change["tuner"]) == runs[1].get(change["tuner"])
+        ]
 
     @cached_property
     def notes(self) -> list[str]:
@@ -341,52 +339,21 @@ class ComparisonDiff:
             "notes": self.notes,
         }
 
-    def format_lines(self) -> Iterator[str]:
+    def format_lines(self) -> list[str]:
         """Format the differences as text lines.
 
         The table has the significant lines and those after all simulations; changed statuses,
         tuners, settings and notes follow.
         """
         document = self.to_document()
-        head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
-        yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"
-        table_rows = [head]
-        error_rows: list[dict[str, Any]] = document["errors"]
-        max_simulations = max((row["simulations"] for row in error_rows), default=0)
-        listed_rows = [
-            row for row in error_rows if row["significant"] or row["simulations"] == max_simulations
-        ]
-        for row in listed_rows:
-            change_text = (
-                "" if not row["significant"] else "WORSE" if row["ratio"] > 1 else "better"
-            )
-            table_rows.append(
-                (
-                    row["range"],
-                    row["tuner"],
-                    change_text,
-                    str(row["simulations"]),
-                    format_number(row["median_a"]),
-                    format_number(row["median_b"]),
-                    format_number(row["ratio"]),
-                    f"{row['targets']}{'' if row['paired'] else ' not paired'}",
-                    format_number(row["p_holm"]),
-                )
-            )
-        yield from align_columns(table_rows, 3)
-        if len(error_rows) > len(listed_rows):
-            count = len(error_rows) - len(listed_rows)
-            yield f"({count} more lines without a significant difference; --json has all)"
-        yield from self._format_status_changes()
-        for name, tuners in self.unshared_tuners.items():
-            if tuners:
-                yield f"only in {name}: {', '.join(tuners)}"
-        for section in ("configuration", "environment"):
-            if document[section]:
-                yield f"{section}, a -> b"
-                yield from format_changes(document[section])
-        yield from (f"note: {note}" for note in self.notes)
-        yield "something has changed" if self.has_changed else "nothing has changed significantly"
+        rows = document["errors"]
+        last = max((row["simulations"] for row in rows), default=0)
+        return format_diff(
+            document,
+            metric=self.metric,
+            listed=[row for row in rows if row["significant"] or row["simulations"] == last],
+            shown_statuses=self._list_shown_statuses(),
+        )
 
     def to_table(self) -> pd.DataFrame:
         """Return the table for a CSV file."""

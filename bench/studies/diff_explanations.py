@@ -9,7 +9,7 @@ is conservative. Holm's correction is over all numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,12 +21,13 @@ import pandas as pd
 from bench.benchmark.statistics.paired_tests import correct_holm
 from bench.benchmark.storage.provenance import read_environment
 from bench.diagnosis.verdict import Verdict
+from bench.pages.template import render_text
 from bench.studies.explanation_verification import EXTENDED_MODEL_FILE, read_verdict
-from sims.core.plain_values import align_columns
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
 
+_TEMPLATE = Path(__file__).with_name("diff.txt")
 FAMILYWISE_ERROR_RATE = 0.05
 """Familywise error rate: probability of any false alarm among all comparisons."""
 _MAX_CHANGES = 12
@@ -91,31 +92,15 @@ def describe_side(folder: Any, name: str, environment: Mapping[str, Any]) -> dic
     }
 
 
-def format_changes(changes: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Format changes as text lines, at most `_MAX_CHANGES` of them.
+def format_diff(document: Mapping[str, Any], **values: Any) -> list[str]:
+    """Format a document of the schema ``diff`` as text lines.
 
     Args:
-        changes: the changes.
+        document: differences between two comparisons or two explanations.
+        **values: further values of the template.
     """
-    lines = [
-        f"  {change['what']}: {_shorten_text(change['a'])} -> {_shorten_text(change['b'])}"
-        for change in changes
-    ]
-    remaining_count = len(lines) - _MAX_CHANGES
-    return [
-        *lines[:_MAX_CHANGES],
-        *([f"  and {remaining_count} more (--json has all)"] if remaining_count > 0 else []),
-    ]
-
-
-def _shorten_text(value: Any) -> str:
-    text = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def format_number(value: float | None) -> str:
-    """Format a number with three digits; None as a dash."""
-    return "-" if value is None else f"{value:.3g}"
+    changes: dict[str, Any] = {"configuration": (), "environment": (), "settings": ()}
+    return render_text(_TEMPLATE, **{**changes, **document, **values}, max_changes=_MAX_CHANGES)
 
 
 _MAX_COMPARED_CANDIDATES = 5
@@ -323,45 +308,13 @@ class ExplanationDiff:
             "notes": self.notes,
         }
 
-    def format_lines(self) -> Iterator[str]:
+    def format_lines(self) -> list[str]:
         """Format the differences as text lines.
 
         The lines have the verdict, causes, fitted numbers, held-out errors, ranks of candidates,
         settings and notes.
         """
-        document = self.to_document()
-        words = document["verdict"]
-        is_same = words["a"] == words["b"]
-        yield f"verdict: {words['a']}" + ("" if is_same else f" -> {words['b']}")
-        for cause in self.causes:
-            role_a, role_b = cause["in_a"], cause["in_b"]
-            places = f"{role_a} in both" if role_a == role_b else f"{role_a} -> {role_b}"
-            label = "cause" if "cause" in (role_a, role_b) else "     "
-            yield f"{label} {cause['effect']}: {places}"
-        rows = [("number", "unit", "", "a", "95 %", "b", "95 %")]
-        for row in (*document["coefficients"], *document["parameters"]):
-            mark = "MOVED" if row["significant"] else ""
-            cells = [
-                format_number(row["a"]),
-                _format_interval(row, "a"),
-                format_number(row["b"]),
-                _format_interval(row, "b"),
-            ]
-            rows.append((row["name"], row["unit"], mark, *cells))
-        yield from align_columns(rows, 3)
-        for row in document["heldout"]:
-            if row["a"] is not None or row["b"] is not None:
-                change = f"{format_number(row['a'])} -> {format_number(row['b'])}"
-                yield f"held-out {row['name']}: {change}"
-        for row in document["candidates"]:
-            if row["rank_a"] != row["rank_b"]:
-                ranks = f"{row['rank_a'] or 'none'} -> {row['rank_b'] or 'none'}"
-                yield f"candidate {row['effect']}: rank {ranks}"
-        if document["settings"]:
-            yield "settings, a -> b"
-            yield from format_changes(document["settings"])
-        yield from (f"note: {note}" for note in self.notes)
-        yield "something has changed" if self.has_changed else "nothing has changed significantly"
+        return format_diff(self.to_document())
 
     def to_table(self) -> pd.DataFrame:
         """Return the table for a CSV file."""
@@ -427,8 +380,3 @@ def _compute_p_value(row: Mapping[str, Any]) -> float:
     if spread == 0:
         return 1.0 if difference == 0 else 0.0
     return math.erfc(difference / spread / math.sqrt(2))
-
-
-def _format_interval(row: Mapping[str, Any], mark: str) -> str:
-    low, high = row[f"low_{mark}"], row[f"high_{mark}"]
-    return "" if row[mark] is None else f"{format_number(low)} to {format_number(high)}"
