@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
 from bench.benchmark import best_tuner_summary
 from bench.benchmark.comparison_charts import CHARTS, ComparisonView
@@ -22,7 +21,6 @@ from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL, SIGNIFICANCE
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import TRUSTED_TUNERS_NOTE
-from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
 from bench.pages.text_format import format_number, joined
 
@@ -48,15 +46,6 @@ class ComparisonReportData:
     folder: str
     configuration: str
     missing: int = 0
-
-    def make_static_figure(self, name: str, description: str) -> PrintedFigure | None:
-        """Return the printed version of a figure; None if it was not drawn.
-
-        Args:
-            name: Name of the figure.
-            description: Text description for readers who cannot see it.
-        """
-        return PrintedFigure.from_files(self.pictures, name, description, FIGURE_FILES[name])
 
     def format_rerun_command(self) -> str:
         """Return the command that repeats the comparison."""
@@ -330,17 +319,15 @@ def render_page(results: ComparisonReportData) -> str:
     Returns:
         The page, which needs no other file.
     """
-    view, page = results.view, HtmlPage()
-    for name, table in results.tables.items():
-        if len(table):
-            page.add_table(name, table)
+    view = results.view
+    page = HtmlPage({FIGURE_FILES[name]: files for name, files in results.pictures.items()})
+    page.add_tables(results.tables)
     charts = {
         name: make_chart(view) if name in results.pictures or name == "ert" else None
         for name, make_chart in CHARTS.items()
     }
     for chart in charts.values():
-        for name, table in chart.tables.items() if chart else ():
-            page.add_table(name, table, _DIGITS)
+        page.add_tables(chart.tables if chart else {}, _DIGITS)
     range_results = list_range_results(view)
     rankings = [result.rankings for result in range_results]
     equal_errors = best_tuner_summary.format_error_floor(view.statistics)
@@ -368,12 +355,6 @@ def render_page(results: ComparisonReportData) -> str:
         threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
         stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
         targets_per_training=TARGETS_PER_TRAINING,
+        figure_files=FIGURE_FILES,
         joined=joined,
-        separator=_make_list_separator,
     )
-
-
-def _make_list_separator(loop: object) -> Markup:
-    """Return what follows an item of a list: a comma, ``and``, or nothing after the last one."""
-    remaining = int(getattr(loop, "revindex0", 0))
-    return Markup({0: "", 1: " and "}.get(remaining, ", "))

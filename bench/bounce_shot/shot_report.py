@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -27,7 +26,6 @@ from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.figures import figure_output
 from bench.figures.figure_output import FigureFiles
-from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 
@@ -51,7 +49,7 @@ def render_page(
         pictures: printed figures by name.
     """
     success_panel, success = make_success_panel(lines)
-    page = HtmlPage()
+    page = HtmlPage(pictures)
     page.add_table("table", lines)
     page.add_table("shots", rows, 6)
     page.add_table(success_panel.table, success)
@@ -66,7 +64,6 @@ def render_page(
         has_others=bool(other_rows),
         similar=[row["method"] for row in other_rows if row["high"] >= best["low"]],
         success_panel=success_panel,
-        figure=partial(PrintedFigure.from_files, pictures),
     )
 
 

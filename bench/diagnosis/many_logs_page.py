@@ -7,20 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
 from bench.diagnosis import many_logs
 from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult
-from bench.diagnosis.report.effect_and_unit_text import (
-    format_effect_name,
-    format_sentence,
-    joined,
-)
+from bench.diagnosis.report import effect_and_unit_text
 from bench.figures import figure_output, style
 from bench.figures.style import add_caption, break_name
-from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 from bench.pages.chart_figure import draw_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
@@ -41,7 +38,6 @@ _TITLE_LINE = 34
 """Maximum line length of a panel's title, in characters."""
 _NAME_HEIGHT = 0.3
 """Height of a log in the printed figures, in inches."""
-_VERDICT_ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
 _BEFORE = style.make_mark_style(style.VERMILION, (), "s")
 _AFTER = style.make_mark_style(style.BLUE, (), "o")
 
@@ -100,78 +96,44 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     number_table = many_logs.build_number_table(rows)
     causes = many_logs.list_common_causes(rows)
     charts = make_summary_charts(logs, number_table)
-    page = HtmlPage()
-    tables = {"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables}
-    for name, table in tables.items():
-        page.add_table(name, table)
-    closed_shares = logs["gap_closed"][logs["causes"] != ""].dropna()
+    printed = {
+        "numbers": (
+            charts.numbers[:MAX_PANELS],
+            "Point: the value from one log. Bar: its 95 % interval.",
+        ),
+        "held-out": (
+            charts.held_out,
+            "Dashed: the noise floor, the best that any model can reach.",
+        ),
+    }
+    page = HtmlPage(
+        {
+            name: figure_output.render_all_formats(
+                draw_summary_figure(panels, charts.tables, caption)
+            )
+            for name, (panels, caption) in printed.items()
+            if panels
+        }
+    )
+    page.add_tables({"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables})
     return page.render(
         _TEMPLATE,
         rows=rows,
         batch=batch,
         table_file=LOGS_TABLE_FILE,
-        verdicts=_format_verdicts(rows),
+        verdicts=Counter(row.verdict for row in rows if row.verdict),
         causes=causes,
         first_recordings=[batch.recordings[log] for cause in causes[:1] for log in cause.logs],
-        cause_text=_format_cause_text,
-        closed=_ClosedShare(
-            closed_shares.median(), closed_shares.min(), closed_shares.max(), len(closed_shares)
-        )
-        if len(closed_shares)
-        else None,
+        closed=sorted(logs["gap_closed"][logs["causes"] != ""].dropna()),
         failed=[row for row in rows if row.error],
         is_numbered=not charts.has_names,
         number_panels=charts.numbers,
-        number_figure=_make_printed_figure(
-            charts.numbers[:MAX_PANELS],
-            charts.tables,
-            "numbers",
-            "Each number of the causes over the logs.",
-            "Point: the value from one log. Bar: its 95 % interval.",
-        ),
         held_out_panels=charts.held_out,
-        held_out_figure=_make_printed_figure(
-            charts.held_out,
-            charts.tables,
-            "held-out",
-            "Error on held-out runs of each log before and after, in noise floors.",
-            "Dashed: the noise floor, the best that any model can reach.",
-        ),
+        wording=effect_and_unit_text,
+        median=median,
         MAX_NAMED=MAX_NAMED,
         MAX_PANELS=MAX_PANELS,
     )
-
-
-class _ClosedShare(NamedTuple):
-    """Share of the gap that the causes close: median and range, and the number of logs."""
-
-    median: float
-    low: float
-    high: float
-    log_count: int
-
-
-def _format_verdicts(rows: Sequence[LogResult]) -> str:
-    """Count the logs with each verdict in words, for example "2 adequate, 1 unknown".
-
-    Logs that could not be explained have no verdict; they are counted at the end.
-    """
-    counts = Counter(row.verdict for row in rows if row.verdict)
-    ordered_verdicts = [
-        *_VERDICT_ORDER,
-        *(verdict for verdict in counts if verdict not in _VERDICT_ORDER),
-    ]
-    parts = [f"{counts[verdict]} {verdict}" for verdict in ordered_verdicts if counts[verdict]]
-    failed = sum(1 for row in rows if row.error)
-    if failed:
-        parts.append(f"{failed} could not be explained")
-    return joined(parts)
-
-
-def _format_cause_text(name: str) -> str:
-    """Format the effects of a cause in words, as the beginning of a sentence."""
-    text = joined([format_effect_name(part) for part in name.split(" or ")], "or")
-    return format_sentence(text)[:-1]
 
 
 class SummaryCharts(NamedTuple):
@@ -301,25 +263,3 @@ def draw_summary_figure(
         figure.legend(*entries, loc="outside upper center", fontsize=8, frameon=False)
     add_caption(figure, caption, letters=17)
     return figure
-
-
-def _make_printed_figure(
-    panels: Sequence[Panel],
-    tables: Mapping[str, pd.DataFrame],
-    name: str,
-    alternative: str,
-    caption: str,
-) -> PrintedFigure | None:
-    """Render the printed version of a chart; None without panels.
-
-    Args:
-        panels: panels of the chart.
-        tables: their tables by name.
-        name: name of the figure's file.
-        alternative: text for readers who cannot see the figure.
-        caption: text below the figure.
-    """
-    if not panels:
-        return None
-    files = figure_output.render_all_formats(draw_summary_figure(panels, tables, caption))
-    return PrintedFigure(files.svg, files.pdf, alternative, name)

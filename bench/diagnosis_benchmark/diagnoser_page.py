@@ -29,7 +29,7 @@ from bench.figures.style import (
     get_mark_style,
     make_mark_style,
 )
-from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 from bench.pages.html_page import HtmlPage
 from bench.pages.text_format import format_p_value, format_percent, sanitise
 from sims.core.plain_values import format_count
@@ -133,15 +133,6 @@ class DiagnoserReportData:
             for name, line_style in self.get_line_styles()
             if name in names_in_table
         )
-
-    def make_static_figure(self, name: str, description: str) -> PrintedFigure | None:
-        """Return the printed version of a figure, or None if the figure was not drawn.
-
-        Args:
-            name: name of the figure.
-            description: text alternative for readers who cannot see the figure.
-        """
-        return PrintedFigure.from_files(self.pictures, name, description)
 
 
 _SHARE_METRICS = {
@@ -506,13 +497,11 @@ def render_page(data: DiagnoserReportData) -> str:
     Args:
         data: graded answers and result tables of all diagnosers.
     """
-    page = HtmlPage()
+    page = HtmlPage(data.pictures)
     failures = build_failure_table(data.rows, data.order)
     tables = {**data.tables, "failures": failures, "items": data.rows}
     tables |= build_chart_tables(data)
-    for name, table in tables.items():
-        if len(table):
-            page.add_table(name, table, _DIGITS)
+    page.add_tables(tables, _DIGITS)
     groups, confusion, costs = (data.tables[name] for name in ("groups", "confusion", "costs"))
     metrics = list(dict.fromkeys(groups["metric"]))
     confused = list(dict.fromkeys(confusion["diagnoser"]))

@@ -162,11 +162,20 @@ def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
 
 
 class FigureFiles(NamedTuple):
-    """One figure as the bytes of its files; `render_pdf` is None if no PDF is requested."""
+    """One figure as the bytes of its files.
+
+    Attributes:
+        png: PNG file; empty if only a page shows the figure.
+        svg: SVG file; None if the page shows the PNG.
+        pdf: PDF file; None if none was requested.
+        joint_positions: For a drawing of a robot, joints with their positions as fractions of width
+            and height from the top left.
+    """
 
     png: bytes
-    svg: bytes
+    svg: bytes | None = None
     pdf: bytes | None = None
+    joint_positions: tuple[tuple[str, float, float], ...] = ()
 
 
 def _render_pdf_if_wanted(figure: Figure) -> bytes | None:

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from bench.figures.figure_output import FigureFiles
 from bench.figures.style import MarkStyle
 
 Scale = Literal["linear", "log", "symlog"]
@@ -170,21 +169,6 @@ class PrintedFigure:
     pdf: bytes | None
     alternative: str
     file: str
-
-    @classmethod
-    def from_files(
-        cls, figures: Mapping[str, FigureFiles], name: str, alternative: str, file: str = ""
-    ) -> PrintedFigure | None:
-        """Return a figure of a page; None if it was not drawn.
-
-        Args:
-            figures: Drawn figures by name.
-            name: Name of the figure.
-            alternative: Text description for readers who cannot see it.
-            file: Name of its files; empty for the name of the figure.
-        """
-        figure = figures.get(name)
-        return figure and cls(figure.svg, figure.pdf, alternative, file or name)
 
     @property
     def kind(self) -> str:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
+from bench.figures.figure_output import FigureFiles
 from bench.pages.chart import Chart, Panel, PrintedFigure
 from bench.pages.page_table import INITIAL_ROWS, DataGrid, GridColumn, Table, select_initial_rows
 from bench.pages.template import load_template
@@ -36,16 +37,18 @@ _SCRIPTS = (
 class HtmlPage:
     """A page whose template asks it for sections, charts, figures and grids."""
 
-    def __init__(self, style: str = "") -> None:
+    def __init__(self, figures: Mapping[str, FigureFiles] | None = None, style: str = "") -> None:
         """Start an empty page; rendering the template adds its sections, charts and grids.
 
         `_tables` has each table as CSV text for the browser, `_frames` the tables from which the
         rows of grids are selected, and `_parts` the macros of the template `parts.html`.
 
         Args:
+            figures: Drawn figures by the name of their files.
             style: CSS rules in addition to those of every page.
         """
         self._own_style = style
+        self._figures = figures or {}
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}
         self._frames: dict[str, pd.DataFrame | Table] = {}
@@ -64,6 +67,24 @@ class HtmlPage:
         self._frames[name] = frame
         number_format = None if digits is None else f"%.{digits}g"
         self._tables[name] = frame.to_csv(index=False, float_format=number_format)
+
+    def add_tables(
+        self, tables: Mapping[str, pd.DataFrame | Table], digits: int | None = None
+    ) -> None:
+        """Add the tables that have rows; `digits` is that of `add_table`."""
+        for name, frame in tables.items():
+            if len(frame):
+                self.add_table(name, frame, digits)
+
+    def printed_figure(self, name: str, alternative: str) -> PrintedFigure | None:
+        """Return a drawn figure; None if it was not drawn.
+
+        Args:
+            name: Name of its files without extension.
+            alternative: Text description for readers who cannot see it.
+        """
+        files = self._figures.get(name)
+        return files and PrintedFigure(files.svg or files.png, files.pdf, alternative, name)
 
     def section(self, name: str, heading: str, caller: Callable[[], Markup]) -> Markup:
         """Return a section, and add it to the navigation; empty without content.

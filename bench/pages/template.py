@@ -13,6 +13,7 @@ from base64 import b64encode
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,12 @@ from jinja2.bccache import Bucket, FileSystemBytecodeCache
 from markupsafe import Markup, escape
 
 from bench.pages.text_format import (
+    append_unit,
     format_number,
     format_p_value,
     format_percent,
     format_significant,
+    format_unit,
     joined,
     sanitise,
 )
@@ -87,6 +90,7 @@ def _get_environment(is_html: bool = True) -> Environment:
         undefined=StrictUndefined,
     )
     environment.filters |= {
+        "call": lambda value, function: function(value),
         "base64": lambda data: Markup(b64encode(data).decode("ascii")),
         "columns": align_cells,
         "count": format_count,
@@ -99,8 +103,26 @@ def _get_environment(is_html: bool = True) -> Environment:
         "shell": quote_words,
         "short": sanitise,
         "significant": format_significant,
+        "unit": format_unit,
+        "with_unit": append_unit,
     }
+    environment.tests["finite"] = is_finite
+    environment.globals["separator"] = _make_list_separator
     return environment
+
+
+def is_finite(value: float | None) -> bool:
+    """Return whether a value is a finite number."""
+    return value is not None and isfinite(value)
+
+
+def _make_list_separator(loop: Any) -> Markup:
+    """Return the separator after a name of a list, such as ``a, b and c``.
+
+    Args:
+        loop: Jinja2's loop over the names.
+    """
+    return Markup({0: "", 1: " and "}.get(loop.revindex0, ", "))
 
 
 def _read_template(name: str) -> str:

@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterable, Sequence
 from math import floor, isfinite, log10
 
+from sims.core import plain_values
 from sims.core.plain_values import SUPERSCRIPT_DIGITS
 
 _MIN_EXPONENT = -300
@@ -116,6 +117,16 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
         texts.append(_format_sign(digits) + _format_power(exponent))
     middle, left, right = texts
     return f"{middle} ({left} to {right})"
+
+
+def format_unit(unit: str) -> str:
+    """Format a unit from a file, such as ``kg·m²``; empty for a pure number."""
+    return plain_values.format_unit(sanitise(unit, 60))
+
+
+def append_unit(text: str, unit: str) -> str:
+    """Append a unit from a file to a number; a pure number has none."""
+    return plain_values.append_unit(text, sanitise(unit, 60))
 
 
 def format_percent(share: float | None) -> str:

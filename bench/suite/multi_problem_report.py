@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,7 +42,7 @@ from bench.figures.style import (
     finish_figure,
     get_mark_style,
 )
-from bench.pages.chart import Axis, Panel, PrintedFigure, Series
+from bench.pages.chart import Axis, Panel, Series
 from bench.pages.chart_figure import draw_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
@@ -405,10 +405,8 @@ def render_multi_problem_page(
         pictures: printed figures by name.
         command: words of the command that makes the page.
     """
-    page = HtmlPage()
-    for name in ("ranks", "ert", "pairs"):
-        if len(tables[name]):
-            page.add_table(name, tables[name])
+    page = HtmlPage(pictures)
+    page.add_tables({name: tables[name] for name in ("ranks", "ert", "pairs")})
     runtime_panel, shares = collection.make_runtime_panel()
     page.add_table(runtime_panel.table, shares, _DIGITS)
     error_panels, errors = _make_error_panels(collection)
@@ -427,7 +425,6 @@ def render_multi_problem_page(
         _TEMPLATE,
         tuners=collection.tuners,
         friedman=friedman,
-        figure=partial(PrintedFigure.from_files, pictures),
         command=command,
         problem_count=len(collection.mean_ranks),
         best=best,

@@ -234,7 +234,7 @@ def render_suite_page(tables: SuiteTables) -> str:
     problem, losses of this project's tuners, and all tables.
     """
     suite = tables.suite
-    page = HtmlPage(_STYLESHEET)
+    page = HtmlPage(style=_STYLESHEET)
     frames = {
         "ranks": tables.ranks,
         "pairs": tables.pairs,

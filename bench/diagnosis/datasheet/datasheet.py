@@ -12,20 +12,13 @@ from bench.diagnosis.datasheet.datasheet_content import SheetContent, build_shee
 from bench.diagnosis.datasheet.datasheet_figure import render_diagram, render_pdf
 from bench.diagnosis.datasheet.datasheet_subject import SheetSubject, make_subject
 from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
-from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
 from bench.diagnosis.datasheet.mjcf_class import CLASS_FILE, MjcfFiles, build_mjcf
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.report.effect_and_unit_text import (
-    append_unit,
-    format_fitted_value,
-    format_number,
-    format_sentence,
-    joined,
-)
+from bench.diagnosis.report import effect_and_unit_text
 from bench.diagnosis.verdict import Verdict
+from bench.figures.figure_output import FigureFiles
 from bench.logs.importing.sample_selection import leave_out_settling
 from bench.logs.segmentation import segment_recording
-from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
 from bench.pages.page_table import Table
 from sims import effects as library
@@ -44,9 +37,7 @@ _NAMED_RUNS = 8
 """Maximum number of runs that the footer names."""
 
 
-def render_page(
-    sheet: SheetContent, diagram_files: tuple[bytes, bytes | None] | None, mjcf: MjcfFiles
-) -> str:
+def render_page(sheet: SheetContent, diagram: FigureFiles | None, mjcf: MjcfFiles) -> str:
     """Render the HTML datasheet of an explained simulator.
 
     The page has the numbers with their evidence, detection limits of absent effects, the drive
@@ -54,15 +45,11 @@ def render_page(
 
     Args:
         sheet: Content of the data sheet.
-        diagram_files: Diagram as SVG, and as PDF if requested; None without a drive.
+        diagram: Diagram as SVG, and as PDF if requested; None without a drive.
         mjcf: MJCF files with their notes.
     """
-    page, printed_figure = HtmlPage(), None
-    if sheet.diagram is not None and diagram_files is not None:
-        image, pdf = diagram_files
-        printed_figure = PrintedFigure(
-            image, pdf, alternative=_describe_rest_forces(sheet.diagram), file=DIAGRAM_NAME
-        )
+    page = HtmlPage({DIAGRAM_NAME: diagram} if diagram else None)
+    if sheet.diagram is not None:
         columns = {
             "load": sheet.diagram.load.tolist(),
             "moves_forward": sheet.diagram.forward.tolist(),
@@ -72,40 +59,15 @@ def render_page(
     return page.render(
         _TEMPLATE,
         sheet=sheet,
-        still=printed_figure,
+        has_diagram=diagram is not None,
         runs=format_run_names([run.name for run in sheet.recording.training()], _NAMED_RUNS),
-        elsewhere=joined(list(sheet.elsewhere())),
+        elsewhere=list(sheet.elsewhere()),
         class_file=CLASS_FILE,
         class_text=mjcf.contents.get(CLASS_FILE, ""),
         notes=mjcf.notes,
-        format_confounding=datasheet_content.format_confounding,
-        format_detection_limit=datasheet_content.format_detection_limit,
-        format_evidence=datasheet_content.format_evidence,
-        format_fitted_value=format_fitted_value,
-        format_name=datasheet_content.format_name,
-        format_prediction_interval=datasheet_content.format_prediction_interval,
-        part=datasheet_content.title,
-        sentence=format_sentence,
-        with_unit=append_unit,
+        content=datasheet_content,
+        wording=effect_and_unit_text,
     )
-
-
-def _describe_rest_forces(diagram: DriveDiagram) -> str:
-    """Describe the forces at which a joint at rest starts to move, in sentences.
-
-    Args:
-        diagram: Drive diagram; its back-drive load is infinite if the joint is self-locking.
-    """
-    starts = append_unit(format_number(diagram.breakaway), diagram.unit)
-    text = f"At rest and without a load, the joint starts to move at {starts}. "
-    if diagram.backdrive < float("inf"):
-        load = append_unit(format_number(diagram.backdrive), diagram.unit)
-        text += f"Without power, a load of {load} moves it back."
-    else:
-        text += "Without power, no load moves it: it is self-locking."
-    if diagram.without:
-        text += f" Not included, because they have an internal state: {', '.join(diagram.without)}."
-    return text
 
 
 TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility"})

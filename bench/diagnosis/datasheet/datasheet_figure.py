@@ -75,13 +75,13 @@ _FOOT_HEIGHT = 0.045
 """Height of the foot of the page, which no table overlaps, as a share of the page."""
 
 
-def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
+def render_diagram(diagram: DriveDiagram) -> figure_output.FigureFiles:
     """Render the diagram as SVG for the page, and as PDF if requested."""
     with style.apply_settings(STYLE):
         figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
         draw_diagram(axes[0, 0], diagram)
         pdf = figure_output.render_pdf(figure) if is_pdf_wanted() else None
-        return figure_output.render_svg(figure), pdf
+        return figure_output.FigureFiles(b"", figure_output.render_svg(figure), pdf)
 
 
 def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:

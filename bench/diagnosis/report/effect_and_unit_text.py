@@ -5,16 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from bench.pages.text_format import append_unit as append_unit
 from bench.pages.text_format import format_estimate as format_estimate
 from bench.pages.text_format import format_number as format_number
 from bench.pages.text_format import format_p_value as format_p_value
 from bench.pages.text_format import format_percent as format_percent
+from bench.pages.text_format import format_unit as format_unit
 from bench.pages.text_format import joined as joined
 from bench.pages.text_format import sanitise as sanitise
 from sims import effects
 
 # All text functions of explain's pages are imported from this module, including the shared ones.
-from sims.core import plain_values
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 
@@ -156,11 +157,6 @@ def format_sentence(text: object) -> str:
     return first + sanitised_text[1:] + stop
 
 
-def format_unit(unit: str) -> str:
-    """Format a unit from a file for print, such as ``kg·m²``; empty for a pure number."""
-    return plain_values.format_unit(sanitise(unit, 60))
-
-
 def format_label(name: str, unit: str, max_length: int = 30) -> str:
     """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
 
@@ -174,16 +170,6 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
         if format_unit(unit)
         else sanitise(name, max_length)
     )
-
-
-def append_unit(text: str, unit: str) -> str:
-    """Append a unit to a number.
-
-    Args:
-        text: the number.
-        unit: its unit, which may come from a user's file.
-    """
-    return plain_values.append_unit(text, sanitise(unit, 60))
 
 
 def format_fitted_value(fitted: FittedValue) -> str:

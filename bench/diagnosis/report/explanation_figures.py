@@ -44,6 +44,7 @@ from bench.diagnosis.report.joint_figure import draw_run_figure
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
 from bench.figures import figure_output
+from bench.figures.figure_output import FigureFiles
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
 from bench.figures.style import (
@@ -491,24 +492,7 @@ def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     return figure
 
 
-class RenderedFigure(NamedTuple):
-    """Rendered figure as the bytes of its files.
-
-    Attributes:
-        png: PNG file.
-        pdf: PDF file; None if no PDF is requested.
-        svg: SVG file; None if no PDF is requested.
-        joint_positions: For a robot, its joints: name, and position as shares of width and height
-            from the upper left corner.
-    """
-
-    png: bytes
-    pdf: bytes | None
-    svg: bytes | None
-    joint_positions: tuple[tuple[str, float, float], ...] = ()
-
-
-def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
+def render_figures(report: DiagnosisReportData) -> dict[str, FigureFiles]:
     """Draw all figures and render their files, by name.
 
     Args:
@@ -523,18 +507,12 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
         rendered = {}
         for name, figure in figures.items():
             png, pdf = figure_output.render_png_and_pdf(figure, DPI)
-            rendered[name] = RenderedFigure(
-                png, pdf, figure_output.render_svg(figure) if is_pdf_wanted() else None
-            )
+            svg = figure_output.render_svg(figure) if is_pdf_wanted() else None
+            rendered[name] = FigureFiles(png, svg, pdf)
         # The page highlights joints on the drawing of the robot, so it needs their positions.
         if report.robot is not None and "robot" in rendered:
-            positions = tuple(
-                compute_joint_positions(
-                    figures["robot"],
-                    report.robot,
-                    get_extreme_pose(report, select_worst_run(report)),
-                )
-            )
+            pose = get_extreme_pose(report, select_worst_run(report))
+            positions = tuple(compute_joint_positions(figures["robot"], report.robot, pose))
             rendered["robot"] = rendered["robot"]._replace(joint_positions=positions)
         return rendered
 

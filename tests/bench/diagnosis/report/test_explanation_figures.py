@@ -38,7 +38,7 @@ def named():
 
 def test_each_figure_is_there_in_every_format_and_shows_something(named):
     assert list(named) == NAMES
-    for png, pdf, svg, spots in named.values():
+    for png, svg, pdf, spots in named.values():
         assert svg.startswith(b"<?xml")
         assert spots == ()
         assert pdf.startswith(b"%PDF-")
@@ -62,7 +62,7 @@ def test_before_and_after_are_both_drawn_where_there_is_an_after(named):
 
 
 def test_without_being_asked_there_are_no_vector_graphics():
-    for png, pdf, svg, _ in render_figures(make_report()).values():
+    for png, svg, pdf, _ in render_figures(make_report()).values():
         assert png.startswith(b"\x89PNG")
         assert pdf is svg is None
 

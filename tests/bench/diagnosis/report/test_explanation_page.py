@@ -12,8 +12,8 @@ import pytest
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.pipeline.report_data_builder import _read_track_figure
-from bench.diagnosis.report.explanation_figures import RenderedFigure
 from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
+from bench.figures.figure_output import FigureFiles
 from bench.pages.html_page import make_iframe
 from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
@@ -25,7 +25,7 @@ SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
 def make_rendered_figure(name):
     """Return placeholder bytes for a rendered figure."""
-    return RenderedFigure(b"\x89PNG\r\n\x1a\n", b"%PDF-" + name.encode(), SVG + name.encode())
+    return FigureFiles(b"\x89PNG\r\n\x1a\n", SVG + name.encode(), b"%PDF-" + name.encode())
 
 
 class Reader(HTMLParser):
