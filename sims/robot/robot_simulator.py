@@ -42,11 +42,8 @@ from sims.robot.dynamics.batch_work import (
     group_by_run,
     list_last_read_times,
 )
-from sims.robot.dynamics.callback_stepping import step_in_callback
-from sims.robot.dynamics.compiled_forces import compile_forces
 from sims.robot.dynamics.drive_limits import compute_off_steps, find_working_servos
 from sims.robot.dynamics.effect_forces import (
-    EffectForces,
     changes_derived_constants,
     compute_time_dependent_forces,
     find_active_elements,
@@ -65,6 +62,8 @@ from sims.robot.dynamics.mujoco_batch import (
 )
 from sims.robot.dynamics.sensor_sampling import DriveSensorModel, sample_readings
 from sims.robot.dynamics.series_joints import AddedElements, group_by_added_elements
+from sims.robot.dynamics.step_forces import StepForces
+from sims.robot.dynamics.stepping_with_forces import step_with_forces
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (
@@ -606,30 +605,22 @@ class RobotSimulator(SystemSimulator):
         if self._reads_sensors():
             field_names.append("sensordata")
         field_names = list(dict.fromkeys(field_names))
+        forces = mujoco_batch.map_forces(inputs.forces)
         if is_stepwise:
-            stiffness = mujoco_batch.get_servo_stiffness(joints)[:batch_size]
-            effect_forces = EffectForces(
-                self.robotic, start.acting, inputs.applied_inputs, joints, stiffness, self.time_step
+            servos = mujoco_batch.robot, joints.velocities, inputs.off
+            step_forces = StepForces(
+                self.robotic,
+                start.acting,
+                inputs.applied_inputs,
+                joints,
+                mujoco_batch.get_servo_stiffness(joints)[:batch_size],
+                self.time_step,
+                working=find_working_servos(*servos) if inputs.off.any() else None,
             )
-            forces = mujoco_batch.map_forces(inputs.forces)
-            compiled = recorded_fields = None
-            if inputs.off.any():
-                # Compiled effects assume a constant servo stiffness over all steps.
-                effect_forces.working = find_working_servos(
-                    mujoco_batch.robot, joints.velocities, inputs.off
-                )
-            else:
-                compiled = compile_forces(effect_forces)
-            if compiled is not None:
-                recorded_fields = step_in_callback(
-                    mujoco_batch, inputs.controls, forces, compiled, field_names
-                )
-            if recorded_fields is None:
-                recorded_fields = mujoco_batch.step_with_forces(
-                    inputs.controls, forces, compiled or effect_forces, field_names, inputs.off
-                )
+            recorded_fields = step_with_forces(
+                mujoco_batch, inputs.controls, forces, step_forces, field_names, inputs.off
+            )
         else:
-            forces = mujoco_batch.map_forces(inputs.forces)
             recorded_fields = mujoco_batch.step(inputs.controls, forces, field_names, inputs.off)
         x = np.concatenate(
             [start.x[:, None], recorded_fields["qpos"][:, :, joints.positions]], axis=1

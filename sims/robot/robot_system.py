@@ -52,7 +52,7 @@ class RobotSystem(System):
         gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
         activations: names under which a recording may specify initial activations of filters.
         refused_inputs: reason why a recording cannot contain an input, by input.
-        traced: compiled effects by inputs (`sims.robot.dynamics.compiled_forces`).
+        traced: compiled effects by inputs (`sims.robot.dynamics.step_forces`).
     """
 
     name = "robot"

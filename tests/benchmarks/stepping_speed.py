@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from sims.core.simulator import Scenario
-from sims.engines.compiled import force_program
+from sims.engines.compiled import array_programs
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -76,7 +76,7 @@ def seconds(cls, effects, batch_size, repeats=REPEATS):
     simulator, theta, scenarios = work(cls, effects, batch_size)
     simulator.engine = engine = Noted(simulator.engine)
     best = np.full((2, 2), np.inf)
-    evaluated = mock.patch.object(force_program, "_get_tracer", return_value=None)
+    evaluated = mock.patch.object(array_programs.TracedPrograms, "find", return_value=None)
     for repeat in range(repeats + 1):
         for k, way in enumerate((evaluated, contextlib.nullcontext())):
             with way:

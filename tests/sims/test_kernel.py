@@ -165,7 +165,7 @@ def make_small_arrays():
         divisions=np.ones(2), ground=np.zeros((4, 2)), limits=np.array([np.inf, 0.07]),
         records=np.zeros((2, 3, 3)), steps_per_record=2,
     )  # fmt: skip
-    return program, work, data_layout.allocate_block(7), 8
+    return program, work, data_layout.allocate_block(np.zeros((7, 32))), 8
 
 
 @pytest.mark.parametrize(

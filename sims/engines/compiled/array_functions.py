@@ -28,7 +28,7 @@ HAS_LLVMLITE = importlib.util.find_spec("llvmlite") is not None
 """True if machine code can be loaded; numba may not support this Python version yet."""
 _MAX_COMPILE_SECONDS = 20
 """Approximate compilation time of the batch engine in seconds, the longest one."""
-_PYTHON_MODULES = ("batch_runner.py", "force_program.py", "numpy_forces.py")
+_PYTHON_MODULES = ("array_programs.py", "batch_runner.py", "force_program.py")
 """Source files of this package on which no compiled code depends."""
 _lock = Lock()
 

@@ -16,8 +16,9 @@ from sims.engines.compiled.data_layout import (
     MIN_REMAINING_SHARE,
     RESTITUTION,
     BatchArrays,
+    allocate_block,
 )
-from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
+from sims.engines.compiled.force_program import ForceProgram, get_force_program
 from sims.engines.compiled.kernel import COMPILED, integrate_elements
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
@@ -98,9 +99,7 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     )
 
 
-def _integrate_group(
-    program: ForceProgram | NumpyForceProgram, arrays: BatchArrays, jobs: int
-) -> None:
+def _integrate_group(program: ForceProgram, arrays: BatchArrays, jobs: int) -> None:
     """Integrate elements with equal effects, on several threads if there are enough of them.
 
     Args:
@@ -117,9 +116,9 @@ def _integrate_group(
         The number of slots is at most the number of elements, rounded up to whole SIMD vectors.
         """
         padded_count = -(-len(part.order) // _SIMD_WIDTH) * _SIMD_WIDTH
-        width = min(program.block_width, padded_count)
-        prepared = program.prepare(width)
-        integrate_elements(prepared.arrays, part, prepared.block, width)
+        width = min(program.program.block_width, padded_count)
+        prepared, layout = program.prepare(width)
+        integrate_elements(layout, part, allocate_block(prepared.r), width)
         prepared.raise_error()
 
     # Every thread has its own buffers. No two threads write the same element, and the result of an

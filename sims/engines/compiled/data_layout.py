@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.effect import Effect, Force, Friction
-from sims.core.system import System
 from sims.engines.compiled.traced_array import EXTERNAL
 
 Array = NDArray[Any]
@@ -252,58 +250,11 @@ NO_EVENT, IMPACT, STANDSTILL, BREAK_AWAY = range(4)
 """Event to which a slot's next step leads."""
 
 
-class InputNames(NamedTuple):
-    """Input names and sizes of batch elements, in the order of the parameters.
-
-    Attributes:
-        constants: names of the constants.
-        inputs: names of the inputs.
-        parameters: number of the system's parameters.
-        coordinates: number of coordinates.
-    """
-
-    constants: tuple[str, ...]
-    inputs: tuple[str, ...]
-    parameters: int
-    coordinates: int
-
-
-def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> IntTable:
-    """Return `ProgramArrays.flags`: integers from which compiled code skips what is not needed.
-
-    `system.bends` is true if its own force may change sharply, as with hidden states such as a
-    motor's current. `system.guided` is the number of coordinates, from the first, on which dry
-    friction acts; zero stands for all.
-
-    Args:
-        system: System that is integrated.
-        names: Names and numbers of its coordinates and inputs.
-        effects: Effects that act on it.
-    """
-    has_friction = any(isinstance(effect, Friction) for effect in effects)
-    has_forces = any(isinstance(effect, Force) for effect in effects)
-    friction_coordinate_count = system.guided or names.coordinates
-    # In the order of the constants from DIMENSIONS to HAS_HIDDEN_STATES.
-    flags = (
-        names.coordinates,
-        has_friction,
-        has_forces or system.bends,
-        system.bounces,
-        friction_coordinate_count,
-        system.bends,
-    )
-    return np.array(flags, dtype=np.int64)
-
-
-def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
-    """Allocate the buffers of a block.
-
-    Args:
-        registers: number of registers.
-        width: number of slots.
-    """
+def allocate_block(registers: FloatArray) -> BlockBuffers:
+    """Allocate the buffers of a block with these registers (., W)."""
+    width = registers.shape[1]
     return BlockBuffers(
-        np.zeros((registers, width)),
+        registers,
         np.zeros((NUMBER_ROW_COUNT, width)),
         np.zeros((STATE_ROW_COUNT, width), dtype=np.int64),
     )

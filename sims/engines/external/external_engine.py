@@ -47,7 +47,7 @@ from sims.engines.compiled.data_layout import (
     OUT_LIMIT,
     OUT_MU,
 )
-from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
+from sims.engines.compiled.force_program import ForceProgram, get_force_program
 
 TIME_TOLERANCE = 1e-6
 """Largest deviation of sample times from the engine's steps, as a fraction of an interval.
@@ -75,7 +75,7 @@ class ElementWork(IntegrationBatch):
             recorded.
     """
 
-    program: ForceProgram | NumpyForceProgram
+    program: ForceProgram
     parameters: Array
     recorded_steps: Indices
 
@@ -286,9 +286,8 @@ class ElementForces:
             element: batch element.
             states: number of states that are evaluated in one call.
         """
-        prepared = element.program.prepare(states)
-        rows, flags = prepared.arrays.rows, prepared.arrays.flags
-        r = prepared.block.r
+        prepared, layout = element.program.prepare(states)
+        rows, flags, r = layout.rows, layout.flags, prepared.r
         r[rows[IN_P] : rows[IN_E]] = element.parameters[:, None]
         compute_constants, self._run_moment, self._run_impact = prepared.make_runners()
         # Single numbers are read and written much faster by a memory view than by an array.
@@ -296,7 +295,7 @@ class ElementForces:
         offsets = (rows * states).tolist()
         self._t, self._x, self._v, self._u = (offsets[k] for k in (IN_T, IN_X, IN_V, IN_U))
         self._e, self._mu, self._speed = (offsets[k] for k in (IN_E, IN_MU, IN_SPEED))
-        self._force = (prepared.arrays.out * states).tolist()
+        self._force = (layout.out * states).tolist()
         self._limit = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
         self._impact = offsets[OUT_E], offsets[OUT_MU]
         self._states = states

@@ -10,12 +10,9 @@ from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState
 from sims.core.simulator import Array
 from sims.robot.dynamics.midpoint_state import (
     IndexArray,
-    JointStates,
     Mask,
     advance_state,
-    predict_midpoint,
 )
-from sims.robot.dynamics.mujoco_batch import JointAddresses
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places.effect_places import SHARED_ACTUATOR_EFFECTS
@@ -101,140 +98,6 @@ def compute_time_dependent_forces(
             coefficients = np.repeat(c[:, batch_index : batch_index + 1], t.size, axis=1)
             forces[batch_index] += effect.force(coefficients, snapshots)
     return forces
-
-
-class EffectForces:
-    """State-dependent effect forces on a batch.
-
-    Attributes:
-        has_dry_friction: (L, D) whether an effect adds dry friction.
-        loaded: (L,) whether an effect depends on the loads of transmissions.
-        system: system of the robot.
-        applied_inputs: applied inputs (L, S) by name.
-        addresses: addresses of the joints.
-        stiffness: (L, D) stiffness of the position servos.
-        step: step length in seconds.
-        forces: effects with a force, with their coefficients (K, L, 1).
-        frictions: effects with dry friction, with their coefficients.
-        hidden: effects with hidden states, with their coefficients.
-        working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all are
-            on.
-    """
-
-    def __init__(
-        self,
-        system: RobotSystem,
-        acting: ActiveEffects,
-        applied_inputs: Mapping[str, Array],
-        addresses: JointAddresses,
-        stiffness: Array,
-        step: float,
-    ) -> None:
-        """Sort the effects into forces, dry frictions and effects with hidden states.
-
-        Left out are effects that a batch handles otherwise: those written into model
-        fields, those whose force depends only on time (precomputed), and those in series
-        with joints. Also note in which batch elements an effect adds dry friction or depends on the
-        loads of transmissions, because these need additional work in each step.
-
-        Args:
-            system: see the attributes.
-            acting: effects at one place each.
-            applied_inputs: see the attributes.
-            addresses: see the attributes.
-            stiffness: see the attributes.
-            step: see the attributes.
-        """
-        self.system = system
-        self.applied_inputs = applied_inputs
-        self.addresses = addresses
-        self.stiffness = stiffness
-        self.step = step
-        force_effects = [
-            (e, c) for e, c in acting if e.hook == "force" and e.of not in TIME_DEPENDENT_EFFECTS
-        ]
-        self.forces = [
-            (e, c)
-            for e, c in force_effects
-            if isinstance(e, Force) and e.of not in MODEL_FIELD_EFFECTS
-        ]
-        self.frictions = [
-            (e, c)
-            for e, c in force_effects
-            if isinstance(e, Friction) and e.of not in MODEL_FIELD_EFFECTS
-        ]
-        self.has_dry_friction: Mask = np.zeros(
-            (len(stiffness), len(addresses.velocities)), dtype=bool
-        )
-        for effect, c in self.frictions:
-            self.has_dry_friction[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
-        self.hidden = [
-            (e, c)
-            for e, c in acting
-            if isinstance(e, HiddenStateEffect) and not is_series_effect(e)
-        ]
-        self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
-        for loading, c in force_effects:
-            if loading.of in LOAD_DEPENDENT_EFFECTS:
-                self.loaded |= (c != 0).any(axis=0)[:, 0]
-        self.working: Array | None = None
-        self._states: list[HiddenState] = []
-
-    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
-        """Compute forces and dry friction limits (L, D) at the middle of step k.
-
-        MuJoCo holds forces over a step. Evaluated at the predicted middle, they have an error of
-        second order only. Hidden states of effects advance to the same time.
-
-        Shapes: L batch elements, D joints.
-
-        Args:
-            k: number of the step; must increase by one from call to call.
-            joint_states: joint states at the beginning of the step.
-        """
-        x, v = predict_midpoint(joint_states.x, joint_states.v, joint_states.a, self.step)
-        midpoint = self._make_snapshot(k + 0.5, k, (x, v, *joint_states.at_midpoint))
-        force = compute_effect_forces(self.forces, midpoint)
-        if self.hidden:
-            start = self.make_step_snapshot(k, joint_states)
-            self._states = self._states or [e.begin(c, start) for e, c in self.hidden]
-            # Hidden states advance from the middle of the previous step to the middle of this one.
-            step = self.step if k else 0.5 * self.step
-            hidden_force, self._states = compute_hidden_state_forces(
-                self.hidden, (start, midpoint), self._states, step
-            )
-            force += hidden_force
-        return force, compute_friction_limits(self.frictions, midpoint)
-
-    def make_step_snapshot(self, k: int, joint_states: JointStates) -> RobotSnapshot:
-        """Return the snapshot at the beginning of step k.
-
-        Args:
-            k: number of the step.
-            joint_states: states of the joints at its beginning.
-        """
-        return self._make_snapshot(
-            k, k, (joint_states.x, joint_states.v, *joint_states.transmission_loads)
-        )
-
-    def _make_snapshot(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
-        """Return the snapshot after a number of steps, with the inputs of step k.
-
-        Shapes: L batch elements, D joints.
-
-        Args:
-            steps: number of steps since the beginning; not whole within a step.
-            k: index of the step.
-            motion: positions and velocities of the joints, and the forces on both sides of the
-                transmissions, (L, D) each.
-        """
-        x, v, *sides = motion
-        now = np.full((len(x), 1), steps * self.step)
-        inputs = {name: u[:, k, None] for name, u in self.applied_inputs.items()}
-        stiffness = self.stiffness
-        if self.working is not None:
-            stiffness = stiffness * self.working[:, k]
-        return make_snapshot(self.system, now, x, v, inputs, np.stack(sides), stiffness)
 
 
 def is_in_drive(effect: Effect) -> bool:

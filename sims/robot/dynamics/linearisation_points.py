@@ -363,7 +363,7 @@ class LinearisationPoints:
                 elif name != "w":
                     columns[name](k)[:point_count] += size
             self._add_effect_forces(steps, point_count, dict([moved["w"]]) if "w" in moved else {})
-            yield point_count, None if point_count == count else np.arange(point_count)
+            yield point_count, self._mujoco_batch.get_element_ids(point_count)
 
     def _add_effect_forces(
         self, steps: IndexArray, n: int, state_changes: Mapping[int, float]
@@ -388,9 +388,7 @@ class LinearisationPoints:
         t: Array = motion.step * steps[:, None].astype(np.float64)
         if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._stepwise_effects):
             # As in the simulation, a servo's force must follow the perturbed state.
-            self._mujoco_batch.batch.forward(
-                None if n == self._mujoco_batch.count else np.arange(n)
-            )
+            self._mujoco_batch.batch.forward(self._mujoco_batch.get_element_ids(n))
             carried = np.stack(
                 [bind(name)[:n, joints.velocities] for name in TRANSMISSION_FORCE_FIELDS]
             )

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from sims.robot.dynamics.drive_limits import (
     find_stiff_force_limits,
     iterate_constant_stretches,
 )
-from sims.robot.dynamics.midpoint_state import IndexArray, JointStates, Mask, MidpointPredictor
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.series_joints import (
     USED_FIELDS,
     WRITTEN_FIELDS,
@@ -94,23 +94,6 @@ class JointAddresses:
             joints = [*file_joints, *series_joints]
         self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
-
-
-class StepwiseForces(Protocol):
-    """Effects whose forces are evaluated in every step, such as `effect_forces.EffectForces`."""
-
-    has_dry_friction: Mask
-    addresses: JointAddresses
-    loaded: Mask
-
-    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
-        """Compute forces and limits of dry friction over step k.
-
-        Args:
-            k: number of the step.
-            joint_states: states of the joints at its beginning.
-        """
-        ...
 
 
 DRIVE_SENSOR_PREFIX = "simgap.drive."
@@ -361,7 +344,7 @@ class MujocoBatch:
         series_positions = np.zeros((element_count, series.positions.size))
         if series_positions.size:
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
-            self.batch.forward(self._get_element_ids(element_count))
+            self.batch.forward(self.get_element_ids(element_count))
             loads = (passive - bias)[:element_count, series.velocities].T
             series_positions[:] = np.stack(
                 compute_rest_positions(self.fields, self.robot, list(loads)), axis=1
@@ -390,8 +373,9 @@ class MujocoBatch:
         record: Sequence[str],
         off: Mask | None = None,
         before_call: Callable[[int], None] | None = None,
+        steps_per_call: int | None = None,
     ) -> dict[str, Array]:
-        """Step n batch elements S times with given controls and forces, without effects in between.
+        """Step n batch elements S times with given controls and forces.
 
         Failed elements are marked in `failed`; their recorded numbers have no meaning.
 
@@ -400,8 +384,10 @@ class MujocoBatch:
             forces: (n, S, nv) generalised forces.
             record: fields of MuJoCo's data to record.
             off: (n, S, K) whether each actuator is switched off; none is by default.
-            before_call: called with the number of the first step of each call of MuJoCo, if a
-                callback changes the generalised forces.
+            before_call: called with the number of the first step of each call of MuJoCo; it may
+                change `forces` of the steps that follow, as a callback may.
+            steps_per_call: number of steps in one call of MuJoCo; as many as can be interrupted
+                after a fraction of a second if None.
 
         Returns:
             Recorded fields (n, S, ...) by name.
@@ -410,145 +396,62 @@ class MujocoBatch:
 
         state = mujoco.mjtState
         input_kinds = int(state.mjSTATE_CTRL)
-        inputs = controls
-        if forces.any() or before_call is not None:
+        applies_forces = before_call is not None or bool(forces.any())
+        if applies_forces:
             input_kinds |= int(state.mjSTATE_QFRC_APPLIED)
-            inputs = np.concatenate([controls, forces], axis=2)
         batch_size, steps, _ = controls.shape
         records = self._allocate_records(batch_size, steps, record)
-        for steps_without_switch in self._split_at_switches(batch_size, steps, off):
+        steps_per_call = steps_per_call or max(MAX_UNINTERRUPTED_STEPS // max(batch_size, 1), 1)
+        for steps_without_switch in self._split_at_switches(steps, off, steps_per_call):
             if before_call is not None:
                 before_call(steps_without_switch.start)
+            inputs = controls[:, steps_without_switch]
+            if applies_forces:
+                inputs = np.concatenate([inputs, forces[:, steps_without_switch]], axis=2)
             recorded = self.batch.rollout(
                 steps_without_switch.stop - steps_without_switch.start,
-                inputs[:, steps_without_switch],
+                inputs,
                 input_kinds,
                 tuple(record),
-                self._get_element_ids(batch_size),
+                self.get_element_ids(batch_size),
             )
             for name, values in recorded.items():
                 records[name][:, steps_without_switch] = values
         self._record_failures(batch_size)
         return records
 
-    def _split_at_switches(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
+    def _split_at_switches(
+        self, steps: int, off: Mask | None, steps_per_call: int
+    ) -> Iterator[slice]:
         """Yield the steps in consecutive parts, and switch actuators on or off before each part.
 
         Within a part no switch changes, so that MuJoCo makes its steps in one call. Before the
         next part is yielded, its switches are set here; an actuator is switched off by a force
-        range of zero. `off` (n, S, K) says which of the K actuators are off; None means that all
-        are on.
+        range of zero.
 
         Shapes: S steps.
+
+        Args:
+            steps: number S of steps.
+            off: (n, S, K) which of the K actuators are off; None if all are on.
+            steps_per_call: maximum number of steps in a part.
         """
-        if off is None or not off.any():
-            yield from self._split_for_interrupts(n, steps)
-            return
-        ranges = self.force_ranges()
-        for stretch in iterate_constant_stretches(off):
-            ranges.write(off[:, stretch.start])
-            for part in self._split_for_interrupts(n, stretch.stop - stretch.start):
-                yield slice(stretch.start + part.start, stretch.start + part.stop)
-        ranges.restore()
+        ranges = None
+        stretches: Iterable[slice] = [slice(0, steps)]
+        if off is not None and off.any():
+            ranges, stretches = self.force_ranges(), iterate_constant_stretches(off)
+        for stretch in stretches:
+            if ranges is not None and off is not None:
+                ranges.write(off[:, stretch.start])
+            for begin in range(stretch.start, stretch.stop, steps_per_call):
+                yield slice(begin, min(begin + steps_per_call, stretch.stop))
+        if ranges is not None:
+            ranges.restore()
 
     def force_ranges(self) -> ForceRanges:
         """Return the force ranges, to switch actuators off until the next `write_effects`."""
         self._mark_changed(FORCE_FIELDS)
         return ForceRanges(self.fields)
-
-    def step_with_forces(
-        self,
-        controls: Array,
-        forces: Array,
-        step_forces: StepwiseForces,
-        record: Sequence[str],
-        off: Mask | None = None,
-    ) -> dict[str, Array]:
-        """Step n batch elements S times with effects that are evaluated in every step.
-
-        In each step the effects are evaluated at the predicted middle of the step, their forces and
-        friction limits are written into MuJoCo's fields, and MuJoCo makes the step. Where actuators
-        are switched, their force ranges are changed before.
-
-        Args:
-            controls: (n, S, nu) controls.
-            forces: (n, S, nv) generalised forces.
-            step_forces: effects to evaluate.
-            record: fields of MuJoCo's data to record.
-            off: (n, S, K) whether each actuator is switched off; none is by default.
-
-        Returns:
-            Recorded fields (n, S, ...) by name.
-        """
-        batch_size, steps, _ = controls.shape
-        dofs = step_forces.addresses.velocities
-        bind = self.batch.bind
-        ctrl, applied = bind("ctrl"), bind("qfrc_applied")
-        loss = self.fields["dof_frictionloss"]
-        has_friction = bool(step_forces.has_dry_friction.any())
-        file_friction = self.begin_dry_friction(step_forces, batch_size)
-        records = self._allocate_records(batch_size, steps, record)
-        data_fields = {name: bind(name)[:batch_size] for name in record}
-        ids = self._get_element_ids(batch_size)
-        # This precedes MuJoCo's first evaluation, since fields that are bound later would not
-        # contain it.
-        predictor = MidpointPredictor(
-            self.batch, step_forces.addresses.positions, dofs, step_forces.loaded
-        )
-        changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
-        dofs_in_use = predictor.dof_indices
-        ctrl[:batch_size] = controls[:, 0]
-        if off is None or not off.any():
-            switches = {}
-        else:
-            switches = {
-                stretch.start: off[:, stretch.start] for stretch in iterate_constant_stretches(off)
-            }
-        ranges = self.force_ranges() if switches else None
-        if ranges is not None:
-            ranges.write(switches[0])
-        self.batch.forward(ids)
-        for step_index in range(steps):
-            ctrl[:batch_size] = controls[:, step_index]
-            if ranges is not None and step_index in switches:
-                ranges.write(switches[step_index])
-                changes[:, step_index] = True
-            force, limit = step_forces.compute(
-                step_index, predictor.read_joint_states(changes[:, step_index])
-            )
-            applied[:batch_size] = forces[:, step_index]
-            applied[:batch_size, dofs_in_use] += force
-            if has_friction:
-                loss[:batch_size, dofs_in_use] = file_friction + np.maximum(limit, 0.0)
-            self.batch.step(ids)
-            for name, values in records.items():
-                values[:, step_index] = data_fields[name]
-        if ranges is not None:
-            ranges.restore()
-        self._record_failures(batch_size)
-        return records
-
-    def begin_dry_friction(self, step_forces: StepwiseForces, n: int) -> Array:
-        """Set the solver parameters of dry friction where effects add it.
-
-        Where no effect adds friction, the file's friction keeps its solver parameters.
-
-        Shapes: D joints.
-
-        Args:
-            step_forces: effects to evaluate in every step.
-            n: number of batch elements in use.
-
-        Returns:
-            Dry friction (n, D) of the joints without these effects.
-        """
-        dofs = step_forces.addresses.velocities
-        file_friction: Array = self.fields["dof_frictionloss"][:n, dofs].copy()
-        if step_forces.has_dry_friction.any():
-            batch_indices, joints = np.nonzero(step_forces.has_dry_friction)
-            write_friction_form(self.fields, self.robot, batch_indices, dofs[joints])
-            self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
-        return file_friction
 
     def get_servo_stiffness(self, joints: JointAddresses) -> Array:
         """Return the force of position servos per unit of their errors, with effects.
@@ -579,10 +482,20 @@ class MujocoBatch:
             dof: index of the joint's velocity.
             limit: (n,) friction limits to add.
         """
-        loss = self.fields["dof_frictionloss"]
+        self.fields["dof_frictionloss"][:n, dof] = self._loaded_friction[:n, dof] + limit
+        self.prepare_dry_friction(slice(n), dof)
+
+    def prepare_dry_friction(self, batch_indices: Any, dofs: Any) -> None:
+        """Set the solver parameters of dry friction where effects add it.
+
+        Where no effect adds friction, the file's friction keeps its solver parameters.
+
+        Args:
+            batch_indices: index of the batch elements.
+            dofs: index of the joints' velocities.
+        """
         self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
-        loss[:n, dof] = self._loaded_friction[:n, dof] + limit
-        write_friction_form(self.fields, self.robot, slice(n), dof)
+        write_friction_form(self.fields, self.robot, batch_indices, dofs)
 
     def _allocate_records(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Allocate arrays for recorded fields.
@@ -594,24 +507,13 @@ class MujocoBatch:
         """
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
-    def _get_element_ids(self, n: int) -> IndexArray | None:
+    def get_element_ids(self, n: int) -> IndexArray | None:
+        """Return the indices of the first n elements; None stands for all of them."""
         return None if n == self.count else np.arange(n)
 
     def _record_failures(self, n: int) -> None:
         """Record which batch elements have failed: MuJoCo no longer moves those with a warning."""
         self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
-
-    @staticmethod
-    def _split_for_interrupts(batch_size: int, steps: int) -> Iterator[slice]:
-        """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between.
-
-        Args:
-            batch_size: number of batch elements.
-            steps: number of steps.
-        """
-        steps_per_part = max(MAX_UNINTERRUPTED_STEPS // max(batch_size, 1), 1)
-        for begin in range(0, steps, steps_per_part):
-            yield slice(begin, min(begin + steps_per_part, steps))
 
 
 CACHE_BYTES = 96 << 20

@@ -9,8 +9,8 @@ from bench.core.plugin_registries import make_robot_simulator
 from sims import effects as library
 from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Scenario
-from sims.robot import robot_simulator
-from sims.robot.dynamics import mujoco_batch
+from sims.engines.compiled.array_programs import TracedPrograms
+from sims.robot.dynamics import mujoco_batch, stepping_with_forces
 from sims.robot.dynamics.effect_forces import is_evaluated_per_step
 from sims.robot.places.effect_places import make_placed_effect
 from tests.sims.robot.sample_arms import ARM
@@ -43,7 +43,14 @@ def list_step_effects(kind):
 
 
 def by_numpy(monkeypatch):
-    monkeypatch.setattr(robot_simulator, "compile_forces", lambda forces: None)
+    monkeypatch.setattr(TracedPrograms, "find", lambda *_: None)
+
+
+def record_results(monkeypatch, owner, name):
+    """Return a list to which each call of a function adds its result."""
+    results, once = [], getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *a: results.append(once(*a)) or results[-1])
+    return results
 
 
 def test_every_effect_moves_the_robot_as_it_does_without_the_compiler(arm, monkeypatch, capsys):
@@ -60,11 +67,7 @@ def test_every_effect_moves_the_robot_as_it_does_without_the_compiler(arm, monke
             theta[lane, column] = (low * high) ** 0.5 if low > 0 else 0.3 * high
             column += 1
     assert column == size
-    programs = []
-    once = robot_simulator.compile_forces
-    monkeypatch.setattr(
-        robot_simulator, "compile_forces", lambda f: programs.append(once(f)) or programs[-1]
-    )
+    programs = record_results(monkeypatch, TracedPrograms, "find")
     quick = made.simulate(theta, SCENARIO)
     assert programs
     assert all(programs), "none was left to numpy"
@@ -141,8 +144,7 @@ def test_untraceable_effects_are_reported_once_and_evaluated_by_numpy(
     assert message in told
     assert (
         not message
-        or f"effect {effect.name}@elbow is evaluated with NumPy, since it cannot be compiled"
-        in told
+        or f"effect {effect.name}@elbow cannot be compiled, and NumPy evaluates it" in told
     )
 
 
@@ -183,14 +185,10 @@ def test_steps_in_the_callback_equal_steps_with_forces(arm, tmp_path, monkeypatc
     made = kind(effects=[system.effect(name) for name in names])
     theta = np.array([[np.mean(p.bounds) for p in made.parameters], [0.0] * len(made.parameters)])
     theta = np.concatenate([theta, 0.5 * theta[:1]])
-    results = []
-    once = robot_simulator.step_in_callback
-    monkeypatch.setattr(
-        robot_simulator, "step_in_callback", lambda *a: results.append(once(*a)) or results[-1]
-    )
+    results = record_results(monkeypatch, stepping_with_forces, "find_callback")
     quick = made.simulate(theta, SCENARIO)
     assert [result is not None for result in results] == [True]
-    monkeypatch.setattr(robot_simulator, "step_in_callback", lambda *_: None)
+    monkeypatch.setattr(stepping_with_forces, "find_callback", lambda *_: None)
     slow = made.simulate(theta, SCENARIO)
     assert np.abs(slow[0] - slow[1]).max() > 0.01
     np.testing.assert_array_equal(quick, slow)
@@ -198,11 +196,7 @@ def test_steps_in_the_callback_equal_steps_with_forces(arm, tmp_path, monkeypatc
 
 def test_forces_that_depend_on_loads_are_not_computed_in_the_callback(arm, monkeypatch):
     made = arm(effects=[arm.system.effect("friction.load@elbow")])
-    results = []
-    once = robot_simulator.step_in_callback
-    monkeypatch.setattr(
-        robot_simulator, "step_in_callback", lambda *a: results.append(once(*a)) or results[-1]
-    )
+    results = record_results(monkeypatch, stepping_with_forces, "find_callback")
     made.simulate(np.array([[0.3]]), SCENARIO)
     assert results == [None]
 

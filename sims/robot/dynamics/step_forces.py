@@ -1,0 +1,321 @@
+"""Forces of effects on a batch of robots in every step.
+
+With NumPy, each effect is evaluated separately, which takes longer than MuJoCo's step. So the
+computation of all effects is one program on registers with one column for each batch element, as
+for the systems of `sims.engines.compiled`. Effects that cannot be traced are evaluated with NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.effect import (
+    ActiveEffects,
+    Effect,
+    Force,
+    Friction,
+    HiddenState,
+    HiddenStateEffect,
+)
+from sims.core.simulator import Array
+from sims.engines.compiled.array_programs import (
+    ArrayFunction,
+    Evaluator,
+    PreparedProgram,
+    TracedPrograms,
+    TracedSource,
+    make_numpy_program,
+)
+from sims.engines.compiled.traced_array import PER_ELEMENT, PER_EVALUATION
+from sims.robot.dynamics.effect_forces import (
+    LOAD_DEPENDENT_EFFECTS,
+    TIME_DEPENDENT_EFFECTS,
+    compute_effect_forces,
+    compute_friction_limits,
+    compute_hidden_state_forces,
+    make_snapshot,
+)
+from sims.robot.dynamics.midpoint_state import JointStates, Mask, predict_midpoint
+from sims.robot.dynamics.mujoco_batch import JointAddresses
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.robot_system import RobotSystem
+
+TESTED_STATES = 16
+"""Number of random states at which a program is compared with NumPy."""
+TEST_STATE_SIZES = (0.01, 1.0, 10.0)
+"""Standard deviations of these states, SI units."""
+
+
+class _StepEffects(NamedTuple):
+    """Effects with a force, with dry friction and with hidden states, and their coefficients.
+
+    Left out are effects that a batch handles otherwise: those written into model fields, those
+    whose force depends only on time (precomputed), and those in series with joints.
+    """
+
+    forces: ActiveEffects
+    frictions: ActiveEffects
+    hidden: ActiveEffects
+
+    @classmethod
+    def from_active(cls, acting: ActiveEffects) -> _StepEffects:
+        """Sort effects at one place each, with coefficients (K, L, 1)."""
+        left_out = TIME_DEPENDENT_EFFECTS | MODEL_FIELD_EFFECTS.keys()
+        own = [(e, c) for e, c in acting if e.hook == "force" and e.of not in left_out]
+        return cls(
+            tuple(pair for pair in own if isinstance(pair[0], Force)),
+            tuple(pair for pair in own if isinstance(pair[0], Friction)),
+            tuple(
+                (e, c)
+                for e, c in acting
+                if isinstance(e, HiddenStateEffect) and not is_series_effect(e)
+            ),
+        )
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients (K, L) of all effects, one after the other."""
+        return np.concatenate([c[:, :, 0] for group in self for _, c in group])
+
+
+class CallbackLayout(NamedTuple):
+    """Registers of a program that MuJoCo's callback reads and writes; see `CallbackContext`."""
+
+    t: int
+    midpoint: int
+    past: int
+    x: int
+    v: int
+    a: int
+    first_input: int
+    first_state: int
+
+
+class StepForces:
+    """Forces of effects on a batch, computed on registers in every step.
+
+    Attributes:
+        has_dry_friction: (L, D) whether an effect adds dry friction.
+        loaded: (L,) whether an effect depends on the loads of transmissions.
+        addresses: addresses of the joints.
+        step: step length in seconds.
+        prepared: program of the forces, with its registers. Its outputs are the forces (D,), the
+            limits of dry friction (D,), and the hidden states after the step (2 H,).
+        depends_on_switches: whether switched servos change the forces.
+    """
+
+    def __init__(
+        self,
+        system: RobotSystem,
+        acting: ActiveEffects,
+        applied_inputs: Mapping[str, Array],
+        addresses: JointAddresses,
+        stiffness: Array,
+        step: float,
+        working: Array | None = None,
+    ) -> None:
+        """Find or make the program of the effects, and write the values that stay constant.
+
+        Also note in which batch elements an effect adds dry friction or depends on the loads of
+        transmissions, because these need additional work in each step.
+
+        Shapes: L batch elements, D joints, S steps.
+
+        Args:
+            system: system of the robot.
+            acting: effects at one place each.
+            applied_inputs: applied inputs (L, S) by name.
+            addresses: addresses of the joints.
+            stiffness: (L, D) stiffness of the position servos.
+            step: step length in seconds.
+            working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all
+                are on.
+        """
+        self.addresses, self.step = addresses, step
+        self.depends_on_switches = working is not None
+        self._system, self._applied_inputs = system, applied_inputs
+        self._stiffness, self._working = stiffness, working
+        effects = _StepEffects.from_active(acting)
+        self._hidden = effects.hidden
+        self.has_dry_friction: Mask = np.zeros(stiffness.shape, dtype=bool)
+        for effect, c in effects.frictions:
+            self.has_dry_friction[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
+        self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
+        for effect, c in acting:
+            if effect.of in LOAD_DEPENDENT_EFFECTS:
+                self.loaded |= (c != 0).any(axis=0)[:, 0]
+        inputs = tuple(applied_inputs)
+        function = _make_function(system, inputs, effects)
+        programs: TracedPrograms = system.traced.setdefault(inputs, TracedPrograms())
+        sources = [
+            TracedSource(effect, f"effect {effect.name}", partial(self._make_test, effect, c))
+            for group in effects
+            for effect, c in group
+        ]
+        program = programs.find(function, sources) or make_numpy_program(function)
+        self.prepared = PreparedProgram(program, len(stiffness))
+        self.registers = r = self.prepared.r
+        groups = [slice(*ends) for ends in pairwise(function.input_ends.tolist())]
+        self._t, self._midpoint_time, step_group, self._interval, *self._motion = groups[:-4]
+        self._u, self._stiffness_group, coefficient_group, self._states = groups[-4:]
+        r[step_group] = step
+        r[self._stiffness_group] = stiffness.T
+        r[coefficient_group] = effects.coefficients
+        prepare_elements, self._run, _ = self.prepared.make_runners()
+        prepare_elements()
+
+    def _make_test(self, effect: Effect, c: Array) -> tuple[ArrayFunction, Iterator[Array]]:
+        """Return the array function of one effect, and random inputs; see `TracedSource`.
+
+        The random numbers have different sizes and a fixed seed, so that the answer is the same in
+        each process.
+
+        Args:
+            effect: effect in the batch.
+            c: (K, L, 1) its coefficients.
+        """
+        effects = _StepEffects.from_active(((effect, c),))
+        function = _make_function(self._system, tuple(self._applied_inputs), effects)
+        groups = [slice(*ends) for ends in pairwise(function.input_ends.tolist())]
+
+        def make_samples() -> Iterator[Array]:
+            """Yield values of all inputs, of which step, stiffness and coefficients are known."""
+            rng = np.random.default_rng(0)
+            shape = function.input_ends[-1], len(self._stiffness)
+            for number in range(TESTED_STATES):
+                sample = rng.normal(size=shape) * rng.choice(TEST_STATE_SIZES)
+                for group, steps in zip(groups, (number, number + 0.5, 1.0, 1.0), strict=False):
+                    sample[group] = steps * self.step
+                sample[groups[-3]] = self._stiffness.T
+                sample[groups[-2]] = effects.coefficients
+                yield sample
+
+        return function, make_samples()
+
+    @cached_property
+    def input_values(self) -> Array:
+        """Applied inputs (S, U, L) over S steps: U inputs of L batch elements."""
+        if not self._applied_inputs:
+            return np.zeros((1, 0, len(self._stiffness)))
+        inputs = np.stack(list(self._applied_inputs.values()))
+        return np.ascontiguousarray(inputs.transpose(2, 0, 1))
+
+    @property
+    def layout(self) -> CallbackLayout:
+        """First registers of the groups that MuJoCo's callback reads and writes."""
+        x, v, a, *_ = self._motion
+        groups = self._t, self._midpoint_time, self._interval, x, v, a, self._u, self._states
+        return CallbackLayout(*(group.start for group in groups))
+
+    def begin(self, joint_states: JointStates) -> None:
+        """Set the hidden states at the beginning of a motion."""
+        if not self._hidden:
+            return
+        inputs = {name: u[:, 0, None] for name, u in self._applied_inputs.items()}
+        snapshot = make_snapshot(
+            self._system,
+            np.zeros((len(self._stiffness), 1)),
+            joint_states.x,
+            joint_states.v,
+            inputs,
+            np.stack(joint_states.transmission_loads),
+            self.registers[self._stiffness_group].T,
+        )
+        states = [e.begin(c, snapshot) for e, c in self._hidden if isinstance(e, HiddenStateEffect)]
+        parts = [part for state in states for part in (state.x, state.v)]
+        self.registers[self._states] = np.concatenate(parts, axis=1).T
+
+    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
+        """Compute forces and dry friction limits (L, D) at the middle of step k, in N or N m.
+
+        MuJoCo holds forces over a step. Evaluated at the predicted middle, they have an error of
+        second order only. Hidden states of effects advance to the same time.
+
+        Shapes: L batch elements, D joints.
+
+        Args:
+            k: number of the step; must increase by one from call to call.
+            joint_states: joint states at the beginning of the step.
+        """
+        registers = self.registers
+        for rows, values in zip(self._motion, joint_states, strict=True):
+            registers[rows] = values.T
+        registers[self._t] = k * self.step
+        registers[self._midpoint_time] = (k + 0.5) * self.step
+        registers[self._u] = self.input_values[min(k, len(self.input_values) - 1)]
+        # Hidden states advance from the middle of the previous step to the middle of this one.
+        registers[self._interval] = self.step if k else 0.5 * self.step
+        if self._working is not None:
+            registers[self._stiffness_group] = (self._stiffness * self._working[:, k]).T
+        if k == 0:
+            self.begin(joint_states)
+        self._run()
+        ((force, limit, states),) = self.prepared.program.outputs
+        registers[self._states] = registers[states]
+        return registers[force].T, registers[limit].T
+
+
+def _make_function(
+    system: RobotSystem, input_names: Sequence[str], effects: _StepEffects
+) -> ArrayFunction:
+    """Return the array function of effects on a robot.
+
+    The groups of inputs are time at the beginning and at the middle of a step, step length,
+    interval over which hidden states advance, motion (`JointStates`), inputs, stiffness of servos,
+    coefficients, and hidden states. The outputs are the forces, the limits of dry friction, and the
+    hidden states after the interval; of each state the position and the rate.
+
+    Args:
+        system: system of the robot.
+        input_names: names of the inputs.
+        effects: the effects.
+    """
+    joints, states = len(system.coordinates), 2 * len(effects.hidden)
+    counts = [len(effect.coefficients) for group in effects for effect, _ in group]
+
+    def bind(t: Any, middle: Any, step: Any, interval: Any, *values: Any) -> tuple[Evaluator]:
+        """Return the function that evaluates all effects; see `ArrayFunction.bind`."""
+        *motion, u, stiffness, coefficients, hidden_states = values
+        at = JointStates(*motion)
+        inputs = {name: u[:, i, None] for i, name in enumerate(input_names)}
+        parts = iter(np.split(coefficients, np.cumsum(counts), axis=1))
+        forces, frictions, hidden = (
+            [(effect, next(parts).T[:, :, None]) for effect, _ in group] for group in effects
+        )
+
+        def evaluate() -> tuple[Any, Any, Any]:
+            """Return forces, limits of dry friction, and later hidden states."""
+            x, v = predict_midpoint(at.x, at.v, at.a, step)
+            midpoint = make_snapshot(
+                system, middle, x, v, inputs, np.stack(at.at_midpoint), stiffness
+            )
+            force = compute_effect_forces(forces, midpoint)  # type: ignore[arg-type]
+            later_states = np.zeros((1, 0))
+            if hidden:
+                loads = np.stack(at.transmission_loads)
+                start = make_snapshot(system, t, at.x, at.v, inputs, loads, stiffness)
+                columns = [hidden_states[:, i, None] for i in range(states)]
+                earlier = [HiddenState(*columns[i : i + 2]) for i in range(0, states, 2)]
+                added, later = compute_hidden_state_forces(
+                    hidden,  # type: ignore[arg-type]
+                    (start, midpoint),
+                    earlier,
+                    interval,
+                )
+                force = force + added
+                later_states = np.concatenate([p for s in later for p in (s.x, s.v)], axis=1)
+            limit = compute_friction_limits(frictions, midpoint)  # type: ignore[arg-type]
+            return force, limit, later_states
+
+        return (evaluate,)
+
+    sizes = [1] * 4 + [joints] * len(JointStates._fields) + [len(input_names), joints]
+    groups = [(size, PER_EVALUATION) for size in sizes]
+    groups += [(sum(counts), PER_ELEMENT), (states, PER_EVALUATION)]
+    return ArrayFunction(groups, ((joints, joints, states),), bind)
