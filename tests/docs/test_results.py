@@ -22,9 +22,9 @@ from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import build_shot_rows
 from bench.bounce_shot.shot_sampling import draw_shots
 from bench.bounce_shot.tuned_shots import TunedModel
-from bench.cli.main import main
 from sims.core.toml_validation import read_toml
 from sims.vision.pinhole_camera import FilmDescription, PinholeCamera, format_camera_file
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.docs.documentation_pages import quoted, section, tables, text_of
 from tests.sample_experiments import SPRING, spring_experiment
@@ -146,8 +146,8 @@ def test_every_figure_is_described(folder):
     assert {quoted(row[1])[0]: quoted(row[0])[0] for row in rows} == FIGURE_FILES
 
 
-def test_several_comparisons(folder, tmp_path, capsys):
-    assert main(["plot", str(folder), str(folder), "--out", str(tmp_path / "all")]) == 0
+def test_several_comparisons(folder, tmp_path):
+    run_command("plot", folder, folder, "--out", tmp_path / "all")
     # The Nemenyi test needs five problems; two are enough for everything else.
     written = {path.name for path in (tmp_path / "all").iterdir() if path.is_file()}
     assert written | {"nemenyi.csv"} == set(list_documented_names("## plot of several comparisons"))
@@ -167,12 +167,12 @@ def test_the_tables_of_the_bounce_shot():
     assert [*row, "seen", "trusted"] == list_documented_names("### `shots.csv`")
 
 
-def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
+def test_the_losses_of_a_training(tmp_path, monkeypatch, spring):
     monkeypatch.chdir(tmp_path)
     document = {**SPRING, "training_budget": 40, "targets": 1, "tuners": {"small": SMALL}}
     (tmp_path / "ahead.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
     of = ["small", "spring", "--experiment", "ahead.toml", "--plugin", SPRING_PLUGIN]
-    assert main(["train", *of, "--seeds", "1", "--out", "out"]) == 0
+    run_command("train", *of, "--seeds", "1", "--out", "out")
     assert columns(tmp_path / "out" / "loss.csv") == list_documented_names("### `loss.csv`")
     assert [f.stem for f in (tmp_path / "out" / "figures").glob("*.png")] == ["loss"]
 
@@ -183,8 +183,8 @@ def explained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("explained")
     swing, out = folder / "swing.csv", folder / "out"
     hidden = ["--effect", "drag.linear=2e-4", "--noise", "q=0.002", "--rate", "50"]
-    assert main(["simulate", "pendulum", *hidden, "--runs", "3", "--out", str(swing)]) == 0
-    assert main(["explain", str(swing), "--out", str(out)]) == 0
+    run_command("simulate", "pendulum", *hidden, "--runs", "3", "--out", swing)
+    run_command("explain", swing, "--out", out)
     return folder
 
 
@@ -203,10 +203,11 @@ def test_the_folder_of_an_explanation(explained):
     assert set(extended) == set(list_documented_names("### `extended.toml`"))
 
 
-def test_the_score(explained, capsys):
+def test_the_score(explained):
     model, recording = explained / "out" / "extended.toml", explained / "swing.csv"
-    assert main(["score", str(model), str(recording), "--json"]) == 0
-    assert list(json.loads(capsys.readouterr().out)) == list_documented_names("## score")
+    assert list(
+        json.loads(run_command("score", model, recording, "--json").out)
+    ) == list_documented_names("## score")
 
 
 def test_the_camera_of_a_film(tmp_path):

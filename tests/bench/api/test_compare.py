@@ -7,7 +7,7 @@ import pytest
 import tomli_w
 
 import simgap
-from bench.cli.main import main
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.docs.documentation_pages import ROOT
 from tests.sample_experiments import SPRING
@@ -49,7 +49,7 @@ def untimed(table):
 def test_python_and_the_command_make_the_same(experiment, tmp_path):
     command = ["compare", str(experiment), "--plugin", str(PLUGINS / "spring.py"), "--jobs", "1"]
     with undrawn():
-        assert main([*command, "--out", str(tmp_path / "command")]) == 0
+        run_command(*command, "--out", tmp_path / "command")
     for jobs in (0, 1):
         run = simgap.compare(
             experiment,
@@ -136,7 +136,7 @@ def test_a_bounce_shot_has_tables_too(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path, capsys):
+def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path):
     experiment.write_text(tomli_w.dumps({**SETTINGS, "sweep": {"budget": [3, 5]}}))
     with pytest.raises(simgap.InputError, match=r"sweeps over values: use simgap\.sweep"):
         simgap.compare(experiment, jobs=0)
@@ -148,16 +148,16 @@ def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path
     np.testing.assert_array_equal(*truths)
 
     command = ["compare", str(experiment), "--plugin", str(PLUGINS / "spring.py"), "--jobs", "0"]
-    assert main([*command, "--out", str(tmp_path / "again")]) == 0
-    said = capsys.readouterr().out
+    said = run_command(*command, "--out", tmp_path / "again").out
     assert "\nsmall[budget=3]\n" in said
     for run in runs:
         again = pd.read_csv(tmp_path / "again" / run.experiment.name / "table.csv")
         pd.testing.assert_frame_equal(untimed(run.table), untimed(again), check_exact=True)
-    assert main(["status", str(tmp_path / "again")]) == 0
-    assert capsys.readouterr().out.count("8 of 8 runs finished, complete") == 2
-    assert main(["compare", "--resume", str(tmp_path / "again")]) == 0
-    assert main(["plot", str(tmp_path / "again")]) == 0
+    assert (
+        run_command("status", tmp_path / "again").out.count("8 of 8 runs finished, complete") == 2
+    )
+    run_command("compare", "--resume", tmp_path / "again")
+    run_command("plot", tmp_path / "again")
 
 
 def test_a_fault_in_one_of_a_sweep_leaves_nothing(experiment, tmp_path):

@@ -33,6 +33,7 @@ from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.ball import Ball
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 
 vision = pytest.mark.skipif(
@@ -289,18 +290,18 @@ def test_faults_of_the_table_are_one_line(experiment, change, message):
         read_shot_config(replace(experiment, shot=change))
 
 
-def test_world_that_cannot_be_had_is_skipped_with_its_reason(
-    experiment, tmp_path, monkeypatch, capsys
-):
+def test_world_that_cannot_be_had_is_skipped_with_its_reason(experiment, tmp_path, monkeypatch):
     monkeypatch.setattr(
         shot_study.true_world, "find_missing_requirement", lambda: "the world needs mujoco"
     )
-    assert main.main(["compare", "bounce-shot", "--out", str(tmp_path / "out")]) == 0
-    assert "skipped: the world needs mujoco" in capsys.readouterr().out
+    assert (
+        "skipped: the world needs mujoco"
+        in run_command("compare", "bounce-shot", "--out", tmp_path / "out").out
+    )
 
 
 @pytest.mark.long
-def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path, capsys):
+def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path):
     assert "bounce-shot" in list_experiment_names()
     text = f"""{SMALL}
 budget = 6
@@ -312,9 +313,7 @@ shot = {{ balls = ["golf"] }}
 """
     (tmp_path / "mine.toml").write_text(text)
     out = tmp_path / "out"
-    assert (
-        main.main(["compare", str(tmp_path / "mine.toml"), "--jobs", "1", "--out", str(out)]) == 0
-    )
+    run_command("compare", tmp_path / "mine.toml", "--jobs", "1", "--out", out)
     lines = pd.read_csv(out / "table.csv").set_index(["method", "ball"])
     assert list(lines.index.unique("method")) == [
         "nominal",
@@ -332,14 +331,12 @@ shot = {{ balls = ["golf"] }}
     kept = (out / "shots" / "golf-000.json").read_text()
     assert {row["method"] for row in json.loads(kept)["rows"]} == set(lines.index.unique("method"))
     before = (out / "table.csv").read_text()
-    assert main.main(["compare", "--resume", str(out)]) == 0
+    run_command("compare", "--resume", out)
     assert (out / "shots" / "golf-000.json").read_text() == kept
     assert (out / "table.csv").read_text() == before
-    assert main.main(["status", str(out)]) == 0
-    assert "1 of 1 shots made, complete" in capsys.readouterr().out
+    assert "1 of 1 shots made, complete" in run_command("status", out).out
     (out / "shots" / "golf-000.json").write_text("{")
-    assert main.main(["compare", "--resume", str(out)]) == 2
-    assert "damaged; delete it" in capsys.readouterr().err
+    assert "damaged; delete it" in run_command("compare", "--resume", out, code=2).err
 
 
 DROPS = """
@@ -373,8 +370,7 @@ def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
     crashing, tmp_path, capsys
 ):
     out = tmp_path / "out"
-    assert main.main(["compare", *crashing, "--out", str(out)]) == 1
-    said = capsys.readouterr()
+    said = run_command("compare", *crashing, "--out", out, code=1)
     assert "crashed: crashing in 1 shots; RuntimeError: boom" in said.out
     assert said.err.count("RuntimeError: boom") == 2, "as it is and after explain, when it happens"
     allowed = ["compare", *crashing, "--allow-failures", "--out", str(tmp_path / "allowed")]
@@ -384,16 +380,16 @@ def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
     assert main.main(["plot", str(out), "--plugin", crashing[2]]) == 0
     assert (out / "table.csv").read_bytes() == table
     capsys.readouterr()
-    assert main.main(["status", str(out), "--runs"]) == 0
-    said = capsys.readouterr().out
+    said = run_command("status", out, "--runs").out
     assert "mine: 1 of 1 shots made, complete" in said
     assert "  golf  1 made" in said
     assert "made       golf-000" in said
-    assert main.main(["plot", str(out), str(out), "--out", str(tmp_path / "across")]) == 2
-    said = capsys.readouterr().err
+    said = run_command("plot", out, out, "--out", tmp_path / "across", code=2).err
     assert f"{out}: expected the folder of a comparison, found a bounce shot" in said
-    assert main.main(["compare", *crashing, "--out", str(out)]) == 2
-    assert f"simgap: --out {out}: exists and is not empty" in capsys.readouterr().err
+    assert (
+        f"simgap: --out {out}: exists and is not empty"
+        in run_command("compare", *crashing, "--out", out, code=2).err
+    )
 
 
 def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys):
@@ -440,8 +436,7 @@ def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys)
         path.write_text(text)
         capsys.readouterr()
         for arguments in (["status"], ["plot"], ["compare", "--resume"]):
-            assert main.main([*arguments, str(out)]) == 2
-            said = capsys.readouterr().err
+            said = run_command(*arguments, out, code=2).err
             assert str(path) in said
             assert says in said
             assert said.count("\n") == 1
@@ -475,13 +470,11 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
         return shoot(experiment, settings, known)
 
     monkeypatch.setattr(tuned_shots, "tune_and_plan", interrupted)
-    assert main.main(["compare", *crashing, "--out", str(out)]) == 130
-    said = capsys.readouterr()
+    said = run_command("compare", *crashing, "--out", out, code=130)
     assert "simgap: interrupted; 1 of 2 shots are made and stored" in said.err
     assert f"simgap: to finish: simgap compare --resume {out}" in said.err
     assert len(pd.read_csv(out / "status.csv")) == 6, "what there is is reported"
-    assert main.main(["status", str(out)]) == 1
-    assert "missing    golf-001" in capsys.readouterr().out
+    assert "missing    golf-001" in run_command("status", out, code=1).out
     monkeypatch.setattr(tuned_shots, "tune_and_plan", shoot)
     first = (out / "shots" / "golf-000.json").read_bytes()
 

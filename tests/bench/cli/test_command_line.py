@@ -14,6 +14,7 @@ import tomli_w
 
 from bench.benchmark.statistics.error_curves import ERROR_TABLE_COLUMNS
 from bench.cli.main import main
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND
@@ -208,12 +209,9 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         (["plot", "nowhere"], "nowhere: expected the folder of a comparison"),
     ],
 )
-def test_unknown_names_are_one_line_and_exit_code_2(
-    arguments, message, capsys, tmp_path, monkeypatch
-):
+def test_unknown_names_are_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    captured = capsys.readouterr()
+    captured = run_command(*arguments, code=2)
     assert message in captured.err
     assert captured.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == [], "nothing is left behind"
@@ -237,7 +235,7 @@ def test_bad_values_exit_with_2(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_faults_inside_an_experiment_show_before_any_work(experiment, tmp_path, capsys):
+def test_faults_inside_an_experiment_show_before_any_work(experiment, tmp_path):
     text = experiment.read_text()
     for change, message in [
         (text.replace('"spring"', '"sprig"'), "unknown simulator 'sprig'"),
@@ -249,43 +247,38 @@ def test_faults_inside_an_experiment_show_before_any_work(experiment, tmp_path, 
         assert change != text
         path = tmp_path / "changed.toml"
         path.write_text(change)
-        assert (
-            main(["compare", str(path), "--plugin", SPRING_PLUGIN, "--out", str(tmp_path / "out")])
-            == 2
-        )
-        captured = capsys.readouterr().err
+        captured = run_command(
+            "compare", path, "--plugin", SPRING_PLUGIN, "--out", tmp_path / "out", code=2
+        ).err
         assert message in captured
         assert captured.count("\n") == 1
         assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("damage", ["truncate", "text", "missing"])
-def test_damaged_folder_is_one_line(damage, tmp_path, capsys):
+def test_damaged_folder_is_one_line(damage, tmp_path):
     (tmp_path / "experiment.toml").write_text(tomli_w.dumps(SPRING))
     (tmp_path / "environment.json").write_text('{"experiment": "e"}')
     if damage == "truncate":
         (tmp_path / "runs.parquet").write_bytes(b"PAR1")
     elif damage == "text":
         (tmp_path / "runs.parquet").write_text("run,k\n")
-    assert main(["plot", str(tmp_path)]) == 2
-    assert "not a complete comparison" in capsys.readouterr().err
+    assert "not a complete comparison" in run_command("plot", tmp_path, code=2).err
 
 
-def test_list_shows_tags_of_experiments(capsys):
-    assert main(["list", "experiments"]) == 0
-    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+def test_list_shows_tags_of_experiments():
+    lines = {line.split()[0]: line for line in run_command("list", "experiments").out.splitlines()}
     assert lines["ball-drop-video"].endswith(" [published, video]")
     assert lines["pendulum-real"].endswith(" [several-parameters, real]")
 
 
-def test_list_says_what_each_thing_is(capsys):
+def test_list_says_what_each_thing_is():
     for what, expected in [
         ("tuners", ["cma_es", "tunenet", "least_squares"]),
         ("simulators", ["ball", "pendulum"]),
         ("experiments", ["ball-drop", "pendulum-real"]),
     ]:
-        assert main(["list", what]) == 0
-        lines = capsys.readouterr().out.splitlines()
+        lines = run_command("list", what).out.splitlines()
         names = [line.split()[0] for line in lines]
         assert set(expected) <= set(names)
         assert all(len(line.split()) > 3 for line in lines)

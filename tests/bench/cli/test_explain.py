@@ -5,11 +5,11 @@ import signal
 
 import pytest
 
-from bench.cli.main import main
 from bench.cli.progress_display import ProgressDisplay
 from bench.core.plugin_registries import simulators
 from sims.extended_simulator import load_extended, read_extended
 from tests.bench.diagnosis import verdict_schema
+from tests.command_output import run_command
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +27,15 @@ def folder(tmp_path_factory):
         "inertia=4e-3",
     ]
     command += ["--noise", "q=0.003", "qd=0.02", "--runs", "3", "--seconds", "1.5", "--rate", "60"]
-    assert main([*command, "--out", str(there / "swing.csv")]) == 0
-    assert main([*command, "--seed", "9", "--out", str(there / "other.csv")]) == 0
-    assert main(["explain", str(there / "swing.csv"), "--out", str(there / "out")]) == 0
+    run_command(*command, "--out", there / "swing.csv")
+    run_command(*command, "--seed", "9", "--out", there / "other.csv")
+    run_command("explain", there / "swing.csv", "--out", there / "out")
     return there
 
 
-def faulty(capsys, *command):
+def faulty(*command):
     """Return the single error line of a command that must fail, without progress lines."""
-    capsys.readouterr()
-    assert main([str(part) for part in command]) == 2
-    told = capsys.readouterr()
+    told = run_command(*command, code=2)
     lines = [line for line in told.err.splitlines() if not line.endswith(" ...")]
     assert len(lines) == 1
     assert lines[0].startswith("simgap: ")
@@ -86,11 +84,9 @@ def test_the_extended_simulator_loads_with_the_numbers_of_the_verdict(folder):
     assert read_extended(folder / "out" / "extended.toml").constants["mass"] == 0.15
 
 
-def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
+def test_the_account_says_what_was_found(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    capsys.readouterr()
-    assert main(["explain", "swing.csv", "--seed", "0"]) == 0
-    told = capsys.readouterr()
+    told = run_command("explain", "swing.csv", "--seed", "0")
     assert "The simulation lacks linear drag" in told.out
     (made,) = (folder / "results").iterdir()
     assert f"report      results/{made.name}/report.html" in told.out
@@ -103,14 +99,11 @@ def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
     assert (made / "extended.toml").read_bytes() == (folder / "out" / "extended.toml").read_bytes()
 
 
-def test_score_prints_json_with_the_keys_of_the_design(folder, capsys):
+def test_score_prints_json_with_the_keys_of_the_design(folder):
     for name in ("swing.csv", "other.csv"):
-        capsys.readouterr()
-        assert (
-            main(["score", str(folder / "out" / "extended.toml"), str(folder / name), "--json"])
-            == 0
+        found = json.loads(
+            run_command("score", folder / "out" / "extended.toml", folder / name, "--json").out
         )
-        found = json.loads(capsys.readouterr().out)
         assert list(found) == ["rmse", "normalised_rmse", "runs", "samples"]
         assert set(found["rmse"]) == {"q", "qd"}
         assert found["rmse"]["q"] == pytest.approx(0.003, rel=0.12)
@@ -118,19 +111,10 @@ def test_score_prints_json_with_the_keys_of_the_design(folder, capsys):
         assert (found["runs"], found["samples"]) == (3, 270)
 
 
-def test_score_says_it_to_a_person(folder, capsys):
-    assert (
-        main(
-            [
-                "score",
-                str(folder / "out" / "extended.toml"),
-                str(folder / "other.csv"),
-                "--held-out",
-            ]
-        )
-        == 0
-    )
-    out = capsys.readouterr().out.splitlines()
+def test_score_says_it_to_a_person(folder):
+    out = run_command(
+        "score", folder / "out" / "extended.toml", folder / "other.csv", "--held-out"
+    ).out.splitlines()
     assert out[0].startswith("q: RMSE 0.00")
     assert out[0].endswith(" rad")
     assert out[-1].endswith("times the noise; 1 run, 90 samples") or out[-1].endswith(
@@ -138,13 +122,13 @@ def test_score_says_it_to_a_person(folder, capsys):
     )
 
 
-def test_nothing_is_written_over(folder, capsys, tmp_path):
+def test_nothing_is_written_over(folder, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    line = faulty(capsys, "explain", folder / "swing.csv", "--out", tmp_path / "full")
+    line = faulty("explain", folder / "swing.csv", "--out", tmp_path / "full")
     assert "full: exists and is not empty" in line
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
-    line = faulty(capsys, "explain", folder / "swing.csv", "--out", tmp_path / "full" / "mine.txt")
+    line = faulty("explain", folder / "swing.csv", "--out", tmp_path / "full" / "mine.txt")
     assert "mine.txt: exists and is not empty" in line
 
 
@@ -164,71 +148,41 @@ def test_nothing_is_written_over(folder, capsys, tmp_path):
         (["--plugin", "none.toml"], "no such file"),
     ],
 )
-def test_bad_options_are_one_line(folder, capsys, tmp_path, options, message):
-    assert message in faulty(
-        capsys, "explain", folder / "swing.csv", "--out", tmp_path / "o", *options
-    )
+def test_bad_options_are_one_line(folder, tmp_path, options, message):
+    assert message in faulty("explain", folder / "swing.csv", "--out", tmp_path / "o", *options)
     assert not (tmp_path / "o").exists()
 
 
-def test_bad_files_are_one_line(folder, capsys, tmp_path):
+def test_bad_files_are_one_line(folder, tmp_path):
     model = folder / "out" / "extended.toml"
-    assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace(
-        "none.toml", "none.csv"
-    )
+    assert "none.csv" in faulty("explain", tmp_path / "none.csv").replace("none.toml", "none.csv")
     assert "none.toml: no such file" in faulty(
-        capsys, "score", tmp_path / "none.toml", folder / "swing.csv"
+        "score", tmp_path / "none.toml", folder / "swing.csv"
     )
-    assert "format" in faulty(capsys, "score", folder / "swing.toml", folder / "swing.csv")
-    assert "none" in faulty(capsys, "score", model, tmp_path / "none.csv")
+    assert "format" in faulty("score", folder / "swing.toml", folder / "swing.csv")
+    assert "none" in faulty("score", model, tmp_path / "none.csv")
 
 
-def test_a_tuner_may_find_where_the_fit_begins(folder, capsys, tmp_path):
-    assert (
-        main(
-            [
-                "explain",
-                str(folder / "swing.csv"),
-                "--tuner",
-                "least_squares",
-                "--out",
-                str(tmp_path / "o"),
-            ]
-        )
-        == 0
+def test_a_tuner_may_find_where_the_fit_begins(folder, tmp_path):
+    run_command(
+        "explain", folder / "swing.csv", "--tuner", "least_squares", "--out", tmp_path / "o"
     )
     found = verdict_schema.check((tmp_path / "o" / "verdict.json").read_text())
     assert [cause["effect"] for cause in found["causes"]] == ["drag.linear"]
 
 
-def test_help_says_what_the_commands_take(capsys):
-    for command, words in (
-        ("explain", ("--free", "--tuner", "--engine", "--out")),
-        ("score", ("--json", "--held-out")),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main([command, "--help"])
-        assert ended.value.code == 0
-        out = capsys.readouterr().out
-        assert all(word in out for word in words)
-
-
-def test_a_budget_that_is_over_leaves_an_answer_that_says_so(folder, capsys, tmp_path):
+def test_a_budget_that_is_over_leaves_an_answer_that_says_so(folder, tmp_path):
     out = tmp_path / "out"
-    command = ["explain", str(folder / "swing.csv"), "--budget", "1e-3", "--out", str(out)]
-    assert main(command) == 0
+    told = run_command("explain", folder / "swing.csv", "--budget", "1e-3", "--out", out).out
     found = verdict_schema.check((out / "verdict.json").read_text())
     assert (found["verdict"], found["cut"]["by"]) == ("unknown", "budget")
-    assert "The search was stopped by its time budget" in " ".join(capsys.readouterr().out.split())
+    assert "The search was stopped by its time budget" in " ".join(told.split())
     assert load_extended(out / "extended.toml", simulators.get).name == "pendulum_extended"
 
 
 @pytest.mark.parametrize("budget", ["0", "-3", "nan", "soon"])
-def test_a_bad_budget_is_one_line(folder, budget, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["explain", str(folder / "swing.csv"), f"--budget={budget}"])
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_a_bad_budget_is_one_line(folder, budget):
+    line = faulty("explain", folder / "swing.csv", f"--budget={budget}")
     assert f"expected a number of seconds above 0, found '{budget}'" in line
 
 
@@ -244,30 +198,29 @@ def interrupted(monkeypatch, times):
     monkeypatch.setattr(ProgressDisplay, "completed", completed)
 
 
-def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_path, monkeypatch):
+def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, tmp_path, monkeypatch):
     interrupted(monkeypatch, 1)
     out = tmp_path / "out"
-    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    told = run_command("explain", folder / "swing.csv", "--out", out, code=130)
     found = verdict_schema.check((out / "verdict.json").read_text())
     assert found["cut"]["by"] == "interrupt"
-    told = capsys.readouterr()
     assert "The search was stopped by an interrupt" in told.out
     assert "simgap: stopping with the results so far; Ctrl-C again stops at once" in told.err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, monkeypatch):
+def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, tmp_path, monkeypatch):
     interrupted(monkeypatch, 2)
     out = tmp_path / "out"
-    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    told = run_command("explain", folder / "swing.csv", "--out", out, code=130)
     assert not out.exists()
-    assert "interrupted before the first result" in capsys.readouterr().err
+    assert "interrupted before the first result" in told.err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_thorough_search_changes_nothing_where_nothing_is_left_over(folder, tmp_path):
     command = ["explain", str(folder / "swing.csv"), "--thorough", "--out", str(tmp_path / "o")]
-    assert main(command) == 0
+    run_command(*command)
     plain, thorough = (
         json.loads((where / "verdict.json").read_text())
         for where in (folder / "out", tmp_path / "o")

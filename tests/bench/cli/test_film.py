@@ -6,12 +6,12 @@ import pytest
 pytest.importorskip("av")
 pytest.importorskip("cv2")
 
-from bench.cli.main import main
 from bench.logs import film_tracking
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.ball import BallSystem
 from sims.vision import video_files
+from tests.command_output import run_command
 
 
 @pytest.fixture(scope="module")
@@ -19,33 +19,14 @@ def drop(tmp_path_factory):
     folder = tmp_path_factory.mktemp("film")
     made = folder / "drop.csv"
     options = ["--runs", "1", "--theta", "0.7", "--observe", "z", "--rate", "60", "--seconds", "3"]
-    assert (
-        main(
-            ["simulate", "ball", *options, "--initial", "z=3.6", "vx=0", "vy=0", "--out", str(made)]
-        )
-        == 0
-    )
-    assert (
-        main(
-            [
-                "film",
-                str(made),
-                "--out",
-                str(folder / "drop.mp4"),
-                "--camera-seed",
-                "3",
-                "--size",
-                "200",
-            ]
-        )
-        == 0
-    )
+    run_command("simulate", "ball", *options, "--initial", "z=3.6", "vx=0", "vy=0", "--out", made)
+    run_command("film", made, "--out", folder / "drop.mp4", "--camera-seed", "3", "--size", "200")
     return folder
 
 
 def test_a_tracked_film_gives_the_heights_and_explain_reads_it_unedited(drop, tmp_path):
     out = tmp_path / "tracked.csv"
-    assert main(["track", str(drop / "drop.mp4"), "--out", str(out)]) == 0
+    run_command("track", drop / "drop.mp4", "--out", out)
     tracked = read_recording(out, BallSystem, whole=True)
     truth = read_recording(drop / "drop.csv", BallSystem, whole=True).runs[0]
     run = tracked.runs[0]
@@ -55,30 +36,16 @@ def test_a_tracked_film_gives_the_heights_and_explain_reads_it_unedited(drop, tm
     assert tracked.constants["radius"] == 0.5
     assert 1e-4 < tracked.noise["z"] < 0.05
     assert out.with_suffix(".png").stat().st_size > 10_000
-    assert main(["explain", str(out), "--out", str(tmp_path / "explained")]) == 0
+    run_command("explain", out, "--out", tmp_path / "explained")
     found = json.loads((tmp_path / "explained" / "verdict.json").read_text())["parameters"][
         "restitution"
     ]
     assert abs(found["value"] - 0.7) < 0.03
 
 
-def test_without_the_camera_the_fall_gives_the_scale(drop, tmp_path, capsys):
+def test_without_the_camera_the_fall_gives_the_scale(drop, tmp_path):
     out = tmp_path / "scaled.csv"
-    assert (
-        main(
-            [
-                "track",
-                str(drop / "drop.mp4"),
-                "--out",
-                str(out),
-                "--scale",
-                "fall",
-                "--ball-diameter",
-                "1",
-            ]
-        )
-        == 0
-    )
+    run_command("track", drop / "drop.mp4", "--out", out, "--scale", "fall", "--ball-diameter", "1")
     z = read_recording(out, BallSystem, whole=True).runs[0].channels["z"]
     assert np.nanmin(z) == pytest.approx(0.5, abs=0.15)
     assert np.nanmax(z) == pytest.approx(3.6, abs=0.4)
@@ -98,17 +65,13 @@ def test_a_film_and_its_camera_come_together_or_not_at_all(drop, tmp_path, monke
         raise InputError("disk full")
 
     monkeypatch.setattr(video_files, "write_files", full)
-    assert (
-        main(["film", str(drop / "drop.csv"), "--out", str(tmp_path / "film.mp4"), "--size", "32"])
-        == 2
-    )
+    run_command("film", drop / "drop.csv", "--out", tmp_path / "film.mp4", "--size", "32", code=2)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_tracked_is_one_line_and_nothing_is_written(tmp_path, capsys):
+def test_what_cannot_be_tracked_is_one_line_and_nothing_is_written(tmp_path):
     (tmp_path / "text.mp4").write_text("hello\n" * 20)
-    assert main(["track", str(tmp_path / "text.mp4"), "--out", str(tmp_path / "t.csv")]) == 2
-    error = capsys.readouterr().err
+    error = run_command("track", tmp_path / "text.mp4", "--out", tmp_path / "t.csv", code=2).err
     assert error.count("\n") == 1
     assert "text file" in error
     assert not list(tmp_path.glob("t.*"))

@@ -3,14 +3,13 @@
 import copy
 import json
 import subprocess
-from contextlib import redirect_stdout
-from io import StringIO
 
 import pytest
 import tomli_w
 
 from bench.cli.main import COMMANDS, main
 from bench.schemas import find_violations, list_schema_names, load_schema
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND, undrawn
@@ -22,25 +21,11 @@ ARM = """<mujoco><worldbody><body name="arm"><joint name="hinge" type="hinge" ax
 """
 
 
-def answered(capsys, *arguments, code=0):
+def answered(*arguments, code=0):
     """Return the document that a command prints, and check that it is the only output."""
-    capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "80")
-        try:
-            ended = main([*map(str, arguments), "--json"])
-        except SystemExit as stop:
-            ended = stop.code
-    said = capsys.readouterr()
-    assert ended == code, said.err
-    return json.loads(said.out)
-
-
-def document_of(command):
-    """Return the document that a command prints; for fixtures, which cannot use capsys."""
-    with redirect_stdout(StringIO()) as said:
-        assert main([*map(str, command), "--json"]) == 0
-    return json.loads(said.getvalue())
+        return json.loads(run_command(*arguments, "--json", code=code).out)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +45,7 @@ def compared(place):
     """Document printed by `simgap compare`."""
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--jobs", 0, "--out", place / "run"]
     with undrawn():
-        return document_of(command)
+        return answered(*command)
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +59,15 @@ def log(place):
     """Recording of a pendulum with a hidden drag."""
     path = place / "swing.csv"
     command = ["simulate", "pendulum", "--effect", "drag.linear=4e-4", "--noise", "q=0.01"]
-    command += ["qd=0.05", "--runs", "3", "--seconds", "3", "--rate", "50", "--out", str(path)]
-    assert main(command) == 0
+    command += ["qd=0.05", "--runs", "3", "--seconds", "3", "--rate", "50", "--out", path]
+    run_command(*command)
     return path
 
 
 @pytest.fixture(scope="module")
 def explanation(place, log):
     """Document printed by `simgap explain` for the recording."""
-    return document_of(["explain", log, "--jobs", 1, "--out", place / "explained"])
+    return answered("explain", log, "--jobs", 1, "--out", place / "explained")
 
 
 @pytest.fixture(scope="module")
@@ -307,14 +292,11 @@ def test_every_command_has_a_case_and_a_schema():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_what_a_command_prints_is_of_the_form_that_its_schema_publishes(name, request, capsys):
-    def ask(*arguments, code=0):
-        return answered(capsys, *arguments, code=code)
-
+def test_what_a_command_prints_is_of_the_form_that_its_schema_publishes(name, request):
     code = CASES[name].__code__
     wanted = code.co_varnames[: code.co_argcount]
     given = {each: request.getfixturevalue(each) for each in wanted if each != "ask"}
-    documents = list(CASES[name](ask=ask, **given))
+    documents = list(CASES[name](ask=answered, **given))
     assert documents
     for document in documents:
         assert find_violations(document, name) == []
@@ -327,12 +309,12 @@ def test_what_a_command_prints_is_of_the_form_that_its_schema_publishes(name, re
             assert find_violations({**document, "unheard": 1}, name) or name == "schema"
 
 
-def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run, capsys):
+def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run):
     from jsonschema import Draft202012Validator
 
     for name in list_schema_names():
         Draft202012Validator.check_schema(load_schema(name))
-    found = answered(capsys, "status", run)
+    found = answered("status", run)
     for change in (
         lambda d: d["studies"][0]["seal"].pop("missing"),
         lambda d: d["studies"][0].update(finished=-1),
@@ -354,8 +336,8 @@ def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run, capsys):
         (["list"], None, ""),
     ],
 )
-def test_a_fault_has_one_form_and_exit_code_2(arguments, kind, message, capsys):
-    found = answered(capsys, *arguments, code=2 if kind else 0)
+def test_a_fault_has_one_form_and_exit_code_2(arguments, kind, message):
+    found = answered(*arguments, code=2 if kind else 0)
     if kind is None:
         assert "error" not in found
         return

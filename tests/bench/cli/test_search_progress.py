@@ -14,7 +14,6 @@ from itertools import pairwise
 import pytest
 
 from bench.api.explain import explain
-from bench.cli.main import main
 from bench.cli.progress_display import (
     BUDGET_HINT,
     HINT_AFTER,
@@ -25,6 +24,7 @@ from bench.cli.progress_display import (
 )
 from bench.diagnosis.evaluation.search_control import SearchControl
 from tests.bench.diagnosis.explained_samples import recording
+from tests.command_output import run_command
 
 
 class Clock:
@@ -305,7 +305,7 @@ def command(tmp_path):
     log = str(tmp_path / "swing.csv")
     noise = ["--noise", "q=0.003", "qd=0.02"]
     make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", *noise]
-    assert main([*make, "--runs", "3", "--seconds", "3", "--rate", "60", "--out", log]) == 0
+    run_command(*make, "--runs", "3", "--seconds", "3", "--rate", "60", "--out", log)
     return [sys.executable, "-m", "bench.cli.main", "explain", log, "--out", str(tmp_path / "out")]
 
 

@@ -21,6 +21,7 @@ from bench.benchmark.runner.tuner_training import (
     train_or_load,
 )
 from bench.cli.main import main
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 
@@ -230,10 +231,13 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cac
         load_trained_tuner(entry, path)
     if spoil is truncated:
         assert (
-            main(["compare", str(experiment), "--plugin", PLUGIN, "--out", str(cache.parent / "c")])
-            == 2
+            run_command(
+                "compare", experiment, "--plugin", PLUGIN, "--out", cache.parent / "c", code=2
+            )
+            .err.strip()
+            .splitlines()[-1]
+            == said
         )
-        assert capsys.readouterr().err.strip().splitlines()[-1] == said
         assert train_spring(experiment, "--again") == 0
 
 
@@ -253,9 +257,8 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cac
         ),
     ],
 )
-def test_faults_are_one_line(arguments, message, capsys):
-    assert main(["train", *arguments]) == 2
-    error = capsys.readouterr().err
+def test_faults_are_one_line(arguments, message):
+    error = run_command("train", *arguments, code=2).err
     assert message in error
     assert len(error.strip().splitlines()) == 1
 
@@ -277,10 +280,9 @@ def test_every_tuned_simulator_of_the_project_has_exactly_one_default_experiment
     assert set(DEFAULT_EXPERIMENTS) <= tuned
 
 
-def test_the_default_experiment_is_printed_and_finds_the_weights(tmp_path, capsys):
+def test_the_default_experiment_is_printed_and_finds_the_weights(tmp_path):
     words = ["tunenet", "ball", "--budget", "40", "--seeds", "1", "--out", str(tmp_path / "out")]
-    assert main(["train", *words]) == 0
-    said = capsys.readouterr().out.splitlines()
+    said = run_command("train", *words).out.splitlines()
     assert said[0] == "experiment: ball-drop"
     assert said[-1] == "used by: simgap compare ball-drop --training-budget 40"
     assert (tmp_path / "out" / "loss.csv").is_file()

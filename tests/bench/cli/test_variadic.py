@@ -4,7 +4,8 @@ import argparse
 
 import pytest
 
-from bench.cli.main import build_parser, main
+from bench.cli.main import build_parser
+from tests.command_output import run_command
 
 
 def commands():
@@ -68,14 +69,13 @@ def test_several_such_options_may_stand_before_it():
         (["--effect", "drag.linear=1", "pendulun"], "unknown simulator 'pendulun'"),
     ],
 )
-def test_faults_name_the_word_that_is_wrong(words, message, tmp_path, capsys):
-    assert main(["simulate", *words, "--out", str(tmp_path / "a.csv")]) == 2
-    assert message in capsys.readouterr().err
+def test_faults_name_the_word_that_is_wrong(words, message, tmp_path):
+    assert message in run_command("simulate", *words, "--out", tmp_path / "a.csv", code=2).err
 
 
-def test_simulate_runs_with_the_option_first(tmp_path, capsys):
+def test_simulate_runs_with_the_option_first(tmp_path):
     out = tmp_path / "swing.csv"
     words = ["--effect", "drag.linear=2e-4", "pendulum", "--runs", "1", "--seconds", "0.1"]
-    assert main(["simulate", *words, "--out", str(out)]) == 0
+    run_command("simulate", *words, "--out", out)
     assert 'system = "pendulum"' in out.with_suffix(".toml").read_text()
     assert "drag.linear" in out.with_suffix(".truth.toml").read_text()

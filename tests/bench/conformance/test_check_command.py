@@ -5,8 +5,8 @@ import json
 import pytest
 from jsonschema import validate
 
-from bench.cli.main import main
 from bench.schemas import load_schema
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.docs.documentation_pages import blocks, text_of
 
@@ -14,17 +14,16 @@ CHAOS = ["--plugin", str(PLUGINS / "chaos.py")]
 SPRING = ["--plugin", str(PLUGINS / "spring.py")]
 
 
-def checked(capsys, *arguments):
-    code = main(["check", *arguments])
-    return code, capsys.readouterr().out
+def checked(*arguments, code=0):
+    """Return what the check of a plugin prints."""
+    return run_command("check", *arguments, code=code).out
 
 
 @pytest.mark.slow
-def test_the_tuner_of_the_page_passes_every_check(tmp_path, capsys):
+def test_the_tuner_of_the_page_passes_every_check(tmp_path):
     plugin = tmp_path / "my_tuner.py"
     plugin.write_text(dict(blocks(text_of("add-a-tuner.md")))["my_tuner.py"], encoding="utf-8")
-    code, said = checked(capsys, "narrowing", "--plugin", str(plugin))
-    assert code == 0, said
+    said = checked("narrowing", "--plugin", plugin)
     assert said.count("ok    ") == 14
     assert (
         "-       stochastic is declared\n        not applicable: it declares that it is random"
@@ -53,13 +52,10 @@ def test_the_tuner_of_the_page_passes_every_check(tmp_path, capsys):
         ("chaos_nan", "found diverged: the tuner gave proposals that are not finite"),
     ],
 )
-def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(
-    name, expected, capsys, monkeypatch
-):
+def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(name, expected, monkeypatch):
     monkeypatch.setattr("bench.conformance.check_suites.CALL_TIMEOUT_SECONDS", 2.0)
     monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.0)
-    code, said = checked(capsys, name, *CHAOS)
-    assert code == 1
+    said = checked(name, *CHAOS, code=1)
     assert expected in said
     assert "FAILED  runs in one and in ten dimensions" in said
     assert "; see " in said
@@ -67,19 +63,16 @@ def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(
 
 
 @pytest.mark.slow
-def test_simulators_and_effects_are_checked_by_name(capsys):
-    code, said = checked(capsys, "drag.linear")
-    assert (code, said.splitlines()[-1]) == (
-        0,
+def test_simulators_and_effects_are_checked_by_name():
+    said = checked("drag.linear")
+    assert said.splitlines()[-1] == (
         "effect drag.linear (sims.effects.drag.LinearDrag): all 10 checks passed",
     )
-    code, said = checked(capsys, "slider")
-    assert (code, said.splitlines()[-1]) == (
-        0,
+    said = checked("slider")
+    assert said.splitlines()[-1] == (
         "simulator slider (sims.systems.slider.Slider): all 10 checks passed, 4 not applicable",
     )  # fmt: skip
-    code, said = checked(capsys, "spring", *SPRING)
-    assert code == 0, said
+    said = checked("spring", *SPRING)
 
 
 LEAKY = """from simgap import Channel, OwnSimulator, Parameter
@@ -107,37 +100,34 @@ class Leaky(OwnSimulator):
 
 
 @pytest.mark.usefixtures("fresh_registries")
-def test_state_left_over_between_runs_is_one_failure_for_people_and_programs(tmp_path, capsys):
+def test_state_left_over_between_runs_is_one_failure_for_people_and_programs(tmp_path):
     plugin = tmp_path / "leaky.py"
     plugin.write_text(LEAKY)
-    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
-    assert code == 1
+    said = checked("leaky", "--plugin", plugin, code=1)
     assert said.count("FAILED") == 1
     assert "FAILED  same proposal gives the same bits\n        expected the same numbers" in said
     assert "see Leaky.reset: it must set everything that a run has changed" in said
     needs = "not tested: needs 'same proposal gives the same bits'"
     assert f"-       initial states show\n        {needs}" in said
     assert said.splitlines()[-1].endswith(": 1 of 7 checks failed, 7 not tested")
-    code, said = checked(capsys, "leaky", "--plugin", str(plugin), "--json")
-    document = json.loads(said)
-    assert (code, document["passed"]) == (1, False)
+    document = json.loads(checked("leaky", "--plugin", plugin, "--json", code=1))
+    assert not document["passed"]
     outcomes = [check["outcome"] for check in document["checks"]]
     assert [outcomes.count(what) for what in ("passed", "failed", "not tested")] == [6, 1, 7]
     validate(document, load_schema("check"))
 
 
 @pytest.mark.usefixtures("fresh_registries")
-def test_an_exception_of_the_subject_names_its_line(tmp_path, capsys):
+def test_an_exception_of_the_subject_names_its_line(tmp_path):
     plugin = tmp_path / "leaky.py"
     plugin.write_text(LEAKY.replace('theta["friction"]', 'theta["fiction"]'))
-    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
-    assert (code, said.count("FAILED")) == (1, 1)
+    said = checked("leaky", "--plugin", plugin, code=1)
+    assert said.count("FAILED") == 1
     assert "simulator leaky: KeyError: 'fiction' (leaky.py, line 14, in reset)" in said
 
 
-def test_unknown_name_is_one_line(capsys):
-    assert main(["check", "cma_ess"]) == 2
-    error = capsys.readouterr().err
+def test_unknown_name_is_one_line():
+    error = run_command("check", "cma_ess", code=2).err
     assert error.startswith(
         "simgap: unknown tuner, simulator, effect or diagnoser 'cma_ess'; did you mean cma_es?"
     )

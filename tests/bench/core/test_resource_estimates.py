@@ -12,7 +12,6 @@ from bench.benchmark.runner.comparison_resources import (
     check_comparison_size,
     estimate_comparison_need,
 )
-from bench.cli.main import main
 from bench.core.resource_estimates import (
     FORCE_HINT,
     MachineResources,
@@ -23,6 +22,7 @@ from bench.core.resource_estimates import (
 from bench.logs.quality.clock_checks import check_recording_plausible, find_anomalies
 from bench.logs.recording_loading import load_recording as recorded
 from sims.core.simulator import InputError
+from tests.command_output import run_command
 
 BASE = {
     "simulator": "pendulum",
@@ -120,15 +120,10 @@ EXPERIMENTS = [
 ]  # fmt: skip
 
 
-def refused(capsys, arguments):
+def refused(*arguments):
     """Return the one-line error with which a command refuses, and check that it is quick."""
     begun = time.perf_counter()
-    try:
-        code = main([str(a) for a in arguments])
-    except SystemExit as end:  # error in an option
-        code = end.code
-    out, err = capsys.readouterr()
-    assert code == 2, out + err
+    out, err = run_command(*arguments, code=2)
     assert not out
     assert err.startswith("simgap: ")
     assert err.count("\n") == 1
@@ -139,12 +134,12 @@ def refused(capsys, arguments):
 
 
 @pytest.mark.parametrize("place", range(len(EXPERIMENTS)))
-def test_experiments_beyond_all_measure_are_refused(tmp_path, capsys, place):
+def test_experiments_beyond_all_measure_are_refused(tmp_path, place):
     changes, says = EXPERIMENTS[place]
     path = tmp_path / "e.toml"
     path.write_text(tomli_w.dumps({**BASE, **changes}))
     arguments = ["compare", path, "--jobs", 0, "--out", tmp_path / "out"]
-    assert says in refused(capsys, arguments)
+    assert says in refused(*arguments)
     assert sorted(tmp_path.iterdir()) == [path]
 
 
@@ -163,10 +158,10 @@ def test_experiments_beyond_all_measure_are_refused(tmp_path, capsys, place):
         (["--memory", 10**20], "--memory"),
     ],
 )
-def test_options_of_compare_beyond_all_measure(tmp_path, capsys, options, message):
+def test_options_of_compare_beyond_all_measure(tmp_path, options, message):
     path = tmp_path / "e.toml"
     path.write_text(tomli_w.dumps(BASE))
-    line = refused(capsys, ["compare", path, "--out", tmp_path / "out", *options])
+    line = refused("compare", path, "--out", tmp_path / "out", *options)
     assert message in line
     assert not (tmp_path / "out").exists()
 
@@ -203,8 +198,8 @@ def test_options_of_compare_beyond_all_measure(tmp_path, capsys, options, messag
         (["--observe", ",".join(["q"] * 10**5)], "different channels"),
     ],
 )
-def test_simulations_beyond_all_measure(tmp_path, capsys, options, message):
-    line = refused(capsys, ["simulate", "pendulum", "--out", tmp_path / "s.csv", *options])
+def test_simulations_beyond_all_measure(tmp_path, options, message):
+    line = refused("simulate", "pendulum", "--out", tmp_path / "s.csv", *options)
     assert message in line
     assert not list(tmp_path.iterdir())
 
@@ -264,17 +259,17 @@ high = 0.0034
     ],
 )
 @pytest.mark.parametrize("command", ["explain", "score"])
-def test_recordings_beyond_all_measure(tmp_path, capsys, size_options, message, command):
+def test_recordings_beyond_all_measure(tmp_path, size_options, message, command):
     path = swing(tmp_path, **size_options)
     arguments = ["explain", path, "--out", tmp_path / "out"]
     if command == "score":
         (tmp_path / "model.toml").write_text(MODEL)
         arguments = ["score", tmp_path / "model.toml", path]
-    assert message in refused(capsys, arguments)
+    assert message in refused(*arguments)
     assert not (tmp_path / "out").exists()
 
 
-def test_other_commands_refuse_what_is_beyond_all_measure(tmp_path, capsys, monkeypatch):
+def test_other_commands_refuse_what_is_beyond_all_measure(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     training = ["train", "tunenet", "ball", "--experiment", "ball-drop"]
     for options, says in (
@@ -282,15 +277,15 @@ def test_other_commands_refuse_what_is_beyond_all_measure(tmp_path, capsys, monk
         (["--seeds", 10**9], "lower seeds"),
         (["--budget", 1], "give a larger --budget"),
     ):
-        assert says in refused(capsys, [*training, *options])
+        assert says in refused(*training, *options)
     path = tmp_path / "drop.csv"
     path.write_text("run,t,z\n" + "".join(f"1,{i / 30},{5 - i * i / 200}\n" for i in range(20)))
     path.with_suffix(".toml").write_text('system = "ball"\n[channels.z]\nunit = "m"\n')
     for pixels in (10**6, 10**18):
-        line = refused(capsys, ["film", path, "--out", tmp_path / "f.mp4", "--size", pixels])
+        line = refused("film", path, "--out", tmp_path / "f.mp4", "--size", pixels)
         assert "lower the size" in line
     for option, value in (("--fps", "1e308"), ("--fps", "nan"), ("--ball-diameter", "1e308")):
-        line = refused(capsys, ["track", path, "--out", tmp_path / "t.csv", option, value])
+        line = refused("track", path, "--out", tmp_path / "t.csv", option, value)
         assert "expected more than 0" in line
 
 
@@ -381,10 +376,9 @@ def test_sound_recordings_are_not_odd(recordings, tmp_path):
     assert list(find_anomalies(recording, kind)) == []
 
 
-def test_motion_that_is_too_fast_is_said_and_not_refused(tmp_path, capsys):
+def test_motion_that_is_too_fast_is_said_and_not_refused(tmp_path):
     path = swing(tmp_path, factor=1e-3)
     recording, kind = recorded(path)
     (odd,) = {odd.certain for odd in find_anomalies(recording, kind)}
     assert not odd
-    assert main(["inspect", str(path), "--out", str(tmp_path / "out")]) == 0
-    assert "are the stamps seconds?" in capsys.readouterr().out
+    assert "are the stamps seconds?" in run_command("inspect", path, "--out", tmp_path / "out").out

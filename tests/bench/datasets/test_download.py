@@ -21,6 +21,7 @@ from bench.datasets import dataset_catalogue
 from bench.datasets.dataset_catalogue import SourceFile
 from sims.recording.recording import read_recording
 from sims.systems.pendulum import Pendulum
+from tests.command_output import run_command
 
 MAT = "ParameterEstimation/SinglePendulum/SinglePendulumDataForParameterEstimation.mat"
 LICENCE = b"Anybody may use this.\n"
@@ -121,8 +122,7 @@ def served(repository):
 def refused(capsys, *words):
     """Return the one-line error of `simgap download`, and check that no file has been written."""
     capsys.readouterr()
-    assert main(["download", "pendulum_free_swing", *map(str, words)]) == 2
-    said = capsys.readouterr()
+    said = run_command("download", "pendulum_free_swing", *words, code=2)
     assert said.out == ""
     assert len(said.err.splitlines()) == 1, said.err
     folder = dataset_catalogue.get_user_folder()
@@ -180,21 +180,18 @@ def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat, c
     assert f"experiments find it with SIMGAP_DATA={out}" in capsys.readouterr().out
 
 
-def test_what_is_here_is_not_downloaded_again(repository, capsys):
+def test_what_is_here_is_not_downloaded_again(repository):
     words = ["download", "pendulum_free_swing"]
-    assert main([*words, "--from", str(repository)]) == 0
-    capsys.readouterr()
-    assert main([*words, "--from", "/nowhere"]) == 0
-    assert "already in" in capsys.readouterr().out
+    run_command(*words, "--from", repository)
+    assert "already in" in run_command(*words, "--from", "/nowhere").out
 
 
-def test_an_experiment_finds_what_was_downloaded(repository, capsys):
-    assert main(["compare", "pendulum-real", "--targets", "1"]) == 2
-    said = capsys.readouterr().err
+def test_an_experiment_finds_what_was_downloaded(repository):
+    said = run_command("compare", "pendulum-real", "--targets", "1", code=2).err
     assert said.count("\n") == 1
     assert "run `simgap download pendulum_free_swing`" in said
     assert availability(load_experiment("pendulum-real")).data_set.name == "pendulum_free_swing"
-    assert main(["download", "pendulum_free_swing", "--from", str(repository)]) == 0
+    run_command("download", "pendulum_free_swing", "--from", repository)
     assert availability(load_experiment("pendulum-real")).data_set is None
 
 
@@ -268,9 +265,10 @@ def test_a_source_that_cannot_be(repository, capsys, words, message):
     assert message in refused(capsys, *words)
 
 
-def test_an_unknown_name_names_those_that_there_are(capsys):
-    assert main(["download", "pendulum"]) == 2
-    assert "there are: pendulum_free_swing, so101" in capsys.readouterr().err
+def test_an_unknown_name_names_those_that_there_are():
+    assert (
+        "there are: pendulum_free_swing, so101" in run_command("download", "pendulum", code=2).err
+    )
 
 
 def test_a_folder_with_other_things_is_left_alone(repository, tmp_path, capsys):
@@ -302,18 +300,19 @@ def test_a_file_of_other_content_is_no_recording(content):
     assert "\n" not in str(raised.value)
 
 
-def test_the_list_says_what_there_is_where_and_for_what(repository, capsys):
-    assert main(["download", "--json"]) == 0
-    listed = {one["name"]: one for one in json.loads(capsys.readouterr().out)["data_sets"]}
+def test_the_list_says_what_there_is_where_and_for_what(repository):
+    listed = {
+        one["name"]: one for one in json.loads(run_command("download", "--json").out)["data_sets"]
+    }
     assert listed["so101"]["experiments"] == ["robot-so101"]
     assert listed["so101"]["folder"] is None
-    assert main(["download", "pendulum_free_swing", "--from", str(repository), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(
+        run_command("download", "pendulum_free_swing", "--from", repository, "--json").out
+    )
     assert document["downloaded"] == ["pendulum_free_swing"]
     (one,) = document["data_sets"]
     assert Path(one["folder"]).is_dir()
-    assert main(["download"]) == 0
-    said = capsys.readouterr().out
+    said = run_command("download").out
     assert f"in {one['folder']}" in said
     assert "not here: run `simgap download so101`" in said
 

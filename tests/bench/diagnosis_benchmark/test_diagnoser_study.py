@@ -9,7 +9,6 @@ import pytest
 
 import simgap
 from bench.benchmark.problem.experiment import load_experiment
-from bench.cli import main as cli
 from bench.core.plugin_registries import REGISTRIES
 from bench.diagnosis_benchmark.answer_store import ANSWERS_FILE, AnswerStore, read_answers
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
@@ -18,6 +17,7 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
 )
 from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set, read_config
 from sims.core.simulator import InputError
+from tests.command_output import run_command
 
 PLUGIN = Path(__file__).with_name("plugin.py")
 TOML = """
@@ -40,11 +40,11 @@ runs = [3]
 MISBEHAVING = ("peeks", "hangs", "crashes", "spends", "lies")
 
 
-def main(arguments):
+def compare(*arguments, code=0):
     """Run the command as in a separate process: registered plugins are removed afterwards."""
     before = [registry.snapshot() for registry in REGISTRIES]
     try:
-        return cli.main(arguments)
+        return run_command("compare", *arguments, code=code)
     finally:
         for registry, snapshot in zip(REGISTRIES, before, strict=True):
             registry.restore(snapshot)
@@ -75,12 +75,12 @@ def finished_study(tmp_path_factory):
     out = folder / "out"
     knowing = folder / "knowing.py"
     knowing.write_text(PLUGIN.read_text().replace('WHERE = "/tmp"', f"WHERE = {str(out)!r}"))
-    code = main(["compare", str(path), "--plugin", str(knowing), "--out", str(out), "--jobs", "1"])
-    return code, out
+    compare(path, "--plugin", knowing, "--out", out, "--jobs", 1, code=1)
+    return out
 
 
 def test_a_diagnoser_of_a_plugin_file_is_in_the_table(finished_study):
-    _, out = finished_study
+    out = finished_study
     own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
     assert [row["status"] for row in own] == ["done", "done"]
     assert all(0 < int(row["simulations"]) <= 6 for row in own)
@@ -91,24 +91,23 @@ def test_a_diagnoser_of_a_plugin_file_is_in_the_table(finished_study):
 
 
 def test_a_diagnoser_cannot_read_the_hidden_causes(finished_study):
-    _, out = finished_study
+    out = finished_study
     peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
     assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_trusted_diagnoser_could_read_the_hidden_causes(finished_study, tmp_path):
-    _, out = finished_study
+    out = finished_study
     path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
     given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
-    assert main(["compare", str(path), *given]) == 0
+    compare(path, *given)
     rows = items(tmp_path / "out")
     assert {(row["verdict"], row["trusted"]) for row in rows} == {("unknown", "True")}
 
 
 def test_failed_answers_stay_in_the_table_and_stop_no_other(finished_study):
-    code, out = finished_study
-    assert code == 1
+    out = finished_study
     rows = {row["diagnoser"]: row for row in items(out) if row["kind"] == "single"}
     assert rows["hangs"]["status"] == "timeout"
     assert rows["crashes"]["status"] == "crashed"
@@ -121,7 +120,7 @@ def test_failed_answers_stay_in_the_table_and_stop_no_other(finished_study):
 
 
 def test_python_reads_the_folder_of_the_command(finished_study):
-    _, out = finished_study
+    out = finished_study
     run = simgap.ComparisonResult(out)
     assert len(run.runs) == 2 * (1 + len(MISBEHAVING))
     assert run.runs["alarm"].dtype == bool
@@ -141,7 +140,7 @@ def test_python_reads_the_folder_of_the_command(finished_study):
 
 
 def test_a_damaged_table_is_one_line(finished_study, tmp_path):
-    _, out = finished_study
+    out = finished_study
     folder = tmp_path / "copy"
     shutil.copytree(out, folder)
     table = folder / "items.csv"
@@ -151,13 +150,11 @@ def test_a_damaged_table_is_one_line(finished_study, tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
+def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path):
     path, out = written(tmp_path, "fifteen", "declines"), tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
-    assert main(["compare", str(path), *given]) == 0
-    assert (
-        "declines does not support 2 of the cases: it knows no sliders" in capsys.readouterr().out
-    )
+    said = "declines does not support 2 of the cases: it knows no sliders"
+    assert said in compare(path, *given).out
     run = simgap.ComparisonResult(out)
     rows = run.runs.set_index("diagnoser")
     assert set(rows.loc["declines", "outcome"]) == {"skipped"}
@@ -166,28 +163,24 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     assert counted["fifteen", "false alarms"] == 1
     assert "declines" not in set(run.tables["failures"]["diagnoser"])
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "declines does not support 2 of the cases: it knows no sliders." in page
+    assert f"{said}." in page
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_study_resumes(finished_study, tmp_path, capsys):
+def test_a_study_resumes(finished_study, tmp_path):
     path = written(tmp_path, "fifteen")
     out = tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--jobs", "1"]
-    assert main(["compare", str(path), "--out", str(out), *given]) == 0
+    compare(path, "--out", out, *given)
     lines = (out / ANSWERS_FILE).read_text().splitlines(keepends=True)
     (out / ANSWERS_FILE).write_text(lines[0] + lines[1][:40])  # as if the run had been killed
-    capsys.readouterr()
-    assert main(["status", str(out)]) == 1
-    assert "1 of 2 answers given" in capsys.readouterr().out
-    assert main(["compare", "--resume", str(out), "--jobs", "1"]) == 0
+    assert "1 of 2 answers given" in run_command("status", out, code=1).out
+    compare("--resume", out, "--jobs", 1)
     assert set(read_answers(out)) == {"clean/slider/0", "single/slider/drag.linear/8/50/3/0"}
     first = json.loads(lines[0])
     again = read_answers(out)[first["question"]]["rows"]["fifteen"]
     assert again == first["rows"][0]  # and was not evaluated again
-    capsys.readouterr()
-    assert main(["plot", str(out), "--json"]) == 0
-    (said,) = json.loads(capsys.readouterr().out)["comparisons"]
+    (said,) = json.loads(run_command("plot", out, "--json").out)["comparisons"]
     shares = {line["metric"]: line for line in said["results"]}
     assert shares["false alarms"]["of"] == shares["named, alone"]["of"] == 1
     assert str(out / "report.html") in said["files"]
@@ -201,7 +194,7 @@ def test_a_secret_salt_draws_other_questions_and_is_stored_at_the_end(tmp_path):
     out, public = tmp_path / "out", load_experiment(str(written(tmp_path, "fifteen")))
     path.write_text(path.read_text().replace('salt = "public"\n', ""))
     secret = ["--secret", "nobody knows", "--plugin", str(PLUGIN), "--jobs", "1"]
-    assert main(["compare", str(path), "--out", str(out), *secret]) == 0
+    compare(path, "--out", out, *secret)
     configuration = (out / "experiment.toml").read_text()
     assert "nobody knows" in configuration  # revealed, as the study is complete
     names = {one["item"]["name"] for one in read_answers(out).values()}
@@ -235,19 +228,18 @@ def test_recording_conditions_are_as_requested():
         ('[[diagnosis.questions]]\nkind = "clean"\ncount = 0', "count: expected 1 to"),
     ],
 )
-def test_a_fault_in_the_table_is_one_line(tmp_path, capsys, more, message):
+def test_a_fault_in_the_table_is_one_line(tmp_path, more, message):
     path = written(tmp_path, "simgap", more=more)
-    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
+    error = compare(path, "--out", tmp_path / "out", code=2).err
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_diagnoser_is_refused(tmp_path, capsys):
+def test_an_unknown_diagnoser_is_refused(tmp_path):
     path = written(tmp_path, "oracle")
-    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
-    assert "unknown diagnoser 'oracle'; there are: classifier" in capsys.readouterr().err
+    error = compare(path, "--out", tmp_path / "out", code=2).err
+    assert "unknown diagnoser 'oracle'; there are: classifier" in error
 
 
 def test_two_studies_in_one_folder_are_refused(tmp_path):

@@ -6,10 +6,9 @@ import sys
 
 import pytest
 
-from bench.cli import main as cli
-from bench.core.plugin_registries import REGISTRIES
 from bench.diagnosis_benchmark.diagnosers.language_model import parse_answer
 from sims.core.simulator import InputError
+from tests.command_output import run_command
 
 EXPERIMENT = """
 budget = 20000
@@ -45,29 +44,24 @@ print("I think the answer is:\\n```json\\n" + json.dumps(answer) + "\\n```")
 
 
 @pytest.fixture
-def restored_registries(monkeypatch):
+def diagnoser_command(monkeypatch, fresh_registries):
     monkeypatch.setenv("SIMGAP_DIAGNOSER_COMMAND", "")  # restored afterwards
     monkeypatch.setattr("bench.diagnosis_benchmark.diagnoser_report.draw_figures", lambda *_: {})
-    before = [registry.snapshot() for registry in REGISTRIES]
-    yield
-    for registry, snapshot in zip(REGISTRIES, before, strict=True):
-        registry.restore(snapshot)
 
 
-def compare(folder, command):
-    (folder / "board.toml").write_text(EXPERIMENT)
-    out = folder / "out"
-    arguments = ["compare", str(folder / "board.toml"), "--command", command, "--jobs", "0"]
-    code = cli.main([*arguments, "--out", str(out)])
+def compare(folder, command, code=0):
+    """Compare diagnosers, one of which is a command; return the rows of the answers."""
+    path, out = folder / "board.toml", folder / "out"
+    path.write_text(EXPERIMENT)
+    run_command("compare", path, "--command", command, "--jobs", 0, "--out", out, code=code)
     with (out / "items.csv").open(encoding="utf-8") as file:
-        return code, list(csv.DictReader(file))
+        return list(csv.DictReader(file))
 
 
-def test_a_command_is_a_diagnoser(tmp_path, restored_registries):
+def test_a_command_is_a_diagnoser(tmp_path, diagnoser_command):
     stub, prompt = tmp_path / "stub.py", tmp_path / "prompt.txt"
     stub.write_text(STUB)
-    code, rows = compare(tmp_path, f"{sys.executable} {stub} {prompt}")
-    assert code == 0
+    rows = compare(tmp_path, f"{sys.executable} {stub} {prompt}")
     assert {row["diagnoser"] for row in rows} == {"language-model"}
     assert [row["status"] for row in rows] == ["done", "done"]
     assert sorted(row["verdict"] for row in rows) == ["adequate", "named"]
@@ -79,9 +73,8 @@ def test_a_command_is_a_diagnoser(tmp_path, restored_registries):
     assert {"verdict", "causes"} <= set(text.replace('"', " ").split())
 
 
-def test_a_failing_command_is_a_failed_answer(tmp_path, restored_registries):
-    code, rows = compare(tmp_path, f"{sys.executable} -c 'import sys; sys.exit(3)'")
-    assert code == 1
+def test_a_failing_command_is_a_failed_answer(tmp_path, diagnoser_command):
+    rows = compare(tmp_path, f"{sys.executable} -c 'import sys; sys.exit(3)'", code=1)
     assert {row["status"] for row in rows} == {"crashed"}
     assert "exit code 3" in rows[0]["reason"]
 

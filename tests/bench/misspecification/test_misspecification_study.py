@@ -22,7 +22,6 @@ from bench.benchmark.problem.experiment import (
 from bench.benchmark.problem.recording_observations import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.stored_study import prepare_study
-from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores
 from bench.misspecification.calibration import (
@@ -36,6 +35,7 @@ from bench.studies.study import begin_studies, get_study_class
 from sims import extended_simulator as extending
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
+from tests.command_output import run_command
 
 EXPONENT, GRAVITY = -0.1, 9.81
 SHOT = load_experiment("misspecified-shot")
@@ -148,7 +148,7 @@ def test_what_is_complete_is_taken_up_and_nothing_is_made_again(folder):
     assert {end.group for end in standing.ends} >= {"plain random", "extended least_squares"}
 
 
-def test_it_is_reported_in_words_tables_and_figures(folder, capsys):
+def test_it_is_reported_in_words_tables_and_figures(folder):
     said = (folder / "said.txt").read_text()
     found = "the true system has restitution.speed -0.1; explain reports named: restitution.speed"
     assert found in said
@@ -161,10 +161,8 @@ def test_it_is_reported_in_words_tables_and_figures(folder, capsys):
     assert len(compared.statuses) == 12
     with pytest.raises(InputError, match="figures of a study of two comparisons are files"):
         compared.figure("error")
-    assert main(["verify", str(folder)]) == 2
-    assert "name one of the two in it" in capsys.readouterr().err
-    assert main(["status", str(folder)]) == 0
-    assert "12 of 12 runs finished, complete" in capsys.readouterr().out
+    assert "name one of the two in it" in run_command("verify", folder, code=2).err
+    assert "12 of 12 runs finished, complete" in run_command("status", folder).out
 
 
 def test_failures_count_and_rank_last(folder):

@@ -10,8 +10,8 @@ import pytest
 
 from bench.benchmark.problem.targets import count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.cli.main import main
 from sims.core.simulator import Channel, InputError, Parameter, Simulator
+from tests.command_output import run_command
 from tests.sample_experiments import spring_experiment
 
 PLUGIN = '''
@@ -94,9 +94,10 @@ def test_diverging_targets_are_drawn_again_and_counted(exploding, tmp_path):
     assert "Warning" not in verified.stderr
 
 
-def test_too_many_diverging_targets_are_refused_in_one_message(exploding, tmp_path, capsys):
-    assert main([*exploding(2000.0), "--out", str(tmp_path / "out")]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+def test_too_many_diverging_targets_are_refused_in_one_message(exploding, tmp_path):
+    (line,) = (
+        run_command(*exploding(2000.0), "--out", tmp_path / "out", code=2).err.strip().splitlines()
+    )
     assert "targets drawn diverges" in line
     assert "expected at most 90%: narrow the bounds and training ranges" in line
     assert not (tmp_path / "out").exists()

@@ -10,8 +10,8 @@ import zipfile
 import pytest
 import tomli_w
 
-from bench.cli.main import main
 from bench.studies import archive_bundle as archives
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import undrawn
@@ -29,19 +29,20 @@ def place(tmp_path_factory):
     (folder / "small.toml").write_text(tomli_w.dumps(document))
     command = ["compare", str(folder / "small.toml"), *PLUGIN, "--jobs", "1", "--salt", "a secret"]
     with undrawn():
-        assert main([*command, "--out", str(folder / "run")]) == 0
+        run_command(*command, "--out", folder / "run")
     log = folder / "swing.csv"
     command = ["simulate", "pendulum", "--effect", "drag.linear=4e-4", "--noise", "q=0.01"]
-    assert main([*command, "--observe", "q", "--runs", "2", "--seconds", "2", "--rate", "50",
-                 "--out", str(log)]) == 0  # fmt: skip
-    assert main(["explain", str(log), "--jobs", "1", "--out", str(folder / "told")]) == 0
+    run_command(
+        *command, "--observe", "q", "--runs", "2", "--seconds", "2", "--rate", "50", "--out", log
+    )
+    run_command("explain", log, "--jobs", "1", "--out", folder / "told")
     return folder
 
 
 @pytest.fixture(scope="module")
 def compared(place):
     """Archive of the comparison."""
-    assert main(["bundle", str(place / "run"), "--out", str(place / "run.zip")]) == 0
+    run_command("bundle", place / "run", "--out", place / "run.zip")
     return place / "run.zip"
 
 
@@ -49,14 +50,13 @@ def compared(place):
 def explanation_archive(place):
     """Archive of the explanation with its recording."""
     command = ["bundle", str(place / "told"), "--with", str(place / "swing.csv")]
-    assert main([*command, "--out", str(place / "told.zip")]) == 0
+    run_command(*command, "--out", place / "told.zip")
     return place / "told.zip"
 
 
-def verified(archive, capsys, *options):
-    capsys.readouterr()
-    code = main(["verify", str(archive), *PLUGIN, "--json", *options])
-    return code, json.loads(capsys.readouterr().out)
+def verified(archive, code=0):
+    """Return the document that the verification of an archive or folder prints."""
+    return json.loads(run_command("verify", archive, *PLUGIN, "--json", code=code).out)
 
 
 def content(archive):
@@ -95,49 +95,48 @@ def test_the_folder_is_in_it_whole_and_the_same_folder_gives_the_same_bytes(
     assert manifest["command"] == "simgap compare run/experiment.toml"
     again = tmp_path / "again.zip"
     shutil.copytree(place / "run", tmp_path / "run")  # other time stamps and another location
-    assert main(["bundle", str(tmp_path / "run"), "--out", str(again)]) == 0
+    run_command("bundle", tmp_path / "run", "--out", again)
     assert again.read_bytes() == compared.read_bytes()
 
 
 def test_it_is_never_written_over_and_an_unfinished_comparison_is_refused(
-    place, compared, tmp_path, capsys
+    place, compared, tmp_path
 ):
-    assert main(["bundle", str(place / "run"), "--out", str(compared)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in run_command("bundle", place / "run", "--out", compared, code=2).err
     shutil.copytree(place / "run", tmp_path / "run")
     (tmp_path / "run" / "segments").mkdir()
-    assert main(["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "a.zip")]) == 2
-    assert "not finished" in capsys.readouterr().err
+    assert (
+        "not finished"
+        in run_command("bundle", tmp_path / "run", "--out", tmp_path / "a.zip", code=2).err
+    )
     assert not (tmp_path / "a.zip").exists()
 
 
-def test_what_was_made_follows(compared, explanation_archive, capsys):
-    code, found = verified(compared, capsys)
-    assert (code, found["follows"], found["archive"]["doubts"]) == (0, True, [])
+def test_what_was_made_follows(compared, explanation_archive):
+    found = verified(compared)
+    assert (found["follows"], found["archive"]["doubts"]) == (True, [])
     checked = found["comparisons"][0]["checked"]
     assert any("the salt has the SHA-256 that was committed" in line for line in checked)
     assert any("16 of 16 rows simulated again" in line for line in checked)
-    code, found = verified(explanation_archive, capsys)
-    assert (code, found["explanation"]["unchecked"]) == (0, [])
+    found = verified(explanation_archive)
+    assert found["explanation"]["unchecked"] == []
     assert any("is reproduced" in line for line in found["explanation"]["checked"])
 
 
-def test_a_folder_of_an_explanation_is_checked_too_and_what_cannot_be_is_said(place, capsys):
-    code, found = verified(place / "told", capsys)
-    assert code == 0
+def test_a_folder_of_an_explanation_is_checked_too_and_what_cannot_be_is_said(place):
+    found = verified(place / "told")
     assert found["archive"] is None
     assert "the recording is not in it" in found["explanation"]["unchecked"][0]
 
 
-def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys, tmp_path):
+def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, tmp_path):
     """The simulator is in a plugin; without it on the command line, nothing is simulated."""
     from bench.core.plugin_registries import simulators
 
     before = simulators.snapshot()
     simulators.restore({})
     try:
-        assert main(["verify", str(compared)]) == 2
-        assert "unknown simulator 'spring'" in capsys.readouterr().err
+        assert "unknown simulator 'spring'" in run_command("verify", compared, code=2).err
     finally:
         simulators.restore(before)
 
@@ -151,25 +150,23 @@ def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys
     ],
 )
 def test_a_file_that_is_changed_added_or_missing_is_named(
-    compared, tmp_path, capsys, change, file, message
+    compared, tmp_path, change, file, message
 ):
     files = content(compared)
     change(files)
-    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
-    assert code == 1
+    found = verified(packed(tmp_path / "a.zip", files), code=1)
     (doubt,) = found["archive"]["doubts"]
     assert (doubt["file"], message in doubt["says"]) == (file, True)
     assert found["comparisons"] == []
 
 
-def test_a_forged_manifest_is_detected_by_the_rows(compared, tmp_path, capsys):
+def test_a_forged_manifest_is_detected_by_the_rows(compared, tmp_path):
     files = content(compared)
     table = files["run/table.csv"].decode().splitlines()
     cells = table[1].split(",")
     cells[5] = str(float(cells[5]) / 2)
     files["run/table.csv"] = "\n".join([table[0], ",".join(cells), *table[2:], ""]).encode()
-    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "run")), capsys)
-    assert code == 1
+    found = verified(packed(tmp_path / "a.zip", listed_again(files, "run")), code=1)
     assert found["archive"]["doubts"] == []
     assert found["comparisons"][0]["doubts"][0]["says"].startswith("median: expected")
 
@@ -190,24 +187,20 @@ def word(verdict):
     ("change", "message"),
     [(coefficient, "drag.linear coefficient"), (held_out, "recomputed"), (word, "proven")],
 )
-def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, capsys, change, message):
+def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, change, message):
     files = content(explanation_archive)
     verdict = json.loads(files["told/verdict.json"])
     change(verdict)
     files["told/verdict.json"] = json.dumps(verdict).encode()
-    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)
-    assert code == 1
+    found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), code=1)
     assert any(message in doubt["says"] for doubt in found["explanation"]["doubts"])
 
 
-def test_another_recording_than_the_explained_one_is_detected(
-    explanation_archive, tmp_path, capsys
-):
+def test_another_recording_than_the_explained_one_is_detected(explanation_archive, tmp_path):
     files = content(explanation_archive)
     rows = files["told/recordings/swing.csv"].decode()
     files["told/recordings/swing.csv"] = rows.replace("0.0", "0.1", 1).encode()
-    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)
-    assert code == 1
+    found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), code=1)
     assert "expected the recording that was explained" in found["explanation"]["doubts"][0]["says"]
 
 
@@ -234,11 +227,10 @@ def entry(name, mode=stat.S_IFREG | 0o644):
     ],
 )
 def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
-    compared, tmp_path, capsys, name, mode, message
+    compared, tmp_path, name, mode, message
 ):
     made = packed(tmp_path / "a.zip", content(compared), [(entry(name, mode | 0o644), "evil")])
-    code, found = verified(made, capsys)
-    assert code == 2
+    found = verified(made, code=2)
     assert message in found["error"]["message"]
     assert "nothing was unpacked" in found["error"]["message"]
     assert not list(tmp_path.rglob("evil*"))
@@ -247,28 +239,24 @@ def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
 @pytest.mark.parametrize(
     ("limit", "at"), [("MAX_COMPRESSION_RATIO", 3), ("MAX_UNPACKED_BYTES", 1 << 20)]
 )
-def test_a_bomb_is_refused_before_it_is_unpacked(
-    compared, tmp_path, capsys, monkeypatch, limit, at
-):
+def test_a_bomb_is_refused_before_it_is_unpacked(compared, tmp_path, monkeypatch, limit, at):
     monkeypatch.setattr(archives, "_MIN_BYTES_FOR_RATIO_CHECK", 1 << 20)
     monkeypatch.setattr(archives, limit, at)
     files = {**content(compared), "run/zeros": bytes(10 << 20)}
-    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
-    assert code == 2
+    found = verified(packed(tmp_path / "a.zip", files), code=2)
     assert "it would unpack from" in found["error"]["message"]
     monkeypatch.setattr(archives, "_MAX_FILES", 3)
-    assert "files, at most 3" in verified(compared, capsys)[1]["error"]["message"]
+    assert "files, at most 3" in verified(compared, 2)["error"]["message"]
 
 
-def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, capsys):
+def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path):
     path = packed(tmp_path / "a.zip", {**content(compared), "run/zeros": bytes(3 << 20)})
     data = bytearray(path.read_bytes())
     # The last entry of the central directory is that of the zeros; its size is replaced by 10.
     place = data.rindex(b"PK\x01\x02")
     data[place + 24 : place + 28] = struct.pack("<I", 10)
     path.write_bytes(data)
-    code, found = verified(path, capsys)
-    assert code == 2
+    found = verified(path, code=2)
     assert str(path) in found["error"]["message"]
 
 
@@ -282,12 +270,9 @@ def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, caps
         (lambda d: d.replace(CENTRAL + b"\0", CENTRAL + b"\1"), "is encrypted"),
     ],
 )
-def test_an_archive_with_more_or_less_around_it_is_refused(
-    compared, tmp_path, capsys, change, message
-):
+def test_an_archive_with_more_or_less_around_it_is_refused(compared, tmp_path, change, message):
     (tmp_path / "a.zip").write_bytes(change(compared.read_bytes()))
-    code, found = verified(tmp_path / "a.zip", capsys)
-    assert code == 2
+    found = verified(tmp_path / "a.zip", code=2)
     assert message in found["error"]["message"]
 
 
@@ -301,31 +286,27 @@ def test_an_archive_with_more_or_less_around_it_is_refused(
         (lambda f: f.update({"other/a.txt": b"a"}), "one folder with manifest.json in it"),
     ],
 )
-def test_an_invalid_manifest_is_refused(compared, tmp_path, capsys, change, message):
+def test_an_invalid_manifest_is_refused(compared, tmp_path, change, message):
     files = content(compared)
     change(files)
-    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
-    assert code == 2
+    found = verified(packed(tmp_path / "a.zip", files), code=2)
     assert message in found["error"]["message"]
 
 
-def test_a_file_listed_twice_is_noticed(compared, tmp_path, capsys):
+def test_a_file_listed_twice_is_noticed(compared, tmp_path):
     files = content(compared)
     manifest = json.loads(files["run/manifest.json"])
     manifest["files"].append(manifest["files"][0])
     files["run/manifest.json"] = json.dumps(manifest).encode()
-    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
-    assert code == 1
+    found = verified(packed(tmp_path / "a.zip", files), code=1)
     assert "listed twice" in found["archive"]["doubts"][0]["says"]
 
 
-def test_links_and_hidden_files_are_left_out_and_said(place, tmp_path, capsys):
+def test_links_and_hidden_files_are_left_out_and_said(place, tmp_path):
     shutil.copytree(place / "run", tmp_path / "run")
     (tmp_path / "run" / "secret").symlink_to("/etc/passwd")
     (tmp_path / "run" / ".token").write_text("mine")
-    capsys.readouterr()
     command = ["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "a.zip"), "--json"]
-    assert main(command) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(run_command(*command).out)
     assert found["left_out"] == [".token: hidden", "secret: a link"]
     assert not {"run/secret", "run/.token"} & set(content(tmp_path / "a.zip"))

@@ -11,8 +11,8 @@ import tomli_w
 
 from bench.benchmark.runner.stored_study import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
-from bench.cli.main import main
 from bench.figures.style import TRUSTED_TUNERS_NOTE
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import undrawn
@@ -31,7 +31,7 @@ def finished_folder(tmp_path_factory):
     (folder / "e.toml").write_text(tomli_w.dumps(document))
     command = ["compare", str(folder / "e.toml"), *PLUGIN, "--jobs", "1", "--salt", SECRET]
     with undrawn():
-        assert main([*command, "--out", str(folder / "out")]) == 0
+        run_command(*command, "--out", folder / "out")
     return folder / "out"
 
 
@@ -41,16 +41,13 @@ def folder(finished_folder, tmp_path):
     return tmp_path / "copy"
 
 
-def verified(folder, capsys, *options):
-    capsys.readouterr()
-    code = main(["verify", str(folder), *options])
-    said = capsys.readouterr()
-    return code, said.out + said.err
+def verified(folder, *options, code=0):
+    """Return all that the verification of a folder prints."""
+    return "".join(run_command("verify", folder, *options, code=code))
 
 
-def test_what_was_made_follows(finished_folder, capsys):
-    code, said = verified(finished_folder, capsys)
-    assert code == 0
+def test_what_was_made_follows(finished_folder):
+    said = verified(finished_folder)
     assert "the salt has the SHA-256 that was committed" in said
     assert "4 targets drawn again, 48 rows compared" in said
     assert "48 of 48 rows simulated again" in said
@@ -84,41 +81,36 @@ def half(rows):
         ("heldout_error", slice(20, 20)),
     ],
 )
-def test_a_number_that_was_made_better_does_not_follow(folder, capsys, column, where):
-    before = pd.read_parquet(folder / "runs.parquet")[column][where]
+def test_a_number_that_was_made_better_does_not_follow(folder, column, where):
     changed_rows(folder, column, half, where)
-    code, said = verified(folder, capsys, "--all")
-    assert code in (1, 2), said
-    if (before > 0).any():
-        assert column in said
-        row = int(said.split("runs.parquet, row ")[1].split(":")[0]) if code == 1 else None
-        assert row is None or (where.start or 0) < row
+    said = verified(folder, "--all", code=1)
+    assert column in said
+    row = int(said.split("runs.parquet, row ")[1].split(":")[0])
+    assert (where.start or 0) < row
 
 
-def test_a_table_that_does_not_come_of_the_rows(folder, capsys):
+def test_a_table_that_does_not_come_of_the_rows(folder):
     lines = pd.read_csv(folder / "table.csv", keep_default_na=False)
     lines.loc[2, "mean"] = float(lines.loc[2, "mean"]) / 2
     lines.to_csv(folder / "table.csv", index=False)
-    code, said = verified(folder, capsys)
-    assert code == 1
+    said = verified(folder, code=1)
     assert f"{folder}/table.csv, row 4: mean: expected" in said
 
 
 @pytest.mark.parametrize("old", [SECRET, "salt_sha256 = "])
-def test_another_salt_is_refused(folder, capsys, old):
+def test_another_salt_is_refused(folder, old):
     path = folder / "experiment.toml"
     text = path.read_text()
     place = text.index(old) + len(old) + (1 if old.endswith(" ") else -1)
     other = "0" if text[place] != "0" else "1"
     path.write_text(text[:place] + other + text[place + 1 :])
-    code, said = verified(folder, capsys)
-    assert code == 2
+    said = verified(folder, code=2)
     assert "one of the two was changed" in said
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes_on_with_it(
-    finished_folder, tmp_path, capsys, monkeypatch
+    finished_folder, tmp_path, monkeypatch
 ):
     from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
@@ -134,8 +126,8 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
     text = (tmp_path / "out" / "experiment.toml").read_text()
     assert SECRET not in text
     assert held.experiment.salt_sha256 in text
-    assert verified(tmp_path / "out", capsys)[0] == 2
-    assert main(["compare", "--resume", str(tmp_path / "out"), "--jobs", "1"]) == 0
+    verified(tmp_path / "out", code=2)
+    run_command("compare", "--resume", tmp_path / "out", "--jobs", "1")
     assert not kept.exists()
     columns = [f"true_{name}" for name in ("rate", "decay")]
     pd.testing.assert_frame_equal(
@@ -143,7 +135,7 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
     )
 
 
-def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path, capsys):
+def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path):
     from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 
@@ -162,33 +154,28 @@ def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path, c
     for content in (None, "another"):
         kept = tmp_path / "out" / "segments" / "salt"
         kept.unlink() if content is None else kept.write_text(content)
-        capsys.readouterr()
-        assert main(["compare", "--resume", str(tmp_path / "out")]) == 2
-        said = capsys.readouterr().err
+        said = run_command("compare", "--resume", tmp_path / "out", code=2).err
         assert str(kept) in said
         assert SECRET not in said
 
 
-def test_a_salt_in_addition_to_the_experiments_own_is_refused(tmp_path, capsys):
+def test_a_salt_in_addition_to_the_experiments_own_is_refused(tmp_path):
     (tmp_path / "e.toml").write_text(tomli_w.dumps(SPRING))
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
-    assert main([*command, "--salt", "another"]) == 2
-    assert "states a public salt" in capsys.readouterr().err
+    assert "states a public salt" in run_command(*command, "--salt", "another", code=2).err
     assert not (tmp_path / "out").exists()
 
 
-def test_isolation_of_this_machine_and_of_a_folder_is_printed(finished_folder, capsys):
-    assert main(["status"]) == 0
-    said = capsys.readouterr().out
+def test_isolation_of_this_machine_and_of_a_folder_is_printed(finished_folder):
+    said = run_command("status").out
     assert "process    active" in said
-    assert main(["status", str(finished_folder)]) == 0
-    said = capsys.readouterr().out
+    said = run_command("status", finished_folder).out
     assert "isolated: a process for each run" in said
     assert "revealed" in said
 
 
 @pytest.mark.slow
-def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, monkeypatch):
+def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, monkeypatch):
     (tmp_path / "e.toml").write_text(
         tomli_w.dumps({**SPRING, "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]})
     )
@@ -202,8 +189,7 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
         lambda f, dpi=figure_output.DPI: titles.append(f.get_suptitle()) or plain(f, 40),
     )
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
-    assert main([*command, "--trust", "--jobs", "1"]) == 0
-    said = capsys.readouterr().out
+    said = run_command(*command, "--trust", "--jobs", "1").out
     assert TRUSTED_TUNERS_NOTE in said
     assert "public salt" in said
     assert titles
@@ -212,5 +198,6 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
         if path.name != "identifiability.csv":  # this file does not depend on a tuner
             assert pd.read_csv(path).get("trusted", pd.Series([False])).all(), path.name
     assert pd.read_parquet(tmp_path / "out" / "runs.parquet")["trusted"].all()
-    assert main(["status", str(tmp_path / "out")]) == 0
-    assert "trusted: its tuners run without isolation" in capsys.readouterr().out
+    assert (
+        "trusted: its tuners run without isolation" in run_command("status", tmp_path / "out").out
+    )

@@ -9,9 +9,9 @@ import pytest
 import tomli_w
 
 from bench.benchmark.storage.result_folder import read_configuration
-from bench.cli.main import main
 from bench.schemas import find_violations
 from bench.studies import diff_comparisons
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import undrawn
@@ -30,7 +30,7 @@ def run(tmp_path_factory):
     (folder / "small.toml").write_text(tomli_w.dumps(document))
     command = ["compare", str(folder / "small.toml"), *PLUGIN, "--jobs", "0", "--salt", "public"]
     with undrawn():
-        assert main([*command, "--out", str(folder / "run")]) == 0
+        run_command(*command, "--out", folder / "run")
     return folder / "run"
 
 
@@ -44,13 +44,12 @@ def copied(run, place, change=None, name="b"):
     return place / name
 
 
-def differ(a, b, capsys, *options):
-    capsys.readouterr()
-    code = main(["diff", str(a), str(b), "--json", *options])
-    found = json.loads(capsys.readouterr().out)
+def differ(a, b, *options, code=0):
+    """Return the document that the comparison of two folders prints."""
+    found = json.loads(run_command("diff", a, b, "--json", *options, code=code).out)
     if "error" not in found:
         assert find_violations(found, "diff") == []
-    return code, found
+    return found
 
 
 def scaled(factor, tuner="random", which=slice(None)):
@@ -71,22 +70,20 @@ def scaled(factor, tuner="random", which=slice(None)):
     return change
 
 
-def test_a_comparison_does_not_differ_from_itself(run, tmp_path, capsys):
-    code, found = differ(run, copied(run, tmp_path), capsys, "--fail-on", "change")
-    assert (code, found["changed"], found["worse"]) == (0, False, False)
+def test_a_comparison_does_not_differ_from_itself(run, tmp_path):
+    found = differ(run, copied(run, tmp_path), "--fail-on", "change")
+    assert (found["changed"], found["worse"]) == (False, False)
     assert {line["ratio"] for line in found["errors"]} == {1.0}
     assert all(line["paired"] and line["targets"] == 14 for line in found["errors"])
     assert (found["configuration"], found["environment"], found["statuses"]) == ([], [], [])
 
 
 @pytest.mark.parametrize(("factor", "worse"), [(1.1, True), (0.9, False)])
-def test_a_small_shift_on_every_target_is_significant_as_pairs(
-    run, tmp_path, capsys, factor, worse
-):
+def test_a_small_shift_on_every_target_is_significant_as_pairs(run, tmp_path, factor, worse):
     """A change of 10 % is far smaller than the differences between targets."""
     other = copied(run, tmp_path, scaled(factor))
-    code, found = differ(run, other, capsys, "--fail-on", "worse")
-    assert (code, found["changed"], found["worse"]) == (int(worse), True, worse)
+    found = differ(run, other, "--fail-on", "worse", code=int(worse))
+    assert (found["changed"], found["worse"]) == (True, worse)
     moved = [line for line in found["errors"] if line["significant"]]
     assert {line["tuner"] for line in moved} == {"random"}
     assert {line["simulations"] for line in moved} == {3, 4}
@@ -96,22 +93,22 @@ def test_a_small_shift_on_every_target_is_significant_as_pairs(
     assert max(line["p_holm"] for line in moved) == pytest.approx(8 / 2**14)
 
 
-def test_a_shift_on_some_targets_is_chance(run, tmp_path, capsys):
+def test_a_shift_on_some_targets_is_chance(run, tmp_path):
     other = copied(run, tmp_path, scaled(1.5, which=slice(0, 3)))
-    code, found = differ(run, other, capsys, "--fail-on", "change")
-    assert (code, found["changed"]) == (0, False)
+    found = differ(run, other, "--fail-on", "change")
+    assert not found["changed"]
     assert min(line["p_value"] for line in found["errors"]) == pytest.approx(0.25)
 
 
-def test_other_targets_of_the_same_names_are_not_paired(run, tmp_path, capsys):
+def test_other_targets_of_the_same_names_are_not_paired(run, tmp_path):
     """With another salt, in-000 is another target."""
 
     def elsewhere(rows):
         rows["true_rate"] *= 1.01
         return scaled(1.1)(rows)
 
-    code, found = differ(run, copied(run, tmp_path, elsewhere), capsys, "--fail-on", "change")
-    assert (code, found["changed"]) == (0, False), "as two samples ten per cent is chance"
+    found = differ(run, copied(run, tmp_path, elsewhere), "--fail-on", "change")
+    assert not found["changed"], "as two samples ten per cent is chance"
     assert not any(line["paired"] for line in found["errors"])
     assert any("not paired" in note for note in found["notes"])
 
@@ -135,21 +132,21 @@ def test_only_seeds_that_both_have_are_compared(run, tmp_path):
     assert not found.has_changed, "fewer runs are no failures"
 
 
-def test_more_failures_are_a_change_for_the_worse_and_fewer_are_not(run, tmp_path, capsys):
+def test_more_failures_are_a_change_for_the_worse_and_fewer_are_not(run, tmp_path):
     other = copied(run, tmp_path)
     statuses = pd.read_csv(other / "status.csv", keep_default_na=False)
     place = statuses.index[statuses["tuner"] == "random"][:2]
     statuses.loc[place, ["status", "reason"]] = ["crashed", "by hand"]
     statuses.to_csv(other / "status.csv", index=False)
-    code, found = differ(run, other, capsys, "--fail-on", "worse")
-    assert (code, found["worse"]) == (1, True)
+    found = differ(run, other, "--fail-on", "worse", code=1)
+    assert found["worse"]
     assert {"tuner": "random", "status": "crashed", "a": 0, "b": 2} in found["statuses"]
     assert max(line["failures_b"] for line in found["errors"]) == 2
-    code, found = differ(other, run, capsys, "--fail-on", "worse")
-    assert (code, found["changed"], found["worse"]) == (0, True, False)
+    found = differ(other, run, "--fail-on", "worse")
+    assert (found["changed"], found["worse"]) == (True, False)
 
 
-def test_configuration_and_environment_that_changed_are_named(run, tmp_path, capsys):
+def test_configuration_and_environment_that_changed_are_named(run, tmp_path):
     other = copied(run, tmp_path)
     path = other / "experiment.toml"
     before = read_configuration(other).experiment.timeout
@@ -157,7 +154,7 @@ def test_configuration_and_environment_that_changed_are_named(run, tmp_path, cap
     made = json.loads((other / "environment.json").read_text())
     made["packages"]["numpy"] = "1.0"
     (other / "environment.json").write_text(json.dumps(made))
-    _, found = differ(run, other, capsys)
+    found = differ(run, other)
     assert found["configuration"] == [{"what": "timeout", "a": before, "b": 61.0}]
     (package,) = found["environment"]
     assert (package["what"], package["a"], package["b"]) == (
@@ -165,15 +162,15 @@ def test_configuration_and_environment_that_changed_are_named(run, tmp_path, cap
     )  # fmt: skip
 
 
-def test_the_table_is_written_once_and_errors_are_reported(run, tmp_path, capsys):
+def test_the_table_is_written_once_and_errors_are_reported(run, tmp_path):
     other, out = copied(run, tmp_path, scaled(1.1)), tmp_path / "out.csv"
-    _, found = differ(run, other, capsys, "--out", str(out))
+    found = differ(run, other, "--out", str(out))
     rows = pd.read_csv(out)
     assert list(rows["ratio"]) == pytest.approx([line["ratio"] for line in found["errors"]])
-    code, found = differ(run, other, capsys, "--out", str(out))
-    assert (code, "exists" in found["error"]["message"]) == (2, True)
-    code, found = differ(run, tmp_path / "none", capsys)
-    assert (code, found["error"]["kind"]) == (2, "input")
+    found = differ(run, other, "--out", str(out), code=2)
+    assert "exists" in found["error"]["message"]
+    found = differ(run, tmp_path / "none", code=2)
+    assert found["error"]["kind"] == "input"
 
 
 def verdict(**changes):
@@ -211,32 +208,30 @@ def explained(folder, **changes):
     # Half-widths of 0.2 allow a difference of 0.28; with Holm's correction for two numbers, 0.32.
     [((4.2e-4, 0.2e-4), False), ((4.3e-4, 0.2e-4), False), ((4.4e-4, 0.2e-4), True)],
 )
-def test_a_coefficient_has_moved_where_both_intervals_do_not_allow_it(
-    tmp_path, capsys, coefficient, moved
-):
+def test_a_coefficient_has_moved_where_both_intervals_do_not_allow_it(tmp_path, coefficient, moved):
     a, b = explained(tmp_path / "a"), explained(tmp_path / "b", coefficient=coefficient)
-    code, found = differ(a, b, capsys, "--fail-on", "change")
-    assert (code, found["changed"]) == (int(moved), moved)
+    found = differ(a, b, "--fail-on", "change", code=int(moved))
+    assert found["changed"] == moved
     (row,) = found["coefficients"]
     assert (row["name"], row["significant"]) == ("drag.linear coefficient", moved)
     assert found["parameters"][0]["significant"] is False
 
 
-def test_another_verdict_or_cause_is_a_change(tmp_path, capsys):
+def test_another_verdict_or_cause_is_a_change(tmp_path):
     a = explained(tmp_path / "a")
-    _, found = differ(a, explained(tmp_path / "b", verdict="ambiguous"), capsys)
+    found = differ(a, explained(tmp_path / "b", verdict="ambiguous"))
     assert (found["changed"], found["verdict"]) == (True, {"a": "named", "b": "ambiguous"})
-    _, found = differ(a, explained(tmp_path / "c", effect="drag.quadratic"), capsys)
+    found = differ(a, explained(tmp_path / "c", effect="drag.quadratic"))
     assert found["changed"]
     assert {"effect": "drag.linear", "in_a": "cause", "in_b": "no"} in found["causes"]
     assert found["coefficients"][0]["significant"] is None, "one of them lacks it"
 
 
-def test_two_kinds_and_what_is_damaged_are_refused(run, tmp_path, capsys):
+def test_two_kinds_and_what_is_damaged_are_refused(run, tmp_path):
     a = explained(tmp_path / "a")
-    code, found = differ(a, run, capsys)
-    assert (code, "two comparisons or two explanations" in found["error"]["message"]) == (2, True)
-    code, found = differ(a, explained(tmp_path / "b", causes=3), capsys)
-    assert (code, "expected a verdict" in found["error"]["message"]) == (2, True)
-    code, found = differ(a, a, capsys, "--fail-on", "worse")
-    assert (code, "for explanations use change" in found["error"]["message"]) == (2, True)
+    found = differ(a, run, code=2)
+    assert "two comparisons or two explanations" in found["error"]["message"]
+    found = differ(a, explained(tmp_path / "b", causes=3), code=2)
+    assert "expected a verdict" in found["error"]["message"]
+    found = differ(a, a, "--fail-on", "worse", code=2)
+    assert "for explanations use change" in found["error"]["message"]
