@@ -2,7 +2,6 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.figures.signal_thinning import thin_signal
 from bench.logs.quality.noise_estimation import count_gaps, estimate_noise
 from bench.logs.recording_loading import load_recording
@@ -10,6 +9,7 @@ from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.servo import Servo
+from tests.command_output import run_command
 from tests.simulation_arguments import simulation_spec, write
 
 RNG = np.random.default_rng(3)
@@ -83,7 +83,7 @@ def test_many_runs_are_cut_short(tmp_path):
     said = lines(tmp_path / "many.csv")
     assert "... and 260 more runs" in said
     assert len(said) < 60
-    assert main(["inspect", str(tmp_path / "many.csv"), "--out", str(tmp_path / "out")]) == 0
+    run_command("inspect", tmp_path / "many.csv", "--out", tmp_path / "out")
 
 
 def test_noise_is_found_under_motion_and_uneven_sampling():
@@ -120,10 +120,9 @@ def test_simulated_noise_is_found(tmp_path):
     assert float(z[7]) == pytest.approx(0.004, rel=0.1)
 
 
-def test_inspect_prints_and_draws_and_leaves_the_recording_alone(odd, tmp_path, capsys):
+def test_inspect_prints_and_draws_and_leaves_the_recording_alone(odd, tmp_path):
     before = {p.name: p.read_bytes() for p in odd.parent.iterdir()}
-    assert main(["inspect", str(odd), "--pdf", "--out", str(tmp_path / "out")]) == 0
-    out = capsys.readouterr().out
+    out = run_command("inspect", odd, "--pdf", "--out", tmp_path / "out").out
     assert "kp differs by run" in out
     assert str(tmp_path / "out" / "odd.png") in out
     picture = matplotlib.image.imread(tmp_path / "out" / "odd.png")[:, :, :3]
@@ -135,12 +134,12 @@ def test_inspect_prints_and_draws_and_leaves_the_recording_alone(odd, tmp_path, 
     assert before == {p.name: p.read_bytes() for p in odd.parent.iterdir() if p.is_file()}
 
 
-def test_the_figure_is_the_same_each_time(odd, tmp_path, monkeypatch, capsys):
+def test_the_figure_is_the_same_each_time(odd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["inspect", str(odd)]) == 0
+    run_command("inspect", odd)
     folder = tmp_path / "results" / "inspect" / tmp_path.name
     first = {p.name: p.read_bytes() for p in folder.iterdir()}
-    assert main(["inspect", str(odd)]) == 0
+    run_command("inspect", odd)
     assert sorted(first) == ["odd.png"]
     assert first == {p.name: p.read_bytes() for p in folder.iterdir()}
 
@@ -158,15 +157,14 @@ def test_thinning_keeps_the_extremes():
     assert thin_signal(y[:4000], 4000).size == 4000
 
 
-def test_faults_are_one_line(odd, tmp_path, capsys):
+def test_faults_are_one_line(odd, tmp_path):
     for arguments, message in [
         ([str(tmp_path / "none.csv")], "none.csv: no such file"),
         ([str(odd), "--system", "serv"], f"{odd}: unknown simulator 'serv'; there are: "),
         ([str(odd), "--system", "ball"], "unknown channel in"),
         ([str(odd), "--out", str(odd / "below")], "cannot be written (Not a directory)"),
     ]:
-        assert main(["inspect", *arguments]) == 2
-        captured = capsys.readouterr().err
+        captured = run_command("inspect", *arguments, code=2).err
         assert message in captured
         assert captured.count("\n") == 1
     odd.with_suffix(".toml").write_text(
@@ -176,7 +174,7 @@ def test_faults_are_one_line(odd, tmp_path, capsys):
         load_recording(odd)
 
 
-def test_every_real_recording_is_inspected(recordings, tmp_path, capsys):
+def test_every_real_recording_is_inspected(recordings, tmp_path):
     paths = sorted(recordings.rglob("*.csv"))
     assert len(paths) == 15
     for path in paths:
@@ -190,7 +188,7 @@ def test_every_real_recording_is_inspected(recordings, tmp_path, capsys):
         recordings / "servo_pendulum" / "recording.csv",
         recordings / "smartphone_fall" / "fall.csv",
     ):
-        assert main(["inspect", str(path), "--out", str(tmp_path)]) == 0
+        run_command("inspect", path, "--out", tmp_path)
         assert (tmp_path / f"{path.stem}.png").stat().st_size > 30_000
 
 

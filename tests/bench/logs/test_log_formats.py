@@ -10,6 +10,7 @@ import pytest
 from bench.cli.main import main
 from bench.logs.recording_loading import load_recording
 from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
+from tests.command_output import run_command
 from tests.malformed_input.input_strategies import log_folders, run_cases
 from tests.malformed_input.malformed_case import tried
 
@@ -27,8 +28,7 @@ def test_the_numbers_of_a_folder_are_those_that_were_logged(kind, tmp_path):
     skip_without(kind)
     logs, model = write_folder(tmp_path, kind)
     out = tmp_path / "log.toml"
-    assert main(["import", str(logs), "--model", str(model), "--out", str(out),
-                 *OPTIONS.get(kind, ())]) == 0  # fmt: skip
+    run_command("import", logs, "--model", model, "--out", out, *OPTIONS.get(kind, ()))
     recording, _ = load_recording(out, divide=False)
     assert len(recording.runs) == 3
     for number, run in enumerate(recording.runs):

@@ -1,16 +1,17 @@
 """Tests of `simgap import`: raw logs become a description that each command reads."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import simgap
-from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.diagnosis.test_robot_input_errors import ARM
+from tests.command_output import run_command
 
 TIMES = np.arange(200) / 50.0
 
@@ -19,6 +20,13 @@ TIMES = np.arange(200) / 50.0
 def arm(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     return tmp_path / "arm.xml"
+
+
+@pytest.fixture
+def bare(tmp_path):
+    """Return the model file of the arm without its actuators."""
+    (tmp_path / "bare.xml").write_text(ARM[: ARM.index("<actuator>")] + "</mujoco>")
+    return tmp_path / "bare.xml"
 
 
 def motion(arm):
@@ -48,12 +56,11 @@ def logged(folder, commands, positions, rates):
     return [folder / "motor_state.csv", folder / "commands.csv"]
 
 
-def test_a_log_of_other_words_and_units_is_read_as_what_it_is(arm, tmp_path, capsys):
+def test_a_log_of_other_words_and_units_is_read_as_what_it_is(arm, tmp_path):
     commands, positions, rates = motion(arm)
     files = logged(tmp_path, commands, positions, rates)
     out = tmp_path / "log.toml"
-    assert main(["import", *map(str, files), "--model", str(arm), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    said = run_command("import", *files, "--model", arm, "--out", out).out
     assert "q.elbow: motor_state.csv, column Elbow Position, by its name; in deg" in said
     assert "time: column TIMESTAMP in us, 50 Hz" in said
     assert "column temperature: its meaning is unknown; left out" in said
@@ -68,12 +75,8 @@ def test_a_log_of_other_words_and_units_is_read_as_what_it_is(arm, tmp_path, cap
     assert "# guess" in out.read_text()
 
 
-def test_a_robot_without_actuators_gets_servos_whose_gains_are_not_known(arm, tmp_path):
-    arm.write_text(ARM[: ARM.index("<actuator>")] + "</mujoco>")
-    bare = tmp_path / "bare.xml"
-    bare.write_text(arm.read_text())
-    (tmp_path / "arm.xml").write_text(ARM)
-    files = logged(tmp_path, *motion(tmp_path / "arm.xml"))
+def test_a_robot_without_actuators_gets_servos_whose_gains_are_not_known(arm, bare, tmp_path):
+    files = logged(tmp_path, *motion(arm))
     made = simgap.import_logs(files, bare, tmp_path / "log.toml")
     assert any("gains of the servo of elbow" in line for line in made.guessed)
     _, kind = load_recording(tmp_path / "log.toml")
@@ -188,25 +191,20 @@ SLOPES = np.column_stack([3 * np.cos(3 * TIMES - 0.1), -1.4 * np.sin(2 * TIMES -
 
 def written(folder, name, columns):
     """Write a table of columns by name; NaN is an empty cell."""
-    cells = np.column_stack(list(columns.values()))
-    rows = [",".join("" if np.isnan(x) else f"{x:.9g}" for x in row) for row in cells]
     folder.mkdir(exist_ok=True)
-    (folder / name).write_text(",".join(columns) + "\n" + "\n".join(rows) + "\n")
+    pd.DataFrame(columns).to_csv(folder / name, index=False)
     return folder / name
 
 
 def log_with_held_joint(folder, moving):
     """Write a log in which one joint of the arm moves and the other is held, with noise."""
-    rng = np.random.default_rng(3)
-    columns = {"t": TIMES}
+    rng, columns = np.random.default_rng(3), {"t": TIMES}
+    commands = np.sin(3 * TIMES), 0.7 * np.cos(2 * TIMES)
     for k, joint in enumerate(("shoulder", "elbow")):
         noise = 1e-3 * rng.standard_normal(TIMES.size)
-        moves = joint == moving
-        columns[f"{joint}_pos"] = WAVES[:, k] if moves else 0.3 + 0.02 * noise
-        columns[f"{joint}_vel"] = SLOPES[:, k] if moves else noise
-        columns[f"{joint}_cmd"] = (
-            np.sin(3 * TIMES) if moves and k == 0 else 0.7 * np.cos(2 * TIMES) if moves else 0.3
-        ) * np.ones(TIMES.size)
+        held = 0.3 + 0.02 * noise, noise, np.full(TIMES.size, 0.3)
+        signals = (WAVES[:, k], SLOPES[:, k], commands[k]) if joint == moving else held
+        columns |= dict(zip((f"{joint}_pos", f"{joint}_vel", f"{joint}_cmd"), signals, strict=True))
     return written(folder, "log.csv", columns)
 
 
@@ -224,9 +222,7 @@ def test_two_logs_of_one_logger_have_the_same_velocities(arm, tmp_path):
     ] * 2
 
 
-def test_gains_of_a_joint_that_the_log_does_not_move_are_said_and_not_fitted(tmp_path):
-    bare = tmp_path / "bare.xml"
-    bare.write_text(ARM[: ARM.index("<actuator>")] + "</mujoco>")
+def test_gains_of_a_joint_that_the_log_does_not_move_are_said_and_not_fitted(bare, tmp_path):
     made = simgap.import_logs(
         [log_with_held_joint(tmp_path / "a", "shoulder")], bare, tmp_path / "log.toml"
     )

@@ -7,15 +7,16 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import simgap
-from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.importing.joint_order import order_of_commands
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
+from tests.command_output import run_command
 
 CASES = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"
 JOINTS = ("yaw", "lift", "bend")
@@ -28,15 +29,15 @@ SERVO = '<position name="m_{0}" joint="{0}" kp="100" kv="10"/>'
 MOTOR = '<motor name="m_{0}" joint="{0}"/>'
 VELOCITY = '<velocity name="m_{0}" joint="{0}" kv="10"/>'
 TIMES = np.arange(200) / 50.0
-COMMANDS = np.column_stack(
-    [0.8 * np.sin(3 * TIMES), 0.5 * np.cos(2 * TIMES) - 0.4, 0.6 * np.sin(5 * TIMES) + 0.3]
-)
-POSITIONS = np.column_stack(
-    [
-        0.8 * np.sin(3 * TIMES - 0.1),
-        0.5 * np.cos(2 * TIMES - 0.1) - 0.4,
-        0.6 * np.sin(5 * TIMES - 0.1) + 0.3,
-    ]
+COMMANDS, POSITIONS = (
+    np.column_stack(
+        [
+            0.8 * np.sin(3 * TIMES - lag),
+            0.5 * np.cos(2 * TIMES - lag) - 0.4,
+            0.6 * np.sin(5 * TIMES - lag) + 0.3,
+        ]
+    )
+    for lag in (0.0, 0.1)
 )
 RATES = np.gradient(POSITIONS, TIMES, axis=0)
 
@@ -62,14 +63,34 @@ def table(path, columns, separator=",", comma=False, above=""):
     return path
 
 
+def named(word, values, size=1.0):
+    """Return a column of values (T, 3) for each joint, by names such as ``{}_pos``."""
+    return {word.format(joint): size * values[:, k] for k, joint in enumerate(JOINTS)}
+
+
+def imported(folder, columns, arm, name="log"):
+    """Import a table of columns after the stamps as NAME.toml."""
+    log = table(folder / f"{name}.csv", {"t": TIMES} | columns)
+    return simgap.import_logs([log], arm, folder / f"{name}.toml")
+
+
+def check_lines(*words):
+    """Return the lines of `simgap import` that ask the user to check a guess."""
+    lines = run_command("import", *words).out.splitlines()
+    return [line for line in lines if line.startswith("check: ")]
+
+
 def channel(out, name):
-    recording, _ = load_recording(out, divide=False)
-    return recording.runs[0].channels[name]
+    return first_run(out).channels[name]
 
 
 def inputs(out):
+    return first_run(out).inputs
+
+
+def first_run(out):
     recording, _ = load_recording(out, divide=False)
-    return recording.runs[0].inputs
+    return recording.runs[0]
 
 
 def right(out, atol=1e-6):
@@ -84,23 +105,19 @@ def right(out, atol=1e-6):
 # -- names and order
 
 
-def rostopic(folder, order, words="field.name{}", commands=JOINTS):
+def rostopic(folder, commands):
     """Write tables in the format of `rostopic echo -p`."""
-    stamps = 1.7e9 + TIMES
-    names = sorted(JOINTS) if order == "sorted" else order
-    rows = ["%time,field.header.seq," + ",".join(
-        [words.format(k) for k in range(3)] + [f"field.position{k}" for k in range(3)]
-        + [f"field.velocity{k}" for k in range(3)])]  # fmt: skip
-    for i, t in enumerate(stamps):
-        places = [JOINTS.index(name) for name in names]
-        cells = [f"{round(t * 1e9)}", str(i), *names, *(f"{POSITIONS[i, k]:.8f}" for k in places)]
-        rows.append(",".join([*cells, *(f"{RATES[i, k]:.8f}" for k in places)]))
-    (folder / "joint_states.csv").write_text("\n".join(rows) + "\n")
-    rows = ["%time,field.layout.data_offset,field.data0,field.data1,field.data2"]
-    for i, t in enumerate(stamps):
-        cells = [f"{COMMANDS[i, JOINTS.index(name)]:.8f}" for name in commands]
-        rows.append(f"{round(t * 1e9)},0," + ",".join(cells))
-    (folder / "commands.csv").write_text("\n".join(rows) + "\n")
+    stamps = np.round((1.7e9 + TIMES) * 1e9).astype(np.int64)
+    names = sorted(JOINTS)
+    places = [JOINTS.index(name) for name in names]
+    states = {"%time": stamps, "field.header.seq": range(200)}
+    states |= {f"field.name{k}": name for k, name in enumerate(names)}
+    states |= {f"field.position{k}": POSITIONS[:, place] for k, place in enumerate(places)}
+    states |= {f"field.velocity{k}": RATES[:, place] for k, place in enumerate(places)}
+    sent = {"%time": stamps, "field.layout.data_offset": 0}
+    sent |= {f"field.data{k}": COMMANDS[:, JOINTS.index(name)] for k, name in enumerate(commands)}
+    pd.DataFrame(states).to_csv(folder / "joint_states.csv", index=False)
+    pd.DataFrame(sent).to_csv(folder / "commands.csv", index=False)
     return folder
 
 
@@ -108,21 +125,18 @@ def rostopic(folder, order, words="field.name{}", commands=JOINTS):
 def test_joint_names_of_rostopic_are_used_and_commands_follow(commands, arm, tmp_path):
     log = tmp_path / "run"
     log.mkdir()
-    made = simgap.import_logs(
-        [rostopic(log, "sorted", commands=commands)], arm, tmp_path / "l.toml"
-    )
+    made = simgap.import_logs([rostopic(log, commands)], arm, tmp_path / "l.toml")
     right(tmp_path / "l.toml")
     assert made.checks == []
     assert "column field.position.bend, by its name" in "\n".join(made.guessed)
     np.testing.assert_allclose(channel(tmp_path / "l.toml", "qd.bend"), RATES[:, 2], atol=1e-6)
 
 
-def test_an_order_that_nothing_tells_is_said_to_be_a_guess(arm, tmp_path, capsys):
+def test_an_order_that_nothing_tells_is_said_to_be_a_guess(arm, tmp_path):
     np.savez(tmp_path / "log.npz", timestamp=TIMES, actual_q=POSITIONS, actual_qd=RATES,
              target_q=COMMANDS)  # fmt: skip
     files = [str(tmp_path / "log.npz"), "--model", str(arm), "--out", str(tmp_path / "log.toml")]
-    assert main(["import", *files]) == 0
-    (line,) = (one for one in capsys.readouterr().out.splitlines() if one.startswith("check: "))
+    (line,) = check_lines(*files)
     assert line.startswith("check: order of joints: the log does not name those of its columns")
     assert "yaw, lift, bend, which is a guess (sorted by name, as ROS drivers have it" in line
     assert "# check: order of joints" in (tmp_path / "log.toml").read_text()
@@ -158,10 +172,10 @@ def test_an_order_without_names_is_the_one_that_the_model_prefers(order, frictio
 
 @pytest.mark.parametrize("order", [(0, 2, 1), (2, 0, 1)])
 def test_positions_without_names_go_where_they_follow_named_commands(order, arm, tmp_path):
-    columns = {"t": TIMES} | {f"{j}_cmd": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
+    columns = named("{}_cmd", COMMANDS)
     columns |= {f"q{place}": POSITIONS[:, k] for place, k in enumerate(order)}
     columns |= {f"qd{place}": RATES[:, k] for place, k in enumerate(order)}
-    made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    made = imported(tmp_path, columns, arm)
     right(tmp_path / "log.toml")
     np.testing.assert_allclose(channel(tmp_path / "log.toml", "qd.bend"), RATES[:, 2], atol=1e-6)
     assert "in the order in which positions follow their commands" in "\n".join(made.guessed)
@@ -184,8 +198,7 @@ def test_numbers_of_joints_are_no_guess(tmp_path):
     for k, joint in enumerate(JOINTS, start=1):
         text = text.replace(joint, f"axis{k}")
     arm.write_text(text)
-    columns = {"t": TIMES} | {f"q{k + 1}": POSITIONS[:, k] for k in range(3)}
-    made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    made = imported(tmp_path, {f"q{k + 1}": POSITIONS[:, k] for k in range(3)}, arm)
     assert not any("order of joints" in line for line in made.checks)
 
 
@@ -213,9 +226,8 @@ UNITS = {
 @pytest.mark.parametrize(("separator", "comma"), [(";", True), ("\t", True), (",", False)])
 def test_units_in_names_are_read(style, separator, comma, arm, tmp_path):
     time, size = UNITS[style]
-    columns = {time: 1e3 * TIMES}
-    columns |= {style.format(joint): size * POSITIONS[:, k] for k, joint in enumerate(JOINTS)}
-    columns |= {style.format(f"{j}_soll"): size * COMMANDS[:, k] for k, j in enumerate(JOINTS)}
+    columns = {time: 1e3 * TIMES} | named(style, POSITIONS, size)
+    columns |= named(style.format("{}_soll"), COMMANDS, size)
     log = table(tmp_path / "log.csv", columns, separator, comma, "# exported 26.11.2026\n")
     made = simgap.import_logs([log], arm, tmp_path / "log.toml")
     right(tmp_path / "log.toml")
@@ -224,16 +236,15 @@ def test_units_in_names_are_read(style, separator, comma, arm, tmp_path):
 
 
 def test_a_row_of_units_is_read(arm, tmp_path):
-    columns = {"t": 1e3 * TIMES} | {j: np.degrees(POSITIONS[:, k]) for k, j in enumerate(JOINTS)}
-    log = table(tmp_path / "log.csv", columns, ";")
+    log = table(tmp_path / "log.csv", {"t": 1e3 * TIMES} | named("{}", np.degrees(POSITIONS)), ";")
     log.write_text(log.read_text().replace("bend\n", "bend\n[ms];[deg];[deg];[deg]\n"))
     simgap.import_logs([log], arm, tmp_path / "log.toml")
     right(tmp_path / "log.toml")
 
 
 def test_counts_of_an_encoder_are_no_angles(arm, tmp_path):
-    columns = {"t": TIMES, "yaw [counts]": np.round(100 * POSITIONS[:, 0]), "lift": POSITIONS[:, 1]}
-    made = simgap.import_logs([table(tmp_path / "l.csv", columns)], arm, tmp_path / "l.toml")
+    columns = {"yaw [counts]": np.round(100 * POSITIONS[:, 0]), "lift": POSITIONS[:, 1]}
+    made = imported(tmp_path, columns, arm)
     assert any("column yaw [counts]: is in counts, expected an angle" in line
                for line in made.untold)  # fmt: skip
     assert "q.yaw" not in made.text
@@ -242,20 +253,17 @@ def test_counts_of_an_encoder_are_no_angles(arm, tmp_path):
 # -- kind of a command
 
 
-def test_a_desired_position_is_no_torque(tmp_path):
+@pytest.mark.parametrize("word", ["q_des", "desired_position", "cmd"])
+def test_a_desired_position_is_no_torque(word, tmp_path):
     arm = model(tmp_path, MOTOR)
-    for word in ("q_des", "desired_position", "cmd"):
-        columns = {"t": TIMES} | {j: POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-        columns |= {f"{word}_{j}": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
-        out = tmp_path / f"{word}.toml"
-        made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, out)
-        assert f"column {word}_yaw: is a desired position of yaw, and m_yaw takes a torque" in (
-            "\n".join(made.untold)
-        )
-        assert inputs(out) == {}
-        (check,) = made.checks
-        assert check.startswith("actuators without an input: m_yaw, m_lift, m_bend; their commands")
-        assert f"possible columns: {word}_yaw" in check
+    columns = named("{}", POSITIONS) | named(word + "_{}", COMMANDS)
+    made = imported(tmp_path, columns, arm)
+    line = f"column {word}_yaw: is a desired position of yaw, and m_yaw takes a torque"
+    assert line in "\n".join(made.untold)
+    assert inputs(tmp_path / "log.toml") == {}
+    (check,) = made.checks
+    assert check.startswith("actuators without an input: m_yaw, m_lift, m_bend; their commands")
+    assert f"possible columns: {word}_yaw" in check
 
 
 @pytest.mark.parametrize(
@@ -272,10 +280,8 @@ def test_a_desired_position_is_no_torque(tmp_path):
     ],
 )
 def test_a_command_of_another_kind_is_left_out(drive, word, line, tmp_path):
-    arm = model(tmp_path, drive)
-    columns = {"t": TIMES} | {j: POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-    columns |= {word.format(j): COMMANDS[:, k] for k, j in enumerate(JOINTS)}
-    made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    columns = named("{}", POSITIONS) | named(word, COMMANDS)
+    made = imported(tmp_path, columns, model(tmp_path, drive))
     assert f"column {word.format('yaw')}: {line}; left out" in "\n".join(made.untold)
     assert inputs(tmp_path / "log.toml") == {}
 
@@ -285,10 +291,8 @@ def test_a_command_of_another_kind_is_left_out(drive, word, line, tmp_path):
     [(MOTOR, "u.m_{}", "effort_{}"), ("", "force.{}", "tau_{}"), (MOTOR, "u.m_{}", "{} [Nm]")],
 )
 def test_torques_drive_what_nothing_commands(drive, name, word, tmp_path):
-    arm = model(tmp_path, drive)
-    columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-    columns |= {word.format(j): 7 * COMMANDS[:, k] for k, j in enumerate(JOINTS)}
-    made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    columns = named("{}_pos", POSITIONS) | named(word, COMMANDS, 7)
+    made = imported(tmp_path, columns, model(tmp_path, drive))
     assert made.checks == []
     assert "measured, because no column has its command" in "\n".join(made.guessed)
     np.testing.assert_allclose(
@@ -298,33 +302,31 @@ def test_torques_drive_what_nothing_commands(drive, name, word, tmp_path):
 
 def test_of_several_torques_the_measured_one_drives_else_none(tmp_path):
     arm = model(tmp_path, "")
-    columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}
+    columns = named("{}_pos", POSITIONS)
     for k, word in enumerate(("tau_con", "tau_fric", "tau_meas")):
-        columns |= {f"{j}_{word}": (k + 1) * COMMANDS[:, i] for i, j in enumerate(JOINTS)}
-    simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+        columns |= named("{}_" + word, COMMANDS, k + 1)
+    imported(tmp_path, columns, arm)
     seen = inputs(tmp_path / "log.toml")["force.bend"]
     np.testing.assert_allclose(seen, 3 * COMMANDS[:, 2], atol=1e-6)
     columns = {name.replace("meas", "other"): values for name, values in columns.items()}
-    made = simgap.import_logs([table(tmp_path / "o.csv", columns)], arm, tmp_path / "o.toml")
+    made = imported(tmp_path, columns, arm, "o")
     assert inputs(tmp_path / "o.toml") == {}
     (check,) = made.checks
     assert "no actuator drives it; possible columns: yaw_tau_con, lift_tau_con" in check
 
 
 def test_a_model_without_an_input_is_said(tmp_path):
-    arm = model(tmp_path, "")
-    columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-    columns |= {f"{j}_current": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
-    made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    columns = named("{}_pos", POSITIONS) | named("{}_current", COMMANDS)
+    made = imported(tmp_path, columns, model(tmp_path, ""))
     (check,) = made.checks
     assert check.startswith("the model has no input, so no actuator drives it; possible columns")
     assert "possible columns: yaw_current, lift_current, bend_current" in check
 
 
 def test_a_temperature_is_no_angle_and_a_current_position_no_current(arm, tmp_path):
-    columns = {"t": TIMES, "yaw_temp": 20 + TIMES, "yaw_current_position": POSITIONS[:, 0],
+    columns = {"yaw_temp": 20 + TIMES, "yaw_current_position": POSITIONS[:, 0],
                "lift_error": 0.1 * TIMES, "lift": POSITIONS[:, 1]}  # fmt: skip
-    made = simgap.import_logs([table(tmp_path / "l.csv", columns)], arm, tmp_path / "l.toml")
+    made = imported(tmp_path, columns, arm)
     assert 'column = "yaw_current_position"' in made.text
     assert 'column = "lift"' in made.text
     assert "column yaw_temp: its meaning is unknown" in "\n".join(made.untold)
@@ -335,19 +337,15 @@ def test_words_that_every_joint_of_a_model_has_are_not_needed(tmp_path):
     for joint in JOINTS:
         text = text.replace(f'"{joint}"', f'"{joint}_joint"')
     (tmp_path / "arm.xml").write_text(text)
-    columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS[::-1])}
-    made = simgap.import_logs(
-        [table(tmp_path / "log.csv", columns)], tmp_path / "arm.xml", tmp_path / "log.toml"
-    )
+    made = imported(tmp_path, named("{}_pos", POSITIONS), tmp_path / "arm.xml")
     assert "q.bend_joint: log.csv, column bend_pos, by its name" in "\n".join(made.guessed)
 
 
 # -- files, headers and stamps
 
 
-def logged(folder, name="log.csv", time="t"):
-    columns = {time: TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-    columns |= {f"{j}_cmd": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
+def logged(folder, name="log.csv"):
+    columns = {"t": TIMES} | named("{}_pos", POSITIONS) | named("{}_cmd", COMMANDS)
     folder.mkdir(exist_ok=True)
     return table(folder / name, columns)
 
@@ -378,12 +376,11 @@ def test_a_small_file_of_events_does_not_stop_the_others(name, arm, tmp_path):
         simgap.import_logs(files, arm, tmp_path / "other.toml")
 
 
-def test_a_table_without_a_header_is_refused_and_nothing_written(arm, tmp_path, capsys):
+def test_a_table_without_a_header_is_refused_and_nothing_written(arm, tmp_path):
     log = logged(tmp_path / "run")
     log.write_text(log.read_text().partition("\n")[2])
     out = tmp_path / "new" / "log.toml"
-    assert main(["import", str(log), "--model", str(arm), "--out", str(out)]) == 2
-    said = capsys.readouterr().err.splitlines()
+    said = run_command("import", log, "--model", arm, "--out", out, code=2).err.splitlines()
     assert len(said) == 1
     assert (
         "log.csv, row 1: expected a header that names the 7 columns, found numbers; put one"
@@ -394,31 +391,27 @@ def test_a_table_without_a_header_is_refused_and_nothing_written(arm, tmp_path, 
 
 
 @pytest.mark.parametrize("bad_row", ["0.5,1\n", "0.5,1,2,3,4,5,6,7,8\n", '0.5,"1,2,3,4,5,6\n'])
-def test_a_broken_row_is_one_line_and_nothing_is_written(bad_row, arm, tmp_path, capsys):
+def test_a_broken_row_is_one_line_and_nothing_is_written(bad_row, arm, tmp_path):
     log = logged(tmp_path / "run")
     lines = log.read_text().splitlines(keepends=True)
     log.write_text("# a note\n" + "".join([*lines[:50], bad_row, *lines[50:]]))
     out = tmp_path / "log.toml"
-    assert main(["import", str(log), "--model", str(arm), "--out", str(out)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = run_command("import", log, "--model", arm, "--out", out, code=2).err.splitlines()
     assert "log.csv, row 52: " in line
     assert not any(word in line.lower() for word in ("tokeniz", "c error", "parser", "traceback"))
     assert not out.exists()
 
 
-def test_rows_without_stamps_need_a_rate(arm, tmp_path, capsys):
-    columns = {j: POSITIONS[:, k] for k, j in enumerate(JOINTS)}
-    columns |= {f"{j}_cmd": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
+def test_rows_without_stamps_need_a_rate(arm, tmp_path):
+    columns = named("{}", POSITIONS) | named("{}_cmd", COMMANDS)
     log, out = table(tmp_path / "log.csv", columns), tmp_path / "log.toml"
     files = [str(log), "--model", str(arm), "--out", str(out)]
-    assert main(["import", *files]) == 2
-    assert "state the rate of the rows with --rate HZ" in capsys.readouterr().err
-    assert main(["import", *files, "--rate", "50"]) == 0
+    assert "state the rate of the rows with --rate HZ" in run_command("import", *files, code=2).err
+    run_command("import", *files, "--rate", "50")
     assert "[time]\nrate = 50.0\n" in out.read_text()
     right(out)
-    recording, _ = load_recording(out, divide=False)
-    np.testing.assert_allclose(recording.runs[0].times, TIMES, atol=1e-12)
-    assert main(["import", *files[:-1], str(tmp_path / "o.toml"), "--rate", "0"]) == 2
+    np.testing.assert_allclose(first_run(out).times, TIMES, atol=1e-12)
+    run_command("import", *files[:-1], tmp_path / "o.toml", "--rate", "0", code=2)
 
 
 def test_a_stamp_that_comes_twice_is_said_and_its_row_left_out(arm, tmp_path):
@@ -451,8 +444,6 @@ def test_files_of_the_same_columns_are_runs(arm, tmp_path):
 
 
 def dataset(folder, positions, commands):
-    import pandas
-
     data = folder / "data" / "chunk-000"
     data.mkdir(parents=True)
     (folder / "meta").mkdir()
@@ -462,7 +453,7 @@ def dataset(folder, positions, commands):
     (folder / "meta" / "info.json").write_text(json.dumps(about))
     rows = {"action": list(commands), "observation.state": list(positions), "timestamp": TIMES,
             "episode_index": np.zeros(len(TIMES), dtype=int)}  # fmt: skip
-    pandas.DataFrame(rows).to_parquet(data / "file-000.parquet")
+    pd.DataFrame(rows).to_parquet(data / "file-000.parquet")
     return folder
 
 
@@ -483,11 +474,10 @@ def normalised(angles):
     return np.column_stack(columns)
 
 
-def test_positions_of_lerobot_may_be_normalised_and_it_is_said(arm, tmp_path, capsys):
+def test_positions_of_lerobot_may_be_normalised_and_it_is_said(arm, tmp_path):
     folder = dataset(tmp_path / "set", normalised(POSITIONS), normalised(COMMANDS))
     out = tmp_path / "log.toml"
-    assert main(["import", str(folder), "--model", str(arm), "--out", str(out)]) == 0
-    (line,) = (one for one in capsys.readouterr().out.splitlines() if one.startswith("check: "))
+    (line,) = check_lines(folder, "--model", arm, "--out", out)
     assert line.startswith("check: positions lie within -100 to 100: they are read as degrees")
     assert "--calibration FILE" in line
     odd = check_recording_plausible(*load_recording(out))
@@ -572,10 +562,9 @@ def test_a_faulty_calibration_is_one_line(text, message, arm, tmp_path):
         ("lerobot_normalised", ["dataset"], ["check: positions lie within -100 to 100"]),
     ],
 )  # fmt: skip
-def test_the_shared_cases(case, logs, lines, tmp_path, capsys):
+def test_the_shared_cases(case, logs, lines, tmp_path):
     folder, out = CASES / case, tmp_path / "log.toml"
     files = [str(folder / log) for log in logs]
-    assert main(["import", *files, "--model", str(folder / "arm3.xml"), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    said = run_command("import", *files, "--model", folder / "arm3.xml", "--out", out).out
     assert all(line in said for line in lines)
-    assert main(["inspect", str(out), "--out", str(tmp_path / "figures")]) == 0
+    run_command("inspect", out, "--out", tmp_path / "figures")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.quality.log_quality import check_log_quality
 from sims.recording.recording import Recording, Run
 
@@ -20,13 +19,6 @@ ARM = """<mujoco model="two"><compiler angle="radian" autolimits="true"/><worldb
 RATE, SECONDS, NOISE = 100.0, 40.0, 1e-3
 JOINTS = {"hip": 12.0, "knee": 20.0}
 """Natural frequency of each servo in rad/s."""
-
-
-@pytest.fixture(scope="module")
-def kind(tmp_path_factory):
-    path = tmp_path_factory.mktemp("robot") / "two.xml"
-    path.write_text(ARM)
-    return make_robot_simulator(path)
 
 
 def multisine(t, rng):

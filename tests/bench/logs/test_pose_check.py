@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.logs.quality.pose_check import find_overlaps
 from bench.logs.recording_loading import load_recording
+from tests.command_output import run_command
 
 LEG = """<mujoco model="leg"><worldbody>
 <body name="base"><geom name="block" type="box" size="0.1 0.1 0.05"/>
@@ -47,7 +47,7 @@ def test_bodies_that_overlap_in_all_poses_are_named(height, more, depth, tmp_pat
     assert finding.remedy == f"add {EXCLUDED} in leg.xml"
 
 
-def test_inspect_prints_overlaps_and_drives_that_do_nothing(tmp_path, capsys):
+def test_inspect_prints_overlaps_and_drives_that_do_nothing(tmp_path):
     """A servo is switched off at 2 s; the column of its power changes there."""
     text = """<mujoco model="arm"><option timestep="0.002"/><worldbody><body name="link">
     <joint name="hinge" axis="0 1 0" damping="0.05"/>
@@ -72,8 +72,7 @@ def test_inspect_prints_overlaps_and_drives_that_do_nothing(tmp_path, capsys):
         for _ in range(5):
             mujoco.mj_step(model, data)
     (tmp_path / "raw.csv").write_text("t,pos,cmd,power\n" + "\n".join(rows) + "\n")
-    assert main(["inspect", str(tmp_path / "log.toml"), "--out", str(tmp_path / "look")]) == 0
-    output = capsys.readouterr().out
+    output = run_command("inspect", tmp_path / "log.toml", "--out", tmp_path / "look").out
     assert "finding: drive: actuator servo exerts nothing where power is 0" in output
     assert 'state it in log.toml: [actuators.servo] enable = "power"' in output
     assert "convention:" not in output

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.core.input_signals import evaluate_signal
 from bench.logs.recording_loading import load_recording
 from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from tests.bench.diagnosis.pendulum_recordings import SWINGING, written
+from tests.command_output import run_command
 
 SHORT = {"runs": 2, "seconds": 0.4, "rate": 100.0}
 
@@ -88,9 +88,8 @@ def odd_log(tmp_path):
     return tmp_path / "log.csv"
 
 
-def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path, capsys):
-    assert main(["inspect", str(odd_log), "--out", str(tmp_path / "figures")]) == 0
-    said = capsys.readouterr().out
+def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path):
+    said = run_command("inspect", odd_log, "--out", tmp_path / "figures").out
     assert "(MJCF): 2 joints, 2 actuators, 2 moving bodies; implicitfast at 5 ms" in said
     assert "warning: not in the log, assumed to be zero: u.m_shoulder" in said
     assert "with initial values from the model file: elbow" in said
@@ -100,21 +99,22 @@ def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path, capsys):
     )
 
 
-def test_inspect_says_nothing_odd_of_a_sound_log(tmp_path, capsys):
+def test_inspect_says_nothing_odd_of_a_sound_log(tmp_path):
     made = simulate_recording(SimulationSpec(model=written(tmp_path), noise=1e-3, **SHORT))
     made.write(tmp_path / "log.csv")
-    assert main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path / "figures")]) == 0
-    assert "warning:" not in capsys.readouterr().out
+    assert (
+        "warning:"
+        not in run_command("inspect", tmp_path / "log.csv", "--out", tmp_path / "figures").out
+    )
 
 
-def test_repairs_of_a_model_are_reported(tmp_path, capsys):
+def test_repairs_of_a_model_are_reported(tmp_path):
     urdf = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/>
     <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
     <joint name="j" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
     <limit effort="5" velocity="1"/></joint><transmission name="t"/></robot>"""
     (tmp_path / "r.urdf").write_text(urdf)
-    assert main(["list", "places", "--model", str(tmp_path / "r.urdf")]) == 0
-    said = capsys.readouterr().out
+    said = run_command("list", "places", "--model", tmp_path / "r.urdf").out
     assert "note: ignored, since MuJoCo has no equivalent: <transmission>" in said
     assert "hinge, effort 5 N·m" in said
     words = said.partition("MuJoCo's words: ")[2]
@@ -122,10 +122,9 @@ def test_repairs_of_a_model_are_reported(tmp_path, capsys):
     assert "kp" not in words, "it has no servo"
 
 
-def test_places_of_a_robot_are_listed(tmp_path, capsys):
+def test_places_of_a_robot_are_listed(tmp_path):
     model = str(written(tmp_path))
-    assert main(["list", "places", "--model", model]) == 0
-    said = capsys.readouterr().out
+    said = run_command("list", "places", "--model", model).out
     for words in (
         "shoulder                 hinge, -1.5 to 1.5 rad",
         "m_shoulder               motor on shoulder, -3 to 3 N·m",
@@ -136,8 +135,8 @@ def test_places_of_a_robot_are_listed(tmp_path, capsys):
         "damping",
     ):
         assert words in said
-    assert main(["list", "places"]) == 2
-    assert main(["list", "effects", "--model", model]) == 2
+    run_command("list", "places", code=2)
+    run_command("list", "effects", "--model", model, code=2)
 
 
 def test_signals_are_added_and_a_multisine_begins_at_rest_within_its_amplitude():

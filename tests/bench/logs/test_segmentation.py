@@ -6,19 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.core.plugin_registries import simulators
 from bench.diagnosis.explain import explain
 from bench.logs import segmentation
 from bench.logs.segmentation import segment_recording
+from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
-from tests.bench.logs.test_log_quality import ARM, multisine
-
-
-@pytest.fixture(scope="module")
-def kind(tmp_path_factory):
-    path = tmp_path_factory.mktemp("robot") / "two.xml"
-    path.write_text(ARM)
-    return make_robot_simulator(path)
+from tests.bench.diagnosis.simulated_logs import describe, write_log
+from tests.bench.diagnosis.test_parameter_freezing import DAMPING, MODEL
+from tests.bench.logs.test_log_quality import multisine
+from tests.sims.robot.test_robot_motion import kind_of
 
 
 def recording_of(seconds, held_out=20.0):
@@ -108,25 +105,15 @@ def test_many_short_runs_are_all_there(kind):
 @pytest.mark.slow
 def test_explain_reports_it_and_an_option_takes_the_whole(tmp_path, monkeypatch):
     """In a clean log of the pendulum, no effect is missing, with segments or with the whole log."""
-    from tests.bench.diagnosis.test_parameter_freezing import DAMPING, MODEL
-
     times = np.arange(0.0, 12.0, 0.02)
-    (tmp_path / "swing.xml").write_text(MODEL.replace('damping="0.1"', f'damping="{DAMPING}"'))
-    (tmp_path / "swing.toml").write_text(
-        'model = "swing.xml"\n[channels."q.hinge"]\nunit = "rad"\nnoise = 0.01\n'
-    )
-    from sims.core.simulator import Scenario
-
-    simulator = make_robot_simulator(tmp_path / "swing.xml")({}, ["q.hinge"])
-    rng = np.random.default_rng(2)
-    rows = ["run,t,q.hinge"]
+    model = MODEL.replace('damping="0.1"', f'damping="{DAMPING}"')
+    simulator, rng, runs = kind_of(model)({}, ["q.hinge"]), np.random.default_rng(2), []
     for run in range(3):
         scenario = Scenario(times, {"q.hinge": 0.5 + 0.1 * run, "qd.hinge": 0.0}, {})
         seen = simulator.simulate(np.zeros((1, 0)), scenario)[0, :, 0]
-        seen = seen + 0.01 * rng.standard_normal(times.size)
-        rows += [f"{run},{t:.2f},{x:.6f}" for t, x in zip(times, seen, strict=True)]
-    path = tmp_path / "swing.csv"
-    path.write_text("\n".join(rows))
+        runs.append((times, seen + 0.01 * rng.standard_normal(times.size)))
+    description = describe({"q.hinge": "rad"}, 0.01, model="swing")
+    path = write_log(tmp_path, description, "q.hinge", runs, "swing", swing=model)
     monkeypatch.setattr(segmentation, "MAX_RECORDING_COST", 32000.0)
     said = []
     found = explain(path, say=said.append)
