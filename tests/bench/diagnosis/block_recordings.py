@@ -3,6 +3,8 @@
 import mujoco
 import numpy as np
 
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
+
 BLOCK = """<mujoco model="block">
   <option timestep="0.002" integrator="implicitfast"/>
   <worldbody>
@@ -41,41 +43,30 @@ def write_block_recording(folder, options="", change=("", ""), samples=200):
     """
     text = BLOCK.replace(OPTIONS, f"{OPTIONS} {options}")
     model = mujoco.MjModel.from_xml_string(text.replace(*change) if change[0] else text)
-    rng = np.random.default_rng(0)
-    rows = ["run,t,u.push_x,u.push_y,u.press,q.x,q.y,q.lift"]
-    tables = []
-    for run in range(RUNS):
+    rng, times, runs, tables = np.random.default_rng(0), np.arange(samples) / RATE, [], []
+    for run in range(1, RUNS + 1):
         data = mujoco.MjData(model)
         mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
-        start = np.concatenate([data.qpos, data.qvel])
-        # The warm start of the solver is no part of the state that a log states.
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = start[:3], start[3:]
-        names = [*(f"q.{joint}" for joint in JOINTS), *(f"qd.{joint}" for joint in JOINTS)]
-        tables.append(f"[runs.r{run}.initial]")
-        tables += [
-            f'"{name}" = {value!r}' for name, value in zip(names, start.tolist(), strict=True)
-        ]
+        state = {f"q.{joint}": q for joint, q in zip(JOINTS, data.qpos.tolist(), strict=True)}
+        state |= {f"qd.{joint}": v for joint, v in zip(JOINTS, data.qvel.tolist(), strict=True)}
+        tables += [f"[runs.{run}.initial]", *(f'"{name}" = {x!r}' for name, x in state.items())]
         phases, frequencies = rng.uniform(0, 2 * np.pi, (2, 3)), rng.uniform(0.3, 1.2, (2, 3))
         amplitudes = rng.uniform(0.03, 0.08, (2, 3))
-        for sample in range(samples):
-            time = sample / RATE
-            push = (amplitudes * np.sin(2 * np.pi * frequencies * time + phases)).sum(axis=1)
-            command = [*push, -8.0 + 5.0 * np.sin(4.4 * time + phases[0, 0])]
-            command = [float(f"{value:.7g}") for value in command]
-            seen = data.qpos + NOISE * rng.standard_normal(3)
-            numbers = ",".join([*map(repr, command), *(f"{value:.8f}" for value in seen)])
-            rows.append(f"r{run},{time:.2f},{numbers}")
-            data.ctrl[:] = command
-            mujoco.mj_step(model, data, nstep=round(1 / (RATE * model.opt.timestep)))
-    (folder / "block.xml").write_text(BLOCK)
-    path = folder / "log.csv"
-    path.write_text("\n".join(rows) + "\n")
-    units = {"push_x": "m", "push_y": "m", "press": "N"}
-    signals = [f'[inputs."u.{name}"]\nunit = "{unit}"' for name, unit in units.items()]
-    signals += [f'[channels."q.{joint}"]\nunit = "m"\nnoise = {NOISE}' for joint in JOINTS]
-    held_out = [f"[runs.r{RUNS - 1}]", "held_out = true"]
-    path.with_suffix(".toml").write_text(
-        "\n".join(['model = "block.xml"', *signals, *held_out, *tables, ""])
-    )
-    return path
+        waves = np.sin(2 * np.pi * frequencies * times[:, None, None] + phases)
+        press = -8.0 + 5.0 * np.sin(4.4 * times + phases[0, 0])
+        commands = np.column_stack([(amplitudes * waves).sum(axis=2), press])
+        # The warm start of the solver is no part of the state that a log states.
+        steps = round(1 / (RATE * model.opt.timestep))
+        readings = follow(model, commands, steps, data.qpos, start_rates=data.qvel)
+        runs.append((times, commands, readings + NOISE * rng.standard_normal(readings.shape)))
+    units = {
+        "u.push_x": "m",
+        "u.push_y": "m",
+        "u.press": "N",
+        "q.x": "m",
+        "q.y": "m",
+        "q.lift": "m",
+    }
+    more = "\n".join([f"[runs.{RUNS}]", "held_out = true", *tables, ""])
+    description = describe(units, NOISE, more, "block")
+    return write_log(folder, description, ",".join(units), runs, block=BLOCK)

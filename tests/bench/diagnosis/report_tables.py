@@ -2,33 +2,20 @@
 
 import numpy as np
 
+from tests.bench.diagnosis.simulated_logs import write_log
+
+UNITS = {"q": "rad", "qd": "rad/s", "x": "m", "v": "m/s", "z": "m"}
+
 
 def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inputs=(), more=""):
     """Write odd.csv and odd.toml; a run is its times, a column per channel and one per input."""
-    units = {
-        "q": "rad",
-        "qd": "rad/s",
-        "x": "m",
-        "v": "m/s",
-        "z": "m",
-        "u": "N*m" if system == "pendulum" else "N",
-    }
-    rows = [",".join(["run", "t", *channels, *inputs])]
-    for number, columns in enumerate(runs, start=1):
-        for row in zip(*columns, strict=True):
-            rows.append(",".join([str(number), *("" if np.isnan(v) else f"{v:.10g}" for v in row)]))
-    (folder / "odd.csv").write_text("\n".join(rows) + "\n")
     lines = [f'system = "{system}"', more]
     for name in channels:
-        lines += [
-            f"[channels.{name}]",
-            f'unit = "{units[name]}"',
-            f"noise = {noise[name]}" if noise else "",
-        ]
+        lines += [f'[channels.{name}]\nunit = "{UNITS[name]}"']
+        lines += [f"noise = {noise[name]}"] if noise else []
     for name in inputs:
-        lines += [f"[inputs.{name}]", f'unit = "{units[name]}"']
-    (folder / "odd.toml").write_text("\n".join(lines) + "\n")
-    return folder / "odd.csv"
+        lines += [f'[inputs.{name}]\nunit = "{"N*m" if system == "pendulum" else "N"}"']
+    return write_log(folder, "\n".join(lines) + "\n", ",".join([*channels, *inputs]), runs, "odd")
 
 
 def swing(times, angle=0.8, pulse=8.17, decay=0.0, rng=None, sigma=(0.003, 0.02)):

@@ -14,6 +14,7 @@ from bench.diagnosis import explain as explaining
 from bench.diagnosis.score_extended import score_model
 from bench.logs.importing.sample_selection import leave_out_settling
 from bench.logs.recording_loading import load_joined
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 NOISE = 5e-4
 ARM = """
@@ -40,12 +41,8 @@ SERVOS = (
     'gainprm="8" biastype="affine" biasprm="0 -8 -0.4" forcerange="-40 40"/>'
 )
 STATED, PLANTED = 0.1, 0.9
-LOG = "".join(
-    ['model = "arm.xml"\n']
-    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "elbow")]
-    + [f'[inputs."u.{m}"]\nunit = "rad"\n' for m in ("s1", "s2")]
-    + ["[runs.3]\nheld_out = true\n"]
-)
+UNITS = dict.fromkeys(("u.s1", "u.s2", "q.shoulder", "q.elbow"), "rad")
+LOG = describe(UNITS, NOISE, "[runs.3]\nheld_out = true\n")
 SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
 CASE = SHARED / "cases" / "filtered_servo" / "log.csv"
 
@@ -58,28 +55,18 @@ def recorded(folder, initial_activation, seconds=2.5):
         initial_activation: ``zero`` for activations as MuJoCo resets them; ``moving`` for a log
             that is cut out of a motion.
     """
-    rng = np.random.default_rng(5)
+    rng, runs = np.random.default_rng(5), []
     model = mujoco.MjModel.from_xml_string(ARM.format(damping=PLANTED, actuators=SERVOS))
-    before = 0.7 if initial_activation == "moving" else 0.0
-    count = round((seconds + before) / 0.01) + 1
-    times = 0.01 * np.arange(count)
-    rows = ["run,t,u.s1,u.s2,q.shoulder,q.elbow"]
-    for run in (1, 2, 3):
+    before = 70 if initial_activation == "moving" else 0
+    times = 0.01 * np.arange(round(100 * seconds) + before + 1)
+    for _ in range(3):
         rates, phases = rng.uniform(4, 8, 2), rng.uniform(1, 2, 2)
-        command = np.array([0.4, 0.9]) * np.sin(times[:, None] * rates + phases)
-        data = mujoco.MjData(model)
-        data.qpos[:] = command[0] / np.array([1.0, 2.0])
-        for t, u in zip(times, command, strict=True):
-            q = data.qpos + NOISE * rng.standard_normal(2)
-            if t > before - 1e-9:
-                rows.append(f"{run},{t:.3f},{u[0]:.9f},{u[1]:.9f},{q[0]:.7f},{q[1]:.7f}")
-            data.ctrl[:] = u
-            for _ in range(5):
-                mujoco.mj_step(model, data)
-    (folder / "arm.xml").write_text(ARM.format(damping=STATED, actuators=SERVOS))
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    (folder / "log.toml").write_text(LOG)
-    return folder / "log.csv"
+        commands = np.array([0.4, 0.9]) * np.sin(times[:, None] * rates + phases)
+        readings = follow(model, commands, 5, start=commands[0] / np.array([1.0, 2.0]))
+        readings += NOISE * rng.standard_normal(readings.shape)
+        runs.append((times[before:], commands[before:], readings[before:]))
+    known = ARM.format(damping=STATED, actuators=SERVOS)
+    return write_log(folder, LOG, ",".join(UNITS), runs, arm=known)
 
 
 @pytest.mark.parametrize("initial_activation", ["zero", "moving"])

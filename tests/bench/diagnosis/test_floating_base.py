@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.cli.main import main
 from bench.diagnosis.explain import explain
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import read_recording
+from tests.bench.diagnosis.simulated_logs import write_log
+from tests.command_output import run_command
 from tests.sims.robot.test_floating_joints import SATELLITE
 from tests.sims.robot.test_robot_motion import kind_of
 
@@ -29,7 +30,7 @@ unit = "rad"
 noise = 0.001
 [inputs."u.m_boom"]
 unit = "N*m"
-[runs.2]
+[runs.3]
 held_out = true
 """
 
@@ -67,23 +68,19 @@ def motion(run):
     return np.array([b - a for a, b, *_ in states])
 
 
-STATED = "".join(f'[runs.{k}.initial]\n"qd.base.wz" = {spin}\n' for k, spin in enumerate(SPINS))
+STATED = "".join(f'[runs.{k}.initial]\n"qd.base.wz" = {spin}\n' for k, spin in enumerate(SPINS, 1))
 TURNING = '[extra."qd.base.wz"]\nunit = "deg/s"\n'
 """Description of a log column with the spin of the hull."""
 
 
 def recorded(tmp_path, toml=TOML + STATED, runs=3, spins=False):
-    rng = np.random.default_rng(4)
-    lines = ["run,t,u.m_boom,q.boom" + ",qd.base.wz" * spins]
+    rng, columns = np.random.default_rng(4), []
     for run in range(runs):
         seen = motion(run) + rng.normal(0.0, 1e-3, TIMES.size)
-        more = f",{np.rad2deg(SPINS[run]):.9g}" * spins
-        columns = zip(TIMES, commands(run), seen, strict=True)
-        lines += [f"{run},{t:.9g},{u:.9g},{q:.9g}{more}" for t, u, q in columns]
-    (tmp_path / "satellite.xml").write_text(MODEL)
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
-    (tmp_path / "log.toml").write_text(toml)
-    return tmp_path / "log.csv"
+        spin = np.full((TIMES.size, int(spins)), np.rad2deg(SPINS[run]))
+        columns.append((TIMES, commands(run), seen, spin))
+    names = "u.m_boom,q.boom" + ",qd.base.wz" * spins
+    return write_log(tmp_path, toml, names, columns, satellite=MODEL)
 
 
 @pytest.mark.parametrize("run", range(len(SPINS)))
@@ -105,7 +102,7 @@ def test_a_column_says_where_a_run_begins(tmp_path):
     found = [run.initial["qd.base.wz"] for run in recording.runs]
     np.testing.assert_allclose(found, SPINS, rtol=1e-6)
     assert check_recording_plausible(recording, kind) == []
-    path.with_suffix(".toml").write_text(TOML + TURNING + '[runs.0.initial]\n"qd.base.wz" = 7.0\n')
+    path.with_suffix(".toml").write_text(TOML + TURNING + '[runs.1.initial]\n"qd.base.wz" = 7.0\n')
     assert read_recording(path, kind).runs[0].initial == {"qd.base.wz": 7.0}, "stated in its place"
 
 
@@ -113,17 +110,17 @@ SINGLE = TOML.partition("[runs")[0]
 BAD = {
     "nothing said": (
         TOML, 3, False,
-        r"run 0: the log does not state where base begins; state \[runs\.0\.initial\], of "
+        r"run 1: the log does not state where base begins; state \[runs\.1\.initial\], of "
         r"q\.base\.x, .*, "
         r"qd\.base\.wz \(states that are left out are as in the model file, at rest\), or insist",
     ),
     "one run without": (
-        TOML + STATED.partition("[runs.2")[0], 3, False,
-        r"run 2: the log does not state where base begins; state \[runs\.2\.initial\]",
+        TOML + STATED.partition("[runs.3")[0], 3, False,
+        r"run 3: the log does not state where base begins; state \[runs\.3\.initial\]",
     ),
     "a single run": (
-        SINGLE + STATED.partition("[runs.1")[0], 1, False,
-        r"run 0: the log does not state where base is when the last third of a single run "
+        SINGLE + STATED.partition("[runs.2")[0], 1, False,
+        r"run 1: the log does not state where base is when the last third of a single run "
         "begins; record",
     ),
     "a channel": (
@@ -150,7 +147,7 @@ def test_a_simulated_log_says_where_its_runs_began(tmp_path):
     (tmp_path / "satellite.xml").write_text(MODEL)
     given = ["simulate", "--model", str(tmp_path / "satellite.xml"), "--runs", "2"]
     given += ["--seconds", "0.5", "--initial", "qd.base.wz=-1:1", "--out"]
-    assert main([*given, str(tmp_path / "made.csv")]) == 0
+    run_command(*given, tmp_path / "made.csv")
     recording, kind = load_recording(tmp_path / "made.csv")
     one, other = (run.initial["qd.base.wz"] for run in recording.runs)
     assert one != other
@@ -161,7 +158,7 @@ def compared(tmp_path, *given):
     """Run a comparison with least squares; return the last row of each run by target."""
     free = ["--free", "damping@boom", "--tuners", "least_squares", "--targets", "1", "--seeds", "1"]
     size = ["--budget", "12", "--jobs", "0", "--trust", "--out", str(tmp_path / "out")]
-    assert main(["compare", *given, *free, *size]) == 0
+    run_command("compare", *given, *free, *size)
     rows = pd.read_parquet(tmp_path / "out" / "runs.parquet").sort_values("k")
     return rows.groupby("target").last()
 

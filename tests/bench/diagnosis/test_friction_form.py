@@ -32,6 +32,7 @@ from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from bench.logs.recording_loading import load_joined
 from sims.extended_simulator import read_extended
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 from tests.bench.diagnosis.verdict_schema import check
 from tests.sims.robot.test_friction_form import ARM
 
@@ -41,40 +42,23 @@ FORMS = {
     # Parameters of the stiff form for 2 ms steps of `implicitfast`.
     "stiff": 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001"',
 }
-LOG = "".join(
-    ['model = "arm.xml"\n']
-    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "elbow")]
-    + [f'[inputs."u.{m}"]\nunit = "N*m"\n' for m in ("m1", "m2")]
-    + ["[runs.3]\nheld_out = true\n"]
-)
+UNITS = {"u.m1": "N*m", "u.m2": "N*m", "q.shoulder": "rad", "q.elbow": "rad"}
 
 
 def recorded(folder, form, friction=PLANTED, seconds=2.0):
     """Write a log of three runs, with a model file without friction; return its path."""
-    rng = np.random.default_rng(8)
+    rng, runs = np.random.default_rng(8), []
     loss = f'frictionloss="{friction}" {FORMS[form]}'
     model = mujoco.MjModel.from_xml_string(ARM.format(integrator="implicitfast", elbow=loss))
-    times = 0.002 * np.arange(round(seconds / 0.002) + 1)
-    rows = ["run,t,u.m1,u.m2,q.shoulder,q.elbow"]
-    for run in (1, 2, 3):
+    times = 0.01 * np.arange(round(100 * seconds) + 1)
+    for _ in range(3):
         rates, phases = rng.uniform(3, 9, 2), rng.uniform(0, 6, 2)
-        torque = np.array([0.8, 0.3]) * np.sin(times[:, None] * rates + phases)
-        # Each command is held for five steps, until the next row.
-        torque = np.repeat(torque[::5], 5, axis=0)[: times.size]
-        data = mujoco.MjData(model)
-        data.qpos[:] = rng.uniform(-0.5, 0.5, 2)
-        q = []
-        for row in torque:
-            q.append(data.qpos.copy())
-            data.ctrl[:] = row
-            mujoco.mj_step(model, data)
-        seen = np.array(q) + NOISE * rng.standard_normal((times.size, 2))
-        for t, u, x in list(zip(times, torque, seen, strict=True))[::5]:
-            rows.append(f"{run},{t:.3f},{u[0]:.9f},{u[1]:.9f},{x[0]:.7f},{x[1]:.7f}")
-    (folder / "arm.xml").write_text(ARM.format(integrator="implicitfast", elbow=""))
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    (folder / "log.toml").write_text(LOG)
-    return folder / "log.csv"
+        torques = np.array([0.8, 0.3]) * np.sin(times[:, None] * rates + phases)
+        readings = follow(model, torques, 5, start=rng.uniform(-0.5, 0.5, 2))
+        runs.append((times, torques, readings + NOISE * rng.standard_normal(readings.shape)))
+    description = describe(UNITS, NOISE, "[runs.3]\nheld_out = true\n")
+    known = ARM.format(integrator="implicitfast", elbow="")
+    return write_log(folder, description, ",".join(UNITS), runs, arm=known)
 
 
 def fitted(path, name):

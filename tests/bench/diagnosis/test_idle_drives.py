@@ -13,6 +13,7 @@ import pytest
 
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.report.summary_text import format_summary
+from tests.bench.diagnosis.simulated_logs import follow, write_log
 from tests.bench.diagnosis.verdict_schema import check
 
 NOISE = 1e-3
@@ -40,27 +41,25 @@ CASE = SHARED / "cases" / "torque_switched_off" / "log.csv"
 
 def recorded(folder, description, has_column=True):
     """Write a log of three runs with the drive off for 1.5 s in each; return its path."""
-    rng = np.random.default_rng(4)
+    rng, runs = np.random.default_rng(4), []
     model = mujoco.MjModel.from_xml_string(ROD.format(damping=PLANTED))
     gain, bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
     times = 0.01 * np.arange(301)
-    rows = ["run,t,u.drive,q.hinge" + ",enabled" * has_column]
-    for run in (1, 2, 3):
-        data = mujoco.MjData(model)
-        first = 0.9 + 0.2 * run
-        u = 1.2 * np.sin(rng.uniform(4, 7) * times)
-        for k, t in enumerate(times):
-            on = not first - 1e-9 <= t < first + 1.5 - 1e-9
-            q = data.qpos[0] + NOISE * rng.standard_normal()
-            rows.append(f"{run},{t:.3f},{u[k]:.9f},{q:.7f}" + f",{int(on)}" * has_column)
-            data.ctrl[0] = u[k]
+    for first in (1.1, 1.3, 1.5):
+
+        def is_on(t, first=first):
+            return (t < first - 1e-9) | (t >= first + 1.5 - 1e-9)
+
+        def switch(data, is_on=is_on):
+            on = is_on(data.time)
             model.actuator_gainprm[:], model.actuator_biasprm[:] = gain * on, bias * on
-            for _ in range(5):
-                mujoco.mj_step(model, data)
-    (folder / "rod.xml").write_text(ROD.format(damping=STATED))
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    (folder / "log.toml").write_text(description)
-    return folder / "log.csv"
+
+        commands = 1.2 * np.sin(rng.uniform(4, 7) * times)
+        readings = follow(model, commands, 5, act=switch)
+        readings += NOISE * rng.standard_normal(readings.shape)
+        runs.append((times, commands, readings, *[is_on(times)] * has_column))
+    columns = "u.drive,q.hinge" + ",enabled" * has_column
+    return write_log(folder, description, columns, runs, rod=ROD.format(damping=STATED))
 
 
 @pytest.mark.parametrize("given", ["key", "column", "nothing"])

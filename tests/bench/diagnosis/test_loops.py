@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from tests.exams.robot_files import write_robot_recording
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 LEG = """<mujoco model="leg">
   <compiler angle="radian"/>
@@ -40,41 +40,32 @@ NOISE = 3e-4
 """Standard deviation of the encoders in rad."""
 
 
-def write_log(folder, planted_damping):
+def write_leg_log(folder, planted_damping):
     """Write three runs of 3 s by plain MuJoCo; the encoders are at hip and crank alone."""
-    rng, runs = np.random.default_rng(5), {}
-    times = np.arange(301) / 100
-    for name in ("1", "2", "3"):
-        model = mujoco.MjModel.from_xml_string(LEG)
-        model.dof_damping[model.joint("knee").dofadr[0]] += planted_damping
-        data = mujoco.MjData(model)
+    rng, runs, times = np.random.default_rng(5), [], np.arange(301) / 100
+    model = mujoco.MjModel.from_xml_string(LEG)
+    model.dof_damping[model.joint("knee").dofadr[0]] += planted_damping
+    encoders = [model.joint(joint).qposadr[0] for joint in ("hip", "crank")]
+    for _ in range(3):
         frequencies = rng.uniform((0.3, 0.7, 1.3), (0.7, 1.3, 2.5), (2, 3))
         phases = rng.uniform(0.0, 6.0, (2, 3))
         waves = np.sin(2 * np.pi * frequencies[..., None] * times + phases[..., None])
         commands = 0.3 * np.einsum("k,ukt->tu", (0.5, 0.3, 0.2), waves)
-        commands = np.array([[float(f"{value:.9g}") for value in row] for row in commands])
-        data.ctrl[:] = commands[0]
-        mujoco.mj_step(model, data, nstep=2000)
-        positions = []
-        for command in commands:
-            positions.append([data.joint(joint).qpos[0] for joint in ("hip", "crank")])
-            data.ctrl[:] = command
-            mujoco.mj_step(model, data, nstep=10)
-        readings = np.array(positions) + NOISE * rng.standard_normal((times.size, 2))
-        runs[name] = (name == "3", times, commands, readings)
-    inputs = {"u.m_hip": "rad", "u.m_crank": "rad"}
-    channels = {"q.hip": ("rad", NOISE), "q.crank": ("rad", NOISE)}
-    return write_robot_recording(folder, "log", inputs, channels, runs, ("leg.xml", LEG))
+        positions = follow(model, commands, 10, settle=2000)[:, encoders]
+        runs.append((times, commands, positions + NOISE * rng.standard_normal(positions.shape)))
+    units = dict.fromkeys(("u.m_hip", "u.m_crank", "q.hip", "q.crank"), "rad")
+    description = describe(units, NOISE, "[runs.3]\nheld_out = true\n", "leg")
+    return write_log(folder, description, ",".join(units), runs, leg=LEG)
 
 
 @pytest.mark.slow
 def test_a_leg_with_a_rod_is_adequate(tmp_path):
-    assert explain(write_log(tmp_path, 0.0), jobs=1).answer.verdict == "adequate"
+    assert explain(write_leg_log(tmp_path, 0.0), jobs=1).answer.verdict == "adequate"
 
 
 @pytest.mark.slow
 def test_a_damping_in_the_loop_is_found(tmp_path):
-    answer = explain(write_log(tmp_path, 0.5), jobs=1).answer
+    answer = explain(write_leg_log(tmp_path, 0.5), jobs=1).answer
     (cause,) = answer.causes
     assert "drag.linear@knee" in (cause.effect, *cause.alternatives)
     if cause.effect == "drag.linear@knee":

@@ -3,13 +3,10 @@
 import csv
 import hashlib
 import json
-from contextlib import redirect_stdout
-from io import StringIO
 
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.diagnosis.many_logs import (
     LOG_COLUMNS,
     LogResult,
@@ -20,6 +17,7 @@ from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
 from sims.systems.slider import Slider
+from tests.command_output import run_command
 from tests.local_cluster import cluster
 
 NOISE = 1e-3
@@ -51,9 +49,7 @@ def logs(tmp_path_factory):
 def explained_logs(logs, tmp_path_factory):
     """Explain all logs with two processes; return the folder and the printed text."""
     out = tmp_path_factory.mktemp("explained") / "out"
-    with redirect_stdout(StringIO()) as printed:
-        assert explain(logs, out, "--jobs", "2") == 0
-    return out, printed.getvalue()
+    return out, explain(logs, out, "--jobs", "2").out
 
 
 def rows_of(out):
@@ -61,8 +57,9 @@ def rows_of(out):
         return list(csv.DictReader(file))
 
 
-def explain(logs, out, *more):
-    return main(["explain", *map(str, logs), "--each", "--out", str(out), *more])
+def explain(logs, out, *more, code=0):
+    """Explain each log alone; return what the command prints."""
+    return run_command("explain", *logs, "--each", "--out", out, *more, code=code)
 
 
 @pytest.mark.slow
@@ -98,7 +95,7 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     out, bad = tmp_path / "out", tmp_path / "bad.csv"
     bad.write_text("nothing\n")
     bad.with_suffix(".toml").write_text('system = "slider"\n')
-    assert explain([logs[0], bad], out, "--jobs", "1") == 1
+    explain([logs[0], bad], out, "--jobs", "1", code=1)
     first = rows_of(out)
     assert [row["verdict"] for row in first] == ["named", ""]
     assert "1 could not be explained" in (out / "report.html").read_text(encoding="utf-8")
@@ -108,32 +105,29 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     log(tmp_path, "bad2", 0.5, 9)
     bad.write_bytes((tmp_path / "bad2.csv").read_bytes())
     bad.with_suffix(".toml").write_bytes((tmp_path / "bad2.toml").read_bytes())
-    assert explain([*logs[:2], bad], out, "--jobs", "1") == 0
+    explain([*logs[:2], bad], out, "--jobs", "1")
     assert [row["log"] for row in rows_of(out)] == ["day0", "day1", "bad"]
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "<strong>3 named</strong>" in page
     assert (out / "day0" / "verdict.json").stat().st_mtime_ns == stamp
     # A changed option (here the seed) invalidates all stored results.
-    assert explain(logs[:1], out, "--jobs", "1", "--seed", "3") == 0
+    explain(logs[:1], out, "--jobs", "1", "--seed", "3")
     assert (out / "day0" / "verdict.json").stat().st_mtime_ns != stamp
 
 
-def test_foreign_files_are_not_changed(logs, tmp_path, capsys):
+def test_foreign_files_are_not_changed(logs, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "logs.json").write_text('{"mine": 1}')
-    assert explain(logs[:1], out) == 2
-    assert "name another folder" in capsys.readouterr().err
+    assert "name another folder" in explain(logs[:1], out, code=2).err
     assert (out / "logs.json").read_text() == '{"mine": 1}'
     (out / "logs.json").rename(out / "mine.json")
-    assert explain(logs[:1], out) == 2
-    assert "not empty" in capsys.readouterr().err
+    assert "not empty" in explain(logs[:1], out, code=2).err
     assert [path.name for path in out.iterdir()] == ["mine.json"]
 
 
-def test_a_cluster_needs_many_logs(logs, tmp_path, capsys):
-    assert main(["explain", str(logs[0]), "--cluster", "tcp://127.0.0.1:1"]) == 2
-    assert "--each" in capsys.readouterr().err
+def test_a_cluster_needs_many_logs(logs, tmp_path):
+    assert "--each" in run_command("explain", logs[0], "--cluster", "tcp://127.0.0.1:1", code=2).err
 
 
 def test_names_that_look_like_formulas_are_text_and_numbers_have_their_range():
@@ -153,7 +147,7 @@ def test_names_that_look_like_formulas_are_text_and_numbers_have_their_range():
 def test_a_cluster_finds_what_this_machine_finds(logs, explained_logs, tmp_path):
     there = tmp_path / "there"
     with cluster(tmp_path) as running:
-        assert explain(logs[:2], there, "--cluster", running.address) == 0
+        explain(logs[:2], there, "--cluster", running.address)
     untimed = [
         [{k: v for k, v in row.items() if k != "seconds"} for row in rows_of(out)]
         for out in (explained_logs[0], there)

@@ -18,6 +18,7 @@ from bench.diagnosis.pipeline.verdict_builder import _is_refuted
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 
 @pytest.mark.parametrize("system", ["pendulum", "servo", "ball"])
@@ -163,47 +164,38 @@ GRIPPER = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
     <position name="grip" joint="finger" kp="200"/></actuator></mujoco>"""
 
 
-def robot_log(folder, text, driven, resting, channels, noise):
-    """Simulate a log with the step of the file: one servo moves, the others stay at zero."""
-    model, rng = mujoco.MjModel.from_xml_string(text), np.random.default_rng(5)
-    inputs = [f"u.{name}" for name in (driven, *resting)]
-    lines = [",".join(["run", "t", *inputs, *(f"q.{name}" for name in channels)])]
-    places = [model.joint(name).qposadr[0] for name in channels]
-    for run in range(3):
-        data = mujoco.MjData(model)
+def robot_log(folder, text, units, places, noise):
+    """Simulate a log with the step of the file: the first servo moves, the others stay at zero.
+
+    Args:
+        folder: folder of the log.
+        text: model file.
+        units: unit by signal; the first one is the command of the moving servo.
+        places: index of the coordinate of each channel.
+        noise: standard deviation of the noise, which is stated if it is not zero.
+    """
+    model, rng, runs = mujoco.MjModel.from_xml_string(text), np.random.default_rng(5), []
+    times = 5 * model.opt.timestep * np.arange(200)
+    for _ in range(3):
         rate, size = rng.uniform(3, 7), rng.uniform(0.3, 0.6)
-        for k in range(1000):
-            if k % 5 == 0:
-                data.ctrl[:] = 0.0
-                data.actuator(driven).ctrl[:] = size * np.sin(rate * k * model.opt.timestep)
-                seen = data.qpos[places] + noise * rng.standard_normal(len(places))
-                controls = [float(data.actuator(name[2:]).ctrl[0]) for name in inputs]
-                row = [k * model.opt.timestep, *controls, *seen.tolist()]
-                lines.append(",".join([str(run), *map(repr, row)]))
-            mujoco.mj_step(model, data)
-    (folder / "robot.xml").write_text(text)
-    (folder / "log.csv").write_text("\n".join(lines) + "\n")
-    units = {
-        name: "m" if "slide" in text and name in ("finger", "grip") else "rad"
-        for name in (driven, *resting, *channels)
-    }
-    stated = f"noise = {noise}\n" * bool(noise)
-    parts = [f'[inputs."{name}"]\nunit = "{units[name[2:]]}"\n' for name in inputs]
-    parts += [f'[channels."q.{name}"]\nunit = "{units[name]}"\n{stated}' for name in channels]
-    (folder / "log.toml").write_text(
-        'model = "robot.xml"\n' + "".join(parts) + "[runs.2]\nheld_out = true\n"
-    )
-    return folder / "log.csv"
+        commands = np.zeros((200, model.nu))
+        commands[:, 0] = size * np.sin(rate * times)
+        readings = follow(model, commands, 5)[:, places]
+        runs.append((times, commands, readings + noise * rng.standard_normal(readings.shape)))
+    description = describe(units, noise or None, "[runs.3]\nheld_out = true\n", "robot")
+    return write_log(folder, description, ",".join(units), runs, robot=text)
 
 
 @pytest.mark.slow
 def test_a_closed_loop_without_a_cause_is_adequate(tmp_path):
-    path = robot_log(tmp_path, FOUR_BAR, "servo", (), ("crank", "rocker"), 0.0)
+    units = dict.fromkeys(("u.servo", "q.crank", "q.rocker"), "rad")
+    path = robot_log(tmp_path, FOUR_BAR, units, [0, 2], 0.0)
     assert explain(path).answer.verdict == "adequate"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [5e-4, 0.0])
 def test_a_gripper_at_rest_is_adequate(tmp_path, noise):
-    path = robot_log(tmp_path, GRIPPER, "servo", ("grip",), ("arm", "finger"), noise)
+    units = {"u.servo": "rad", "u.grip": "m", "q.arm": "rad", "q.finger": "m"}
+    path = robot_log(tmp_path, GRIPPER, units, [0, 1], noise)
     assert explain(path).answer.verdict == "adequate"

@@ -21,11 +21,12 @@ from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
 from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
 from tests.bench.diagnosis.arm_model import ARM
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 HEAVY = ('mass="0.8"', 'mass="1.2"')
 DAMPED = ('damping="0.1"', 'damping="0.4"')
-COLUMNS = ("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow")
-NOISE, EVERY, SECONDS = 3e-4, 2, 3.0
+UNITS = dict.fromkeys(("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow"), "rad")
+NOISE, EVERY, SAMPLES = 3e-4, 2, 375
 
 
 def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
@@ -37,25 +38,14 @@ def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
     step = model.opt.timestep
     model.opt.timestep /= divide
     model.opt.integrator = int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"))
-    rng, lines = np.random.default_rng(3), [",".join(("run", "t", *COLUMNS))]
-    for run in range(3):
-        data = mujoco.MjData(model)
+    rng, times, runs = np.random.default_rng(3), EVERY * step * np.arange(SAMPLES), []
+    for _ in range(3):
         rates, sizes = rng.uniform(1, 5, 2), rng.uniform(0.4, 0.9, 2)
-        for k in range(round(SECONDS / step)):
-            if k % EVERY == 0:
-                data.ctrl[:] = sizes * np.sin(rates * k * step)
-                row = [k * step, *data.ctrl, *(data.qpos + noise * rng.standard_normal(2))]
-                lines.append(",".join([str(run), *(repr(float(value)) for value in row)]))
-            for _ in range(divide):
-                mujoco.mj_step(model, data)
-    (folder / "arm.xml").write_text(ARM)
-    (folder / "log.csv").write_text("\n".join(lines) + "\n")
-    stated = f"noise = {noise}\n" * bool(noise)
-    parts = [f'[inputs."{name}"]\nunit = "rad"\n' for name in COLUMNS[:2]]
-    parts += [f'[channels."{name}"]\nunit = "rad"\n{stated}' for name in COLUMNS[2:]]
-    parts += ["[runs.2]\nheld_out = true\n"]
-    (folder / "log.toml").write_text('model = "arm.xml"\n' + "".join(parts))
-    return folder / "log.csv"
+        commands = sizes * np.sin(times[:, None] * rates)
+        readings = follow(model, commands, EVERY * divide)
+        runs.append((times, commands, readings + noise * rng.standard_normal(readings.shape)))
+    description = describe(UNITS, noise or None, "[runs.3]\nheld_out = true\n")
+    return write_log(folder, description, ",".join(UNITS), runs, arm=ARM)
 
 
 URDF = """<robot name="arm">

@@ -1,6 +1,5 @@
 """Tests that time ranges follow the recording and that parameters at a bound are reported."""
 
-import csv
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.cli.main import main
 from bench.core.plugin_registries import load_plugins
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_data import adapt_to_time_scale
@@ -29,6 +27,8 @@ from sims.core.simulator import Parameter
 from sims.extended_simulator import FittedValue
 from tests.bench.diagnosis.explained_samples import evaluator, recording
 from tests.bench.diagnosis.sample_report_data import DRAG, make_report
+from tests.bench.diagnosis.simulated_logs import write_log
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 
 TANKS = PLUGINS.parents[1] / "examples" / "tanks.py"
@@ -49,25 +49,19 @@ def lagged_tanks(path):
         filled = (PUMP * volts - through) / AREA
         return [filled, (through - away) / AREA, (h[0] - h[2]) / LAG, (h[1] - h[3]) / LAG]
 
-    rng = np.random.default_rng(3)
-    with path.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(["run", "t", "volts", "upper", "lower"])
-        for run, (volts, start) in enumerate(RUNS):
-            state, rows = np.array([*start, *start]), []
-            for u in volts:
-                times = STEP * np.arange(HOLD + 1)
-                exact = {"t_eval": times, "method": "LSODA", "rtol": 1e-10, "atol": 1e-12}
-                part = solve_ivp(rates, (0.0, times[-1]), state, args=(u,), **exact)
-                rows += [(u, *h[2:]) for h in part.y.T[:-1]]
-                state = part.y[:, -1]
-            for i, (u, *levels) in enumerate(rows):
-                seen = np.array(levels) + NOISE * rng.normal(size=2)
-                table.writerow([run, STEP * i, u, *(f"{h:.6f}" for h in seen)])
+    rng, runs, times = np.random.default_rng(3), [], STEP * np.arange(HOLD + 1)
+    for volts, start in RUNS:
+        state, levels = np.array([*start, *start]), []
+        for u in volts:
+            exact = {"t_eval": times, "method": "LSODA", "rtol": 1e-10, "atol": 1e-12}
+            part = solve_ivp(rates, (0.0, times[-1]), state, args=(u,), **exact)
+            levels.append(part.y[2:, :-1].T)
+            state = part.y[:, -1]
+        seen = np.concatenate(levels) + NOISE * rng.normal(size=(len(volts) * HOLD, 2))
+        runs.append((STEP * np.arange(len(seen)), np.repeat(volts, HOLD), seen))
     channels = "".join(f'[channels.{n}]\nunit = "m"\nnoise = {NOISE}\n' for n in ("upper", "lower"))
     about = f'system = "tanks"\n{channels}[inputs.volts]\nunit = "V"\n'
-    path.with_suffix(".toml").write_text(about)
-    return path
+    return write_log(path.parent, about, "volts,upper,lower", runs, path.stem)
 
 
 @pytest.mark.slow
@@ -160,7 +154,7 @@ def bounded(tmp_path_factory):
     path = folder / "swing.csv"
     words = ["--noise", "q=0.002", "--observe", "q", "--initial", "q=0.4:1.2", "--seconds", "2"]
     effect = ["--effect", "drag.linear=0.004"]
-    assert main(["simulate", "pendulum", "--out", str(path), *words, *effect]) == 0
+    run_command("simulate", "pendulum", "--out", path, *words, *effect)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bench.diagnosis.evaluation.coefficient_bounds.MAX_RANGE_FACTOR", 0.02)
         found = explain(path)

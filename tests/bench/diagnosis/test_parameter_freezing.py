@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.diagnosis.explain import explain
+from tests.bench.diagnosis.simulated_logs import write_log
 
 MASS, LENGTH, INERTIA, DAMPING, NOISE = 1.2, 0.5, 0.02, 0.15, 1e-3
 MODEL = f"""<mujoco model="swing"><compiler angle="radian"/>
@@ -19,24 +20,20 @@ LOG = 'model = "swing.xml"\nfree = {free}\n[channels."q.hinge"]\nunit = "rad"\nn
 @pytest.fixture
 def log(tmp_path):
     """Write a free swing, which determines only one ratio of mass and inertia."""
-    rng, times = np.random.default_rng(5), np.arange(0.0, 4.0, 0.02)
-    rows = ["run,t,q.hinge"]
-    for run, angle in enumerate((0.4, -0.7, 1.0)):
+    rng, times, runs = np.random.default_rng(5), np.arange(0.0, 4.0, 0.02), []
+    for angle in (0.4, -0.7, 1.0):
 
         def rate(_t, x):
             torque = -MASS * 9.81 * LENGTH * np.sin(x[0]) - DAMPING * x[1]
             return [x[1], torque / (INERTIA + MASS * LENGTH**2)]
 
         q = solve_ivp(rate, (0, 4), [angle, 0.0], t_eval=times, rtol=1e-9, atol=1e-9).y[0]
-        seen = q + NOISE * rng.standard_normal(times.size)
-        rows += [f"{run},{t:.2f},{x:.6f}" for t, x in zip(times, seen, strict=True)]
-    (tmp_path / "swing.xml").write_text(MODEL)
-    (tmp_path / "swing.csv").write_text("\n".join(rows))
+        runs.append((times, q + NOISE * rng.standard_normal(times.size)))
 
     def stated(*free):
         names = "[" + ", ".join(f'"{name}"' for name in free) + "]"
-        (tmp_path / "swing.toml").write_text(LOG.format(free=names, noise=NOISE))
-        return tmp_path / "swing.csv"
+        description = LOG.format(free=names, noise=NOISE)
+        return write_log(tmp_path, description, "q.hinge", runs, "swing", swing=MODEL)
 
     return stated
 

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.randomization_files import COLUMNS, build_range_files
@@ -23,6 +22,7 @@ from bench.schemas import load_schema
 from sims.core.toml_validation import tomllib
 from sims.extended_simulator import ExtendedSimulator, FittedValue, get_robot_reference
 from tests.bench.diagnosis.sample_report_data import answer, make_report
+from tests.command_output import run_command
 from tests.sims.robot.sample_arms import ARM
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
@@ -434,12 +434,11 @@ def test_names_from_files_do_not_become_code(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_writes_ranges_of_the_example(tmp_path, capsys):
+def test_the_command_writes_ranges_of_the_example(tmp_path):
     out = tmp_path / "out"
     log = str(EXAMPLE / "log.csv")
     arguments = ["explain", log, "--out", str(out), "--ranges", "--jobs", "1", "--json"]
-    assert main(arguments) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(run_command(*arguments).out)
     for name in NAMES:
         assert str(out / name) in said["files"]
         assert (out / name).exists()
@@ -454,17 +453,21 @@ def test_the_command_writes_ranges_of_the_example(tmp_path, capsys):
     assert model.dof_frictionloss[address] == pytest.approx(found["value"], rel=1e-6)
 
 
-def test_without_a_model_file_a_line_and_no_file(tmp_path, capsys):
+def test_without_a_model_file_a_line_and_no_file(tmp_path):
     log = str(tmp_path / "swing.csv")
-    assert main(["simulate", "pendulum", "--noise", "0.01", "--runs", "2", "--out", log]) == 0
+    run_command("simulate", "pendulum", "--noise", "0.01", "--runs", "2", "--out", log)
     out = tmp_path / "out"
-    assert main(["explain", log, "--out", str(out), "--ranges", "--jobs", "1"]) == 0
-    assert "no ranges are written: system pendulum has no model file" in capsys.readouterr().out
+    assert (
+        "no ranges are written: system pendulum has no model file"
+        in run_command("explain", log, "--out", out, "--ranges", "--jobs", "1").out
+    )
     assert not list(out.glob("ranges*"))
 
 
-def test_ranges_and_each_do_not_go_together(tmp_path, capsys):
+def test_ranges_and_each_do_not_go_together(tmp_path):
     log = str(EXAMPLE / "log.csv")
-    assert main(["explain", log, "--each", "--ranges", "--out", str(tmp_path / "out")]) == 2
-    assert "--ranges: not possible together with --each" in capsys.readouterr().err
+    assert (
+        "--ranges: not possible together with --each"
+        in run_command("explain", log, "--each", "--ranges", "--out", tmp_path / "out", code=2).err
+    )
     assert not (tmp_path / "out").exists()

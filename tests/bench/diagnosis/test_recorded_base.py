@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.cli.main import main
 from bench.diagnosis.explain import explain
 from sims.core.simulator import InputError
+from tests.command_output import run_command
 from tests.example_logs import drone
 from tests.exams.robot_files import write_robot_recording
 
@@ -111,7 +111,7 @@ def test_a_flight_that_the_model_predicts_is_adequate(tmp_path):
 @pytest.mark.long
 def test_the_weak_rotor_of_the_example_is_named_and_written_into_the_file(tmp_path):
     log, out = EXAMPLE / "log.csv", tmp_path / "mine"
-    assert main(["explain", str(log), "--out", str(out), "--jobs", "1"]) == 0
+    run_command("explain", log, "--out", out, "--jobs", "1")
     verdict = json.loads((out / "verdict.json").read_text())
     (cause,) = verdict["causes"]
     assert verdict["verdict"] == "named"
@@ -124,7 +124,7 @@ def test_the_weak_rotor_of_the_example_is_named_and_written_into_the_file(tmp_pa
     assert thrusts == pytest.approx([1.0, 1.0, 1.0 + number, 1.0], abs=1e-4)
     # Both files predict the held-out flight down to the noise.
     for name in ("extended.toml", "extended.xml"):
-        assert main(["score", str(out / name), str(log), "--held-out"]) == 0
+        run_command("score", out / name, log, "--held-out")
 
 
 @pytest.mark.slow

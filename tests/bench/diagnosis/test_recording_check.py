@@ -5,7 +5,6 @@ import re
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.diagnosis import identifiability
 from bench.diagnosis.explain import explain
 from bench.diagnosis.identifiability import format_identifiability
@@ -14,6 +13,7 @@ from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
 from sims.systems.slider import Slider
+from tests.command_output import run_command
 
 NOISE = 1e-3
 
@@ -63,17 +63,16 @@ def test_what_is_called_identifiable_has_intervals_that_hold(tmp_path):
     assert 0.88 <= np.mean(held) <= 1.0  # 16 of 18
 
 
-def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path, capsys):
+def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path):
     path = recorded(tmp_path, moved=False)
     (mass,) = [n for n in check_identifiability(path) if n.free]
     assert mass.word == "not identifiable"
     out = tmp_path / "out"
-    assert main(["inspect", str(path), "--check", "--out", str(out)]) == 1
-    said = capsys.readouterr().out
+    said = run_command("inspect", path, "--check", "--out", out, code=1).out
     assert "  not identifiable mass: " in said
 
 
-def test_confounded_numbers_are_named(tmp_path, capsys):
+def test_confounded_numbers_are_named(tmp_path):
     path = recorded(tmp_path)
     by_name = {number.name: dict(number.mixed) for number in check_identifiability(path)}
     assert by_name["input.delay"]["input.hold"] > 0.99
@@ -81,16 +80,17 @@ def test_confounded_numbers_are_named(tmp_path, capsys):
     # The gain of the input is confounded with the free mass, so it is not identifiable.
     (gain,) = [n for n in check_identifiability(path) if n.name == "input.gain"]
     assert gain.word == "not identifiable"
-    assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out
+    said = run_command("inspect", path, "--check", "--out", tmp_path / "out").out
     assert "confounded with" in said
     assert re.search(r"\n  not identifiable: .*input\.gain", said)
 
 
-def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
+def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path):
     path = recorded(tmp_path)
-    assert main(["inspect", str(path), "--free", "mass", "--out", str(tmp_path / "out")]) == 2
-    assert "add --check, or leave out --free" in capsys.readouterr().err
+    assert (
+        "add --check, or leave out --free"
+        in run_command("inspect", path, "--free", "mass", "--out", tmp_path / "out", code=2).err
+    )
     with pytest.raises(InputError, match="no such file"):
         check_identifiability(tmp_path / "none.csv")
 

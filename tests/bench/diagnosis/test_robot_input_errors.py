@@ -3,24 +3,21 @@
 import numpy as np
 import pytest
 
+from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.explain import explain
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.diagnosis.arm_model import ARM
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 
 COLUMNS = ("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow")
-TOML = 'model = "arm.xml"\n' + "".join(
-    f'[{kind}s."{name}"]\nunit = "rad"\n'
-    for kind, name in zip(("input", "input", "channel", "channel"), COLUMNS, strict=True)
-)
+TOML = describe(dict.fromkeys(COLUMNS, "rad"))
 TIMES = np.arange(120) / 40.0
 
 
 def table_of(folder, change=lambda v: v, toml=TOML, columns=COLUMNS, model=ARM, second=1.0):
     """Write a log of the arm following its commands, with changes; return its path."""
-    from bench.core.plugin_registries import make_robot_simulator
-
     path = folder / "arm.xml"
     path.write_text(ARM)
     simulator = make_robot_simulator(path)(observe=["q.shoulder", "q.elbow"])
@@ -29,15 +26,8 @@ def table_of(folder, change=lambda v: v, toml=TOML, columns=COLUMNS, model=ARM, 
     run = Scenario(TIMES, {"q.elbow": 0.8}, inputs)
     values = np.column_stack([commands, simulator.simulate(np.empty((1, 0)), run)[0]])
     values += 1e-3 * np.random.default_rng(2).standard_normal(values.shape) * [0, 0, 1, 1]
-    rows = [",".join(("run", "t", *columns))]
-    for t, row in zip(TIMES, change(values), strict=True):
-        rows.append(
-            ",".join(map(repr, ["1", float(second * t), *map(float, row)])).replace("'", "")
-        )
-    path.write_text(model)
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    (folder / "log.toml").write_text(toml)
-    return folder / "log.csv"
+    runs = [(second * TIMES, change(values))]
+    return write_log(folder, toml, ",".join(columns), runs, arm=model)
 
 
 def scaled(*factors):

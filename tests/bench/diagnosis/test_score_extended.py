@@ -6,6 +6,7 @@ import pytest
 from bench.diagnosis.score_extended import score_model
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, FittedValue, write_extended
+from tests.command_output import run_command
 from tests.simulation_arguments import simulation_spec
 from tests.simulation_arguments import write as simulate
 
@@ -140,17 +141,12 @@ def test_another_system_is_refused(files, tmp_path):
         ("[]", "--plugin FILE.py"),
     ],
 )
-def test_a_file_of_an_own_simulator_names_the_option_that_it_needs(
-    tmp_path, capsys, settings, option
-):
-    from bench.cli.main import main
-
+def test_a_file_of_an_own_simulator_names_the_option_that_it_needs(tmp_path, settings, option):
     file = tmp_path / "extended.toml"
     file.write_text('format = 1\nname = "cart_extended"\nsystem = "cart"\nobserve = ["x"]\n')
     (tmp_path / "environment.json").write_text(f'{{"settings": {settings}}}')
     log = tmp_path / "log.csv"
     log.write_text("run,t,x\n1,0,0\n")
-    assert main(["score", str(file), str(log)]) == 2
-    error = capsys.readouterr().err
+    error = run_command("score", file, log, code=2).err
     assert error.startswith(f"simgap: {file}: extends simulator 'cart', which is not one of arm, ")
     assert error.endswith(f"; add the file that defines it: {option}\n")

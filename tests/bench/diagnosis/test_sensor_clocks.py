@@ -7,8 +7,10 @@ from scipy.integrate import solve_ivp
 from bench.diagnosis.explain import explain
 from bench.logs.quality.log_quality import check_log_quality
 from bench.logs.recording_loading import load_recording
+from tests.bench.diagnosis.simulated_logs import write_log
 
 NOISE, MASS, INTERVAL = 1e-3, 2.0, 0.02
+SLIDER = f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
 
 
 def motion(begin, end, state, force, coulomb):
@@ -36,8 +38,7 @@ def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
         lost: fraction of the sensor's samples that are missing.
         drift: fraction by which the sensor's clock is fast.
     """
-    rng = np.random.default_rng(seed)
-    rows = ["run,t,u,x"]
+    rng, runs = np.random.default_rng(seed), []
     for run in range(3):
         even = np.arange(0.0, seconds, INTERVAL)
         times = even if stamp is None else stamp(even, rng)
@@ -51,16 +52,9 @@ def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
         inside = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(pieces) - 1)
         x = np.array([pieces[i](t)[0] for i, t in zip(inside, at, strict=True)])
         x += NOISE * rng.standard_normal(x.size)
-        cells = [f"{value:.6f}" for value in x]
-        for i in np.flatnonzero(rng.random(x.size) < lost):
-            cells[i] = ""
-        rows += [f"{run},{t:.6f},{a:.6f},{c}" for t, a, c in zip(times, u, cells, strict=True)]
-    path = folder / "log.csv"
-    path.write_text("\n".join(rows))
-    path.with_suffix(".toml").write_text(
-        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
-    )
-    return path
+        x[rng.random(x.size) < lost] = np.nan
+        runs.append((times, u, x))
+    return write_log(folder, SLIDER, "u,x", runs)
 
 
 def jittered(times, rng):
@@ -113,13 +107,11 @@ def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_confirmed_by_later_sam
     swung = solve_ivp(rate, (0.0, 5.0), [1.0, 0.0], t_eval=times, rtol=1e-9, atol=1e-11)
     q = swung.y[0] + 0.003 * np.random.default_rng(0).standard_normal(times.size)
     q[times > 1.611] += 0.02
-    rows = ["run,t,q", *(f"1,{100 + t:.6f},{a:.8f}" for t, a in zip(times, q, strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    (tmp_path / "log.toml").write_text(
+    description = (
         'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = 0.003\n'
         f"[constants]\nmass = {mass}\nlength = {length}\ngravity = 9.81\n"
     )
-    answer = explain(tmp_path / "log.csv").answer
+    answer = explain(write_log(tmp_path, description, "q", [(100 + times, q)])).answer
     (cause,) = answer.causes
     assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "sensor.slip", ())
     jump, instant = cause.coefficients["coefficient"], cause.coefficients["instant"]

@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from bench.diagnosis.explain import explain
+from tests.bench.diagnosis.simulated_logs import write_log
 
 WHEEL = """
 <mujoco>
@@ -29,7 +30,7 @@ unit = "N*m"
 [channels."q.axle"]
 unit = "rad"
 noise = 0.001
-[runs.3]
+[runs.4]
 held_out = true
 """
 LINK, ROTOR, STIFF, DAMPED = 0.08, 0.002, 30.0, 0.02  # kg m^2, N m/rad, N m s/rad
@@ -53,15 +54,11 @@ def turned(torque):
 
 
 def log(folder):
-    rng, rows = np.random.default_rng(4), ["run,t,u.m_axle,q.axle"]
-    for run in range(4):
+    rng, runs = np.random.default_rng(4), []
+    for _ in range(4):
         torque = np.repeat(rng.uniform(-1, 1, 16), 10)[: TIMES.size]
-        q = turned(torque) + 0.001 * rng.standard_normal(TIMES.size)
-        rows += [f"{run},{t:.2f},{u:.9g},{x:.9g}" for t, u, x in zip(TIMES, torque, q, strict=True)]
-    (folder / "wheel.xml").write_text(WHEEL)
-    (folder / "log.toml").write_text(TOML)
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    return folder / "log.csv"
+        runs.append((TIMES, torque, turned(torque) + 0.001 * rng.standard_normal(TIMES.size)))
+    return write_log(folder, TOML, "u.m_axle,q.axle", runs, wheel=WHEEL)
 
 
 @pytest.mark.slow

@@ -4,9 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.diagnosis.conventions.convention_hypotheses import find_copied_commands
 from bench.logs.recording_loading import load_recording
+from tests.bench.diagnosis.simulated_logs import follow, write_log
+from tests.command_output import run_command
 
 ARM = """<mujoco model="arm"><option timestep="0.002"/><worldbody>
 <body><joint name="hip" axis="0 1 0" damping="0.1" armature="0.02"/>
@@ -40,47 +41,41 @@ unit = "rad"
 
 def written(folder, with_commands=True, noise=0.0):
     """Write raw logs whose column `knee_act` is the measured position of the knee."""
-    (folder / "arm.xml").write_text(ARM)
-    (folder / "log.toml").write_text(TOML)
-    rng = np.random.default_rng(4)
+    rng, times = np.random.default_rng(4), 0.01 * np.arange(300)
+    names = ["hip_pos", "knee_pos", "hip_cmd", "knee_act", *["knee_cmd"] * with_commands]
+    model = mujoco.MjModel.from_xml_string(ARM)
     for name in "ab":
-        model = mujoco.MjModel.from_xml_string(ARM)
-        data = mujoco.MjData(model)
-        rows = ["t,hip_pos,knee_pos,hip_cmd,knee_act" + ",knee_cmd" * with_commands]
-        phase = rng.uniform(0, 6, 2)
-        for k in range(300):
-            u = 0.5 * np.sin(np.array([3.0, 4.0]) * 0.01 * k + phase)
-            q = data.qpos + 1e-4 * rng.standard_normal(2)
-            act = q[1] + noise * rng.standard_normal()
-            cells = [0.01 * k, *q, u[0], act, *[u[1]] * with_commands]
-            rows.append(",".join(f"{x:.9g}" for x in cells))
-            data.ctrl[:] = u
-            for _ in range(5):
-                mujoco.mj_step(model, data)
-        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n")
+        commands = 0.5 * np.sin(np.outer(times, [3.0, 4.0]) + rng.uniform(0, 6, 2))
+        q = follow(model, commands, 5) + 1e-4 * rng.standard_normal(commands.shape)
+        copy = q[:, 1] + noise * rng.standard_normal(times.size)
+        columns = [times, q, commands[:, 0], copy, *[commands[:, 1]] * with_commands]
+        write_log(folder, "", ",".join(names), [columns], name, arm=ARM)
+    (folder / "log.toml").write_text(TOML)
     return folder / "log.toml"
 
 
-def test_a_copy_is_found_and_the_unused_command_is_offered(tmp_path, capsys):
+def test_a_copy_is_found_and_the_unused_command_is_offered(tmp_path):
     log = written(tmp_path)
-    assert main(["explain", str(log), "--out", str(tmp_path / "out"), "--jobs", "1"]) == 2
-    message = " ".join(capsys.readouterr().err.split())
+    message = " ".join(
+        run_command("explain", log, "--out", tmp_path / "out", "--jobs", "1", code=2).err.split()
+    )
     assert "command u.m_knee equals q.knee digit for digit: it is a copy of the" in message
     assert '[inputs."u.m_knee"] column = "knee_cmd"' in message
     assert not (tmp_path / "out").exists()
     fixed = tmp_path / "fixed.toml"
     arguments = ["inspect", str(log), "--fix", str(fixed), "--out", str(tmp_path / "look")]
-    assert main(arguments) == 0
+    run_command(*arguments)
     recording, kind = load_recording(fixed)
     assert list(find_copied_commands(recording, kind)) == []
     assert np.ptp(recording.runs[0].inputs["u.m_knee"]) > 0.9
 
 
-def test_without_another_column_the_command_must_be_named(tmp_path, capsys):
+def test_without_another_column_the_command_must_be_named(tmp_path):
     log = written(tmp_path, with_commands=False)
     arguments = ["inspect", str(log), "--out", str(tmp_path / "look")]
-    assert main([*arguments, "--fix", str(tmp_path / "fixed.toml")]) == 2
-    message = " ".join(capsys.readouterr().err.split())
+    message = " ".join(
+        run_command(*arguments, "--fix", tmp_path / "fixed.toml", code=2).err.split()
+    )
     assert "no column of the log can be the command u.m_knee; record it, or write its" in message
     assert not (tmp_path / "fixed.toml").exists()
 

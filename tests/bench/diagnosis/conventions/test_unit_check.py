@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.conventions.unit_check import (
     UNITS,
@@ -28,6 +27,7 @@ from bench.logs.recording_loading import load_joined
 from bench.logs.synthetic_recording import simulate_recording
 from sims.extended_simulator import FittedValue
 from sims.recording.unit_conversion import compute_unit_scale
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.simulation_arguments import simulation_spec
 
@@ -122,10 +122,11 @@ def test_a_sign_that_does_not_matter_is_not_questioned():
     assert found.alternatives == ()
 
 
-def test_the_first_line_is_the_correction_and_applying_it_explains_the_recording(tmp_path, capsys):
+def test_the_first_line_is_the_correction_and_applying_it_explains_the_recording(tmp_path):
     path = swing(tmp_path, {"q": "deg"})
-    assert main(["explain", str(path), "--out", str(tmp_path / "wrong"), "--jobs", "1"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    said = " ".join(
+        run_command("explain", path, "--out", tmp_path / "wrong", "--jobs", "1").out.split()
+    )
     assert (
         "The recorded numbers of channel q look like radians, stated as degrees (factor 57.3): "
         'set unit = "rad" in [channels.q] of swing.toml.' in said
@@ -156,7 +157,7 @@ def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
     assert recording.noise["q"] == 0.002
     about.write_text(about.read_text().replace("scale = -1", "scale = 0"))
     out = str(tmp_path / "out")
-    assert main(["inspect", str(path), "--out", out]) == 2
+    run_command("inspect", path, "--out", out, code=2)
 
 
 @pytest.mark.slow

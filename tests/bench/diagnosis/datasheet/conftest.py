@@ -9,11 +9,11 @@ import pytest
 
 from bench.api.datasheet import datasheet
 from bench.api.explain import explain
-from bench.cli.main import main
 from bench.diagnosis.datasheet.datasheet import DataSheet
 from bench.diagnosis.explanation import Explanation
 from sims import extended_simulator
 from tests.bench.diagnosis.datasheet.drive_recordings import written
+from tests.command_output import run_command
 
 NAME = "servo <i>one</i>"
 
@@ -41,5 +41,5 @@ def files(log: Path, explained: Explanation, tmp_path_factory: pytest.TempPathFa
     (folder / "verdict.json").write_text(json.dumps(explained.answer.to_document()))
     extended_simulator.write_extended(explained.extended, folder / "extended.toml")
     given = ["--from", str(folder), "--name", NAME, "--out", str(folder / "sheet")]
-    assert main(["datasheet", str(log), *given]) == 0
+    run_command("datasheet", log, *given)
     return folder / "sheet"

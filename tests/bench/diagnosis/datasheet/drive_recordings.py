@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.bench.diagnosis.simulated_logs import write_log
+
 TRUE_PARAMETERS = {"torque_constant": 0.4, "resistance": 5.0, "armature": 0.002}
 FRICTION = 0.06
 """Dry friction in N m."""
@@ -55,15 +57,12 @@ def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
 def written(folder: Path, runs: int = 3, seed: int = 0) -> Path:
     """Write a recording of the servo; return its path."""
     rng = np.random.default_rng(seed)
-    lines = ["run,t,goal,torque_enable,q"]
-    for run in range(runs):
-        lines += [f"{run},{t:.4f},{goal:.9g},1,{q:.6f}" for t, goal, q in swings(rng)]
-    path = folder / "log.csv"
-    path.write_text("\n".join(lines) + "\n")
     constants = "".join(f"{name} = {value}\n" for name, value in CONSTANTS.items())
-    path.with_suffix(".toml").write_text(
+    description = (
         f'system = "servo"\ntitle = "a <b>servo</b>"\n[constants]\n{constants}'
         f'[channels.q]\nunit = "rad"\nnoise = {NOISE}\n'
         '[inputs.goal]\nunit = "rad"\n[inputs.torque_enable]\nunit = "1"\n'
     )
-    return path
+    columns = [np.array(swings(rng)).T for _ in range(runs)]
+    rows = [(times, goals, np.ones(times.size), angles) for times, goals, angles in columns]
+    return write_log(folder, description, "goal,torque_enable,q", rows)

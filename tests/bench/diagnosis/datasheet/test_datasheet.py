@@ -11,7 +11,6 @@ import pytest
 import tomllib
 
 from bench.api.datasheet import datasheet
-from bench.cli.main import main
 from bench.diagnosis.datasheet.datasheet import DataSheet
 from bench.diagnosis.datasheet.datasheet_content import SheetRow
 from bench.diagnosis.datasheet.mjcf_class import build_mjcf
@@ -25,6 +24,7 @@ from tests.bench.diagnosis.datasheet.drive_recordings import (
     SAMPLES,
     TRUE_PARAMETERS,
 )
+from tests.command_output import run_command
 
 
 def row(sheet: DataSheet, name: str) -> SheetRow:
@@ -202,10 +202,9 @@ def test_numbers_that_a_model_does_not_state_are_nominal(
     assert build_mjcf(bare, tmp_path).contents["model.xml"].count("frictionloss") == 0
 
 
-def test_an_unknown_joint_is_refused_before_the_search(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_joint_is_refused_before_the_search(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "sheet"
-    assert main(["datasheet", str(log), "--joint", "elbow", "--out", str(out)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert (
+        run_command("datasheet", log, "--joint", "elbow", "--out", out, code=2).err.count("\n") == 1
+    )
     assert not out.exists()

@@ -10,7 +10,6 @@ import pytest
 import tomllib
 
 from bench.api.datasheet import datasheet
-from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.datasheet import datasheet_figure
 from bench.diagnosis.datasheet.datasheet import DataSheet
@@ -18,6 +17,7 @@ from bench.diagnosis.datasheet.datasheet_subject import make_subject
 from bench.figures.style import apply_settings
 from tests.bench.diagnosis.explained_samples import recording
 from tests.bench.figures.figure_readability import unreadable
+from tests.command_output import run_command
 
 FRICTION = 0.004
 """Dry friction in N m."""
@@ -29,9 +29,9 @@ def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("free")
     command = ["simulate", "pendulum", "--effect", f"friction.coulomb={FRICTION}"]
     command += ["--noise", "q=0.003", "qd=0.02", "--runs", "3", "--seconds", "1.5", "--rate", "60"]
-    assert main([*command, "--out", str(folder / "swing.csv")]) == 0
+    run_command(*command, "--out", folder / "swing.csv")
     command = ["datasheet", str(folder / "swing.csv"), "--out", str(folder / "sheet")]
-    assert main(command) == 0
+    run_command(*command)
     return folder
 
 

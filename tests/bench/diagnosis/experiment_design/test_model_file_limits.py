@@ -21,6 +21,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 
 TIMES = np.arange(0.0, 2.0, 0.02)
 MOTOR = {"m": {"joint": "hip", "kind": "motor"}}
@@ -78,32 +79,19 @@ def world_of(kind, command, begin=0.0):
 
 def log(folder, kind, effect, coefficient, size, noise):
     """Write a recording of three runs with an effect that the model file lacks."""
-    rng = np.random.default_rng(0)
-    rows = []
+    rng, runs = np.random.default_rng(0), []
     for number in range(3):
         command = size * np.sin(2.0 * TIMES + number)
         seen, inputs = simulated(kind, command, effect, coefficient, 0.05 * number)
-        (name,) = (one for one in inputs if one.startswith("u."))
-        seen = seen + noise * rng.standard_normal(seen.size)
-        rows += [
-            f"{number},{t:.3f},{u:.6f},{q:.6f}"
-            for t, u, q in zip(TIMES, inputs[name], seen, strict=True)
-        ]
-    path = folder / "log.csv"
-    path.write_text("\n".join([f"run,t,{name},q.hip", *rows]) + "\n")
-    actuators = kind.robot.actuator_tables
-    tables = [
-        f'[actuators.{n}]\njoint = "{t["joint"]}"\nkind = "motor"' for n, t in actuators.items()
-    ]
-    unit = {one.name: one.unit for one in kind.inputs}[name]
-    path.with_suffix(".toml").write_text(
-        "\n".join([
-            f'model = "{kind.robot.path.name}"', f'[inputs."{name}"]\nunit = "{unit}"',
-            f'[channels."q.hip"]\nunit = "rad"\nnoise = {noise}',
-            *tables, "[runs.2]\nheld_out = true\n",
-        ])
-    )  # fmt: skip
-    return path
+        runs.append((TIMES, command, seen + noise * rng.standard_normal(seen.size)))
+    (name,) = (one for one in inputs if one.startswith("u."))
+    (unit,) = (one.unit for one in kind.inputs if one.name == name)
+    tables = "".join(
+        f'[actuators.{n}]\njoint = "{t["joint"]}"\nkind = "motor"\n'
+        for n, t in kind.robot.actuator_tables.items()
+    )
+    description = describe({name: unit, "q.hip": "rad"}, noise, tables, kind.robot.path.name)
+    return write_log(folder, description + "[runs.3]\nheld_out = true\n", f"{name},q.hip", runs)
 
 
 def check_proposals(path, limits):

@@ -5,7 +5,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import simgap
-from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.experiment_design.information_gain import RunValue
 from bench.diagnosis.experiment_design.next_run import (
@@ -14,9 +13,15 @@ from bench.diagnosis.experiment_design.next_run import (
 )
 from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import InputError
+from tests.bench.diagnosis.simulated_logs import write_log
+from tests.command_output import run_command
 
 MASS, LENGTH, INERTIA, NOISE = 0.2, 0.15, 0.006, 4e-3
 TIMES = np.arange(0.0, 4.0, 0.02)
+PENDULUM = (
+    f'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = {NOISE}\n[inputs.u]\n'
+    f'unit = "N*m"\n[constants]\nmass = {MASS}\nlength = {LENGTH}\ngravity = 9.80665\n'
+)
 
 
 def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
@@ -27,8 +32,8 @@ def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
         lag: time constant of the first-order drive in s.
         push: constant torque in N m.
     """
-    rng, rows = np.random.default_rng(seed), ["run,t,u,q"]
-    for number, (times, torques, q0, v0) in enumerate(runs):
+    rng, columns = np.random.default_rng(seed), []
+    for times, torques, q0, v0 in runs:
 
         def rate(_t, x, held):
             drive = x[2] if lag else held
@@ -44,16 +49,8 @@ def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
                     rate, (begin, end), state, args=(torques[i],), rtol=1e-8, atol=1e-10
                 )
                 state = done.y[:, -1]
-        seen = np.array(q) + NOISE * rng.standard_normal(len(q))
-        columns = zip(times, torques, seen, strict=True)
-        rows += [f"{number},{t:.4f},{u:.8f},{x:.6f}" for t, u, x in columns]
-    path = folder / f"{name}.csv"
-    path.write_text("\n".join(rows))
-    path.with_suffix(".toml").write_text(
-        f'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = {NOISE}\n[inputs.u]\n'
-        f'unit = "N*m"\n[constants]\nmass = {MASS}\nlength = {LENGTH}\ngravity = 9.80665\n'
-    )
-    return path
+        columns.append((times, torques, np.array(q) + NOISE * rng.standard_normal(len(q))))
+    return write_log(folder, PENDULUM, "u,q", columns, name)
 
 
 def slow(count=3):
@@ -78,7 +75,7 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     before = write(tmp_path, "before", slow(), lag=0.04)
     # With three fitted runs, a delay and a lag would be distinguishable.
     with before.with_suffix(".toml").open("a") as description:
-        description.write("[runs.2]\nheld_out = true\n")
+        description.write("[runs.3]\nheld_out = true\n")
     proposed = simgap.design(before)
     ambiguous = names_of(proposed.explanation)
     assert {"input.lag", "input.delay"} <= ambiguous
@@ -97,22 +94,20 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     assert "input.delay" not in names
 
 
-def test_what_no_run_can_split_is_said(tmp_path, capsys):
+def test_what_no_run_can_split_is_said(tmp_path):
     path = write(tmp_path, "push", slow(), push=0.02)
     out = tmp_path / "next.csv"
-    assert main(["design", str(path), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    said = run_command("design", path, "--out", out).out
     assert "force.bias" in said
     assert "input.bias" in said
     assert "no run of this kind distinguishes it from" in said
 
 
-def test_what_is_known_is_narrowed(tmp_path, capsys):
+def test_what_is_known_is_narrowed(tmp_path):
     """No cause is open, so the most informative run is proposed, and its prediction is checked."""
     path = write(tmp_path, "clean", slow())
     out = tmp_path / "next.csv"
-    assert main(["design", str(path), "--out", str(out), "--seconds", "3"]) == 0
-    said = capsys.readouterr().out
+    said = run_command("design", path, "--out", out, "--seconds", "3").out
     assert "no causes need to be distinguished: it shrinks" in said
     factor = float(said.split("factor of ")[1].split()[0])
     columns = np.genfromtxt(out, delimiter=",", names=True)
@@ -127,12 +122,11 @@ def test_what_is_known_is_narrowed(tmp_path, capsys):
     assert factor * 0.6 < narrowed < factor * 2.5
 
 
-def test_what_is_asked_wrongly_is_one_line(tmp_path, capsys):
+def test_what_is_asked_wrongly_is_one_line(tmp_path):
     path = write(tmp_path, "clean", slow())
     out = tmp_path / "next.csv"
     out.write_text("mine")
-    assert main(["design", str(path), "--out", str(out)]) == 2
-    assert "next.csv" in capsys.readouterr().err
+    assert "next.csv" in run_command("design", path, "--out", out, code=2).err
     assert out.read_text() == "mine"
     with pytest.raises(InputError, match="seconds: expected a number of seconds above 0, found -1"):
         simgap.design(path, seconds=-1)

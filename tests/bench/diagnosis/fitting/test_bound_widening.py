@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from bench.cli.main import main
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider, widen_range
@@ -11,6 +10,7 @@ from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter
 from tests.bench.diagnosis.explained_samples import evaluator, recording
+from tests.command_output import run_command
 
 HEAVIER = 1.025
 
@@ -25,7 +25,7 @@ def heavy(tmp_path_factory):
     path = tmp_path_factory.mktemp("heavy") / "swing.csv"
     words = ["--theta", "inertia=0.01", "--constant", f"mass={0.15 / HEAVIER}"]
     words += ["--noise", "q=0.002", "--observe", "q", "--seconds", "2"]
-    assert main(["simulate", "pendulum", "--out", str(path), *words]) == 0
+    run_command("simulate", "pendulum", "--out", path, *words)
     about = path.with_suffix(".toml")
     lines = ["mass = 0.15" if li.startswith("mass") else li for li in about.read_text().split("\n")]
     about.write_text("\n".join(lines))
@@ -47,7 +47,7 @@ def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named
     # Without losses the restitution is 1, and the drag is found in addition.
     path = tmp_path / "ball.csv"
     words = ["--theta", "restitution=1.0", "--noise", "0.002", "--effect", "drag.linear=0.1"]
-    assert main(["simulate", "ball", "--out", str(path), "--seconds", "1", *words]) == 0
+    run_command("simulate", "ball", "--out", path, "--seconds", "1", *words)
     found = explain(path)
     answer = found.answer
     assert answer.verdict == "partial"

@@ -13,6 +13,7 @@ from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.sims.robot.test_robot_motion import kind_of
 
 ARM = """
@@ -27,24 +28,15 @@ TIMES = np.arange(0, 2, 0.02)
 
 def evaluator(tmp_path, text):
     """Return the run evaluator of a log with two runs of an arm."""
-    kind = kind_of(text)
-    simulator = kind(observe=["q.hinge"])
-    rows = ["run,t,q.hinge" + (",u.m" if "u.m" in str(kind.system.inputs) else "")]
+    simulator, runs = kind_of(text)(observe=["q.hinge"]), []
     for run, angle in enumerate((0.3, -0.2)):
         inputs = {c.name: 0.2 * np.sin(3 * TIMES + run) for c in simulator.inputs if "u." in c.name}
         given = {c.name: inputs.get(c.name, np.zeros(TIMES.size)) for c in simulator.inputs}
         seen = simulator.simulate(np.empty((1, 0)), Scenario(TIMES, {"q.hinge": angle}, given))[0]
-        columns = [seen[:, 0], *inputs.values()]
-        rows += [
-            ",".join([str(run), *(f"{v:.9f}" for v in row)])
-            for row in zip(TIMES, *columns, strict=True)
-        ]
-    (tmp_path / "arm.xml").write_text(text)
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    toml = 'model = "arm.xml"\n[channels."q.hinge"]\nunit = "rad"\n'
-    toml += '[inputs."u.m"]\nunit = "rad"\n' if "u.m" in rows[0] else ""
-    (tmp_path / "log.toml").write_text(toml)
-    recording, kind = load_recording(tmp_path / "log.csv")
+        runs.append((TIMES, seen, *inputs.values()))
+    units = dict.fromkeys(("q.hinge", *inputs), "rad")
+    path = write_log(tmp_path, describe(units), ",".join(units), runs, arm=text)
+    recording, kind = load_recording(path)
     return RunEvaluator(kind, recording, recording.runs, None, [], ())
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from tests.bench.diagnosis.simulated_logs import write_log
 
 CARRIAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
 <worldbody><body name="carriage"><joint name="screw" type="slide" axis="1 0 0" {joint}/>
@@ -22,44 +23,35 @@ STIFFNESS, DERIVATIVE = 40_000.0, 3_000.0
 
 
 def rows_of(seed):
-    """Return the rows of a 100 Hz log of a carriage that follows a command, with its force."""
+    """Return a 100 Hz run of a carriage that follows a command: time, position and force."""
     rng = np.random.default_rng(seed)
     joint = f'damping="{DAMPING}" frictionloss="{FRICTION}" {STIFF}'
     model = mujoco.MjModel.from_xml_string(CARRIAGE.format(joint=joint, mass=MASS))
-    data = mujoco.MjData(model)
-    phases, rows = rng.uniform(0, 2 * np.pi, 3), []
-    for k in range(500):
-        t = 0.01 * k
-        wanted = sum(
-            0.03 * np.sin(2 * np.pi * f * t + p)
-            for f, p in zip((0.3, 0.7, 1.3), phases, strict=True)
-        )
+    data, rows = mujoco.MjData(model), []
+    times, phases = 0.01 * np.arange(500), rng.uniform(0, 2 * np.pi, 3)
+    waves = np.sin(2 * np.pi * np.outer(times, (0.3, 0.7, 1.3)) + phases)
+    for t, wanted in zip(times, 0.03 * waves.sum(axis=1), strict=True):
         force = STIFFNESS * (wanted - data.qpos[0]) - DERIVATIVE * data.qvel[0]
-        rows.append((seed, t, data.qpos[0] + NOISE * rng.standard_normal(), force))
+        rows.append((t, data.qpos[0] + NOISE * rng.standard_normal(), force))
         data.ctrl[0] = force
-        for _ in range(10):
-            mujoco.mj_step(model, data)
-    return rows
+        mujoco.mj_step(model, data, 10)
+    return [np.array(rows)]
 
 
-def write_log(folder):
+def write_carriage_log(folder):
     """Write three runs of the carriage and the model file with a wrong mass and no friction."""
-    (folder / "model.xml").write_text(CARRIAGE.format(joint="", mass=100))
-    rows = [row for seed in (1, 2, 3) for row in rows_of(seed)]
-    lines = ["run,t,x,u", *(",".join(f"{value:.9g}" for value in row) for row in rows)]
-    (folder / "log.csv").write_text("\n".join(lines) + "\n")
     description = (
         'model = "model.xml"\nfree = ["mass@carriage"]\n[time]\ncolumn = "t"\n'
         f'[channels."q.screw"]\ncolumn = "x"\nunit = "m"\nnoise = {NOISE}\n'
         '[inputs."u.drive"]\ncolumn = "u"\nunit = "N"\n[runs.3]\nheld_out = true\n'
     )
-    (folder / "log.toml").write_text(description)
-    return folder / "log.csv"
+    runs = [rows_of(seed) for seed in (1, 2, 3)]
+    return write_log(folder, description, "x,u", runs, model=CARRIAGE.format(joint="", mass=100))
 
 
 @pytest.fixture(scope="module")
 def answer(tmp_path_factory):
-    return explain(write_log(tmp_path_factory.mktemp("carriage"))).answer
+    return explain(write_carriage_log(tmp_path_factory.mktemp("carriage"))).answer
 
 
 def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypatch):
@@ -70,7 +62,7 @@ def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypat
         return respond(self, places, sizes)
 
     monkeypatch.setattr(FollowedRuns, "compute_parameter_responses", counted)
-    stopped = explain(write_log(tmp_path), force=True, stop=lambda: bool(filters)).answer
+    stopped = explain(write_carriage_log(tmp_path), force=True, stop=lambda: bool(filters)).answer
     assert len(filters) == 1
     assert stopped.cut.reason == "interrupt"
     assert not stopped.causes

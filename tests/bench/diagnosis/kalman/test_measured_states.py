@@ -40,23 +40,24 @@ def theta_of(evaluator, name, c):
     return theta
 
 
+def start_of(evaluator, run=0):
+    """Return the first positions and velocities of a run."""
+    return np.split(evaluator.initial_state_guesses[run], 2)
+
+
+def follow(evaluator, theta=None, run=0, start=None, trajectory=None):
+    """Return the linear model about a motion, by default the one that is simulated from a start."""
+    theta = evaluator.get_nominal_theta() if theta is None else theta
+    start = start_of(evaluator, run) if start is None else start
+    scenario = evaluator.prepared_runs[run].scenario
+    return MeasuredLinear(evaluator.simulator, theta, scenario, start, trajectory)
+
+
 def motion_with(evaluator, theta):
     """Return the linear model about the motion simulated with these parameters."""
-    half = len(evaluator.state_names) // 2
-    start = evaluator.initial_state_guesses[0, :half], evaluator.initial_state_guesses[0, half:]
-    simulated = MeasuredLinear(
-        evaluator.simulator, theta, evaluator.prepared_runs[0].scenario, start
-    )
-    x, v, _ = simulated.trajectory
+    x, v, _ = follow(evaluator, theta).trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
-    motion = Trajectory(x, v, nothing)
-    return MeasuredLinear(
-        evaluator.simulator,
-        evaluator.get_nominal_theta(),
-        evaluator.prepared_runs[0].scenario,
-        start,
-        motion,
-    )
+    return follow(evaluator, trajectory=Trajectory(x, v, nothing))
 
 
 def added(linear, evaluator, name, c):
@@ -111,13 +112,12 @@ def test_a_gain_of_a_sensor_acts_on_what_is_predicted(evaluator):
 
 def test_jacobians_of_other_commands_are_not_used_again(evaluator):
     """Delayed steps change between samples, so the model is evaluated at more times."""
-    scenario, half = evaluator.prepared_runs[0].scenario, len(evaluator.state_names) // 2
+    scenario, start = evaluator.prepared_runs[0].scenario, start_of(evaluator)
     steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
     for values in steps.values():
         for sample in (3, 8, 14, 21, 29):
             values[sample:] += 0.06
     scenario = replace(scenario, inputs=steps)
-    start = evaluator.initial_state_guesses[0, :half], evaluator.initial_state_guesses[0, half:]
     nominal = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
     delayed = theta_of(evaluator, "input.delay@m_shoulder", (0.013,))
     given = delayed, scenario, start, nominal.trajectory
@@ -134,18 +134,10 @@ def test_maps_carry_a_deviation_as_the_simulator_does(evaluator):
     maps = linear.interval_maps()
     half = len(evaluator.state_names) // 2
     moved = 1e-5
-    scenario = evaluator.prepared_runs[0].scenario
-    start = (
-        evaluator.initial_state_guesses[0, :half].copy(),
-        evaluator.initial_state_guesses[0, half:].copy(),
-    )
-    base = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
+    base, (positions, velocities) = follow(evaluator), start_of(evaluator)
     for column in range(half):
-        other = start[0].copy()
-        other[column] += moved
-        changed = MeasuredLinear(
-            evaluator.simulator, evaluator.get_nominal_theta(), scenario, (other, start[1])
-        )
+        other = positions + moved * np.eye(half)[column]
+        changed = follow(evaluator, start=(other, velocities))
         for sample in (1, 4):
             step = base.knots[sample]
             x = (changed.trajectory.x[step] - base.trajectory.x[step]) / moved
@@ -174,19 +166,7 @@ def test_a_quintic_goes_through_values_and_derivatives():
 
 
 def test_control_changes_of_several_runs_are_those_of_each_run(evaluator):
-    half = len(evaluator.state_names) // 2
-    linear = [
-        MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), track.scenario, start)
-        for track, start in zip(
-            evaluator.prepared_runs,
-            zip(
-                evaluator.initial_state_guesses[:, :half],
-                evaluator.initial_state_guesses[:, half:],
-                strict=True,
-            ),
-            strict=True,
-        )
-    ]
+    linear = [follow(evaluator, run=run) for run in range(len(evaluator.prepared_runs))]
     laws = ("input.lag@", "input.rate@")
     names = [n for n in evaluator.library if n.startswith(laws) and not n.endswith("@*")]
     effects = [

@@ -1,10 +1,11 @@
 """Tests of free parameters of a robot that are identified together with a missing effect."""
 
+import mujoco
 import numpy as np
-import pandas as pd
 import pytest
 
 from bench.diagnosis.explain import explain
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 LOAD, LOAD_POSITION = 0.5, (0.12, 0.0, 0.02)
 """Mass in kg of a load that the model file lacks, and its position in the last body in m."""
@@ -37,43 +38,28 @@ def arm(load=""):
 
 
 def record(model, rng):
-    """Return the rows of one run, with commands that move to another angle about once a second."""
-    mujoco = pytest.importorskip("mujoco")
+    """Return one run, with commands that move to another angle about once a second."""
     times = np.arange(0.0, SECONDS, 1.0 / RATE)
     angles = rng.uniform(-0.6, 0.6, (8, 3))
     steps = angles[np.searchsorted(np.cumsum(rng.uniform(0.5, 1.0, 7)), times, side="right")]
     padded = np.vstack([np.repeat(steps[:1], 9, axis=0), steps])
     commands = np.stack([np.convolve(c, np.ones(10) / 10, "valid") for c in padded.T], axis=1)
-    data = mujoco.MjData(model)
-    data.qpos[:] = data.ctrl[:] = commands[0]
-    mujoco.mj_step(model, data, 2000)
-    rows = []
-    for t, command in zip(times, commands, strict=True):
-        rows.append([t, *(data.qpos + rng.normal(0.0, NOISE, 3)), *command])
-        data.ctrl[:] = command
-        mujoco.mj_step(model, data, 10)
-    return rows
+    readings = follow(model, commands, 10, start=commands[0], settle=2000)
+    return times, readings + rng.normal(0.0, NOISE, readings.shape), commands
 
 
 @pytest.mark.slow(seconds=12)
 def test_a_payload_is_found_although_the_gains_of_all_servos_are_free(tmp_path):
     """Smaller gains alone would explain much of the sag and of the slower motion."""
-    mujoco = pytest.importorskip("mujoco")
     position = " ".join(map(str, LOAD_POSITION))
     load = f'<body pos="{position}"><geom type="sphere" size="0.02" mass="{LOAD}"/></body>'
     model, rng = mujoco.MjModel.from_xml_string(arm(load)), np.random.default_rng(3)
-    rows = [[run, *row] for run in range(RUNS) for row in record(model, rng)]
-    columns = ["run", "t", *(f"q.j{i}" for i in range(3)), *(f"u.m{i}" for i in range(3))]
-    pd.DataFrame(rows, columns=columns).to_csv(tmp_path / "log.csv", index=False)
-    (tmp_path / "arm.xml").write_text(arm())
-    channels = "".join(
-        f'[channels."q.j{i}"]\nunit = "rad"\nnoise = {NOISE}\n[inputs."u.m{i}"]\nunit = "rad"\n'
-        for i in range(3)
-    )
+    units = dict.fromkeys([f"{name}{i}" for name in ("q.j", "u.m") for i in range(3)], "rad")
     free = 'free = ["actuator.stiffness@*", "actuator.damping@*"]\n'
-    held_out = f"[runs.{RUNS - 1}]\nheld_out = true\n"
-    (tmp_path / "log.toml").write_text(f'model = "arm.xml"\n{free}{channels}{held_out}')
-    answer = explain(tmp_path / "log.csv").answer
+    description = free + describe(units, NOISE, f"[runs.{RUNS}]\nheld_out = true\n")
+    runs = [record(model, rng) for _ in range(RUNS)]
+    path = write_log(tmp_path, description, ",".join(units), runs, arm=arm())
+    answer = explain(path).answer
     (cause,) = answer.causes
     assert cause.effect == "payload@l2"
     assert cause.coefficients["mass"].value == pytest.approx(LOAD, rel=0.03)

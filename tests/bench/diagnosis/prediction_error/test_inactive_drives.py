@@ -106,13 +106,18 @@ def recorded(folder, rig):
 
 def times_of(recording, mask, run):
     """Return the first and last time of a run at which a mask is set."""
-    times = recording.runs[run].times[mask]
-    return float(times[0]), float(times[-1])
+    return recording.runs[run].times[mask][[0, -1]].tolist()
 
 
-def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_path):
+@pytest.fixture
+def load(tmp_path):
+    """Return a function from a rig to its recording and the simulator of the model file."""
+    return lambda rig: load_recording(recorded(tmp_path, rig), divide=False)
+
+
+def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(load):
     rig = Rig(off={1: (1.2, 2.1, (0,)), 3: (2.0, 9.0, (0,))})
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    recording, kind = load(rig)
     (drive,) = find_inactive_drives(recording, kind)
     assert (drive.joint, drive.actuators, drive.is_held) == ("shoulder", ("s1",), False)
     assert times_of(recording, drive.masks[0], 0) == pytest.approx((1.2, 2.1), abs=0.05)
@@ -137,9 +142,9 @@ def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_
         (("stopped", 0, 1), '[actuators.s2] disable = "stopped"'),
     ],
 )
-def test_a_column_that_says_so_is_taken_for_the_switch(tmp_path, column, line):
+def test_a_column_that_says_so_is_taken_for_the_switch(load, tmp_path, column, line):
     rig = Rig(off={run: (1.0 + 0.3 * run, 9.0, (1,)) for run in (1, 2, 3)}, column=column)
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    recording, kind = load(rig)
     found = remove_inactive_drives(recording, kind)
     for number, run in enumerate(found.runs):
         assert run.times.size == TIMES.size
@@ -157,24 +162,24 @@ def test_a_column_that_says_so_is_taken_for_the_switch(tmp_path, column, line):
     assert remove_inactive_drives(again, kind) is again
 
 
-def test_another_column_that_changes_then_is_named(tmp_path):
+def test_another_column_that_changes_then_is_named(load):
     rig = Rig(off={2: (1.5, 9.0, (0, 1))}, column=("status", 3, 7))
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    recording, kind = load(rig)
     (note,) = remove_inactive_drives(recording, kind).notes
     assert "the drives of joints shoulder, elbow exert no force" in note
     assert "column status changes there" in note
 
 
-def test_a_servo_that_is_limp_in_a_whole_run_is_found(tmp_path):
+def test_a_servo_that_is_limp_in_a_whole_run_is_found(load):
     rig = Rig(off={2: (0.0, 9.0, (0,))})
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    recording, kind = load(rig)
     left = remove_inactive_drives(recording, kind)
     assert [run.name for run in left.runs] == ["1", "3"]
 
 
-def test_an_emergency_stop_with_brakes_is_found(tmp_path):
+def test_an_emergency_stop_with_brakes_is_found(load):
     rig = Rig(brakes={1: 1.5, 3: 2.0})
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    recording, kind = load(rig)
     drives = find_inactive_drives(recording, kind)
     assert [(drive.joint, drive.is_held) for drive in drives] == [
         ("shoulder", True),
@@ -204,8 +209,8 @@ def test_an_emergency_stop_with_brakes_is_found(tmp_path):
     ],
     ids=str,
 )
-def test_what_is_wrong_at_all_times_is_not_taken_for_a_drive_that_does_nothing(tmp_path, rig):
-    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+def test_what_is_wrong_at_all_times_is_not_taken_for_a_drive_that_does_nothing(load, rig):
+    recording, kind = load(rig)
     assert find_inactive_drives(recording, kind) == []
     assert remove_inactive_drives(recording, kind) is recording
 

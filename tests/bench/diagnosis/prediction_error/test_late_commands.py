@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis import explain as explaining
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 NOISE, STEP, INTERVAL = 5e-4, 0.002, 0.01
 ARM = """
@@ -32,12 +33,7 @@ ARM = """
   </actuator>
 </mujoco>
 """
-LOG = "".join(
-    ['model = "arm.xml"\n']
-    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "wrist")]
-    + [f'[inputs."u.{m}"]\nunit = "rad"\n' for m in ("s1", "s2")]
-    + ["[runs.4]\nheld_out = true\n"]
-)
+UNITS = dict.fromkeys(("u.s1", "u.s2", "q.shoulder", "q.wrist"), "rad")
 
 
 def filter_command(command, lag):
@@ -72,31 +68,22 @@ def write_recording(folder, change_command, size, reading_delay=0.0, late_joints
         reading_delay: delay of the readings in seconds; before it, the initial state is read.
         late_joints: indices of the joints whose readings are late.
     """
-    rng = np.random.default_rng(8)
+    rng, runs = np.random.default_rng(8), []
     model = mujoco.MjModel.from_xml_string(ARM)
     steps, per_sample = round(2.5 / STEP), round(INTERVAL / STEP)
-    rows = ["run,t,u.s1,u.s2,q.shoulder,q.wrist"]
-    for run in (1, 2, 3, 4):
+    for _ in range(4):
         changes = rng.uniform(-1.0, 1.0, (6, 2)) * [0.3, 0.8]
         commands = np.repeat(changes, round(0.5 / STEP), axis=0)[:steps]
         applied = commands.copy()
         applied[:, 1] = change_command(commands[:, 1], size)
-        data = mujoco.MjData(model)
-        data.qpos[:] = commands[0]
-        positions = np.empty((steps, 2))
-        for i in range(steps):
-            positions[i] = data.qpos
-            data.ctrl[:] = applied[i]
-            mujoco.mj_step(model, data)
+        positions = follow(model, applied, 1, start=commands[0])
         for joint in late_joints:
             positions[:, joint] = delay_command(positions[:, joint], reading_delay)
-        for i in range(0, steps, per_sample):
-            q, u = positions[i] + NOISE * rng.standard_normal(2), commands[i]
-            rows.append(f"{run},{i * STEP:.3f},{u[0]:.9f},{u[1]:.9f},{q[0]:.7f},{q[1]:.7f}")
-    (folder / "arm.xml").write_text(ARM)
-    (folder / "log.csv").write_text("\n".join(rows) + "\n")
-    (folder / "log.toml").write_text(LOG)
-    return folder / "log.csv"
+        readings = positions[::per_sample]
+        readings += NOISE * rng.standard_normal(readings.shape)
+        runs.append((STEP * np.arange(steps)[::per_sample], commands[::per_sample], readings))
+    description = describe(UNITS, NOISE, "[runs.4]\nheld_out = true\n")
+    return write_log(folder, description, ",".join(UNITS), runs, arm=ARM)
 
 
 @pytest.mark.parametrize(

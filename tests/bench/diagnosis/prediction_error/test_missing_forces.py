@@ -10,16 +10,18 @@ import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
-from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.prediction_error import competing_models
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, get_only_joint
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.logs.recording_loading import load_joined
 from tests.bench.diagnosis.arm_model import ARM
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 DAMPING = {"shoulder": 0.3, "elbow": 0.1}
 """Damping of the joints in the model file, N m s/rad."""
+RATES = (2.0, 2.7), (5.1, 4.3)
+"""Angular frequencies of the slow and of the fast part of each command, rad/s."""
 
 
 def make_model_text(**damping):
@@ -34,37 +36,17 @@ def make_model_text(**damping):
 
 def write_recording(folder, **damping):
     """Record three runs in plain MuJoCo, with another damping than that of the model file."""
-    (folder / "arm.xml").write_text(make_model_text())
     model = mujoco.MjModel.from_xml_string(make_model_text(**damping))
-    rng = np.random.default_rng(8)
-    lines = ["run,t,u.m_shoulder,u.m_elbow,q.shoulder,q.elbow"]
-    for run in range(3):
-        data = mujoco.MjData(model)
-        phases = rng.uniform(0.0, 6.0, 4)
-        for sample in range(200):
-            t = 0.008 * sample
-            command = [
-                0.7 * np.sin(2.0 * t + phases[0]) + 0.2 * np.sin(5.1 * t + phases[1]),
-                0.8 * np.sin(2.7 * t + phases[2]) + 0.2 * np.sin(4.3 * t + phases[3]),
-            ]
-            if sample == 0:
-                data.qpos[:] = command
-            numbers = [*command, *(data.qpos + rng.normal(0.0, 1e-3, 2))]
-            lines.append(f"{run},{t:.3f}," + ",".join(f"{number:.8g}" for number in numbers))
-            data.ctrl[:] = command
-            for _ in range(2):
-                mujoco.mj_step(model, data)
-    path = folder / "log.csv"
-    path.write_text("\n".join(lines) + "\n")
-    (folder / "log.toml").write_text(
-        'model = "arm.xml"\n'
-        + "".join(
-            f'[channels."q.{joint}"]\nunit = "rad"\nnoise = 0.001\n'
-            f'[inputs."u.m_{joint}"]\nunit = "rad"\n'
-            for joint in DAMPING
-        )
-    )
-    return path
+    rng, times, runs = np.random.default_rng(8), 0.008 * np.arange(200), []
+    for _ in range(3):
+        phases = rng.uniform(0.0, 6.0, (2, 2))
+        slow, fast = (np.sin(np.outer(times, r) + phases[:, k]) for k, r in enumerate(RATES))
+        commands = np.array([0.7, 0.8]) * slow + 0.2 * fast
+        readings = follow(model, commands, 2, start=commands[0])
+        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
+    units = dict.fromkeys(("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow"), "rad")
+    known = make_model_text()
+    return write_log(folder, describe(units, 0.001), ",".join(units), runs, arm=known)
 
 
 class _FiltersError(Exception):
@@ -79,7 +61,7 @@ def make_filters(monkeypatch, path):
 
     monkeypatch.setattr(PredictionErrorSearch, "_search_effects", fail)
     with pytest.raises(_FiltersError) as raised:
-        explain([path], ExplainOptions())
+        explain(path)
     return raised.value.args[0]
 
 
@@ -102,7 +84,7 @@ def test_an_effect_at_the_joint_of_the_only_missing_force_acts_there(monkeypatch
 
 def test_wrong_dampings_of_two_joints_are_found(tmp_path):
     path = write_recording(tmp_path, shoulder=3.0, elbow=0.5)
-    (cause,) = explain([path], ExplainOptions()).answer.causes
+    (cause,) = explain(path).answer.causes
     assert cause.effect == "drag.linear@*"
     numbers = {name: number.value for name, number in cause.coefficients.items()}
     assert numbers["coefficient@shoulder"] == pytest.approx(2.7, rel=0.02)

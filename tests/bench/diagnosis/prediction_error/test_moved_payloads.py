@@ -7,6 +7,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.arm_model import ARM
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 
 ELBOW = 0.7
 """Angle of the elbow at the beginning of each run in rad."""
@@ -14,15 +15,11 @@ ELBOW = 0.7
 
 @pytest.fixture
 def evaluator(tmp_path):
-    pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(ARM)
-    rows = [f"{run},{0.01 * k:.2f},0.2,{ELBOW},0.2,{ELBOW}" for run in (1, 2) for k in range(50)]
-    header = "run,t,q.shoulder,q.elbow,u.m_shoulder,u.m_elbow"
-    (tmp_path / "log.csv").write_text("\n".join([header, *rows]) + "\n")
-    names = '[channels."q.shoulder"]', '[channels."q.elbow"]', '[inputs."u.m_shoulder"]'
-    tables = [f'{name}\nunit = "rad"\n' for name in (*names, '[inputs."u.m_elbow"]')]
-    (tmp_path / "log.toml").write_text('model = "arm.xml"\n' + "".join(tables))
-    recording, kind = load_recording(tmp_path / "log.csv")
+    still = [np.tile([0.2, ELBOW], (50, 2))]
+    units = dict.fromkeys(("q.shoulder", "q.elbow", "u.m_shoulder", "u.m_elbow"), "rad")
+    runs = [(0.01 * np.arange(50), *still)] * 2
+    path = write_log(tmp_path, describe(units), ",".join(units), runs, arm=ARM)
+    recording, kind = load_recording(path)
     return RunEvaluator(kind, recording, recording.runs, None)
 
 

@@ -13,6 +13,7 @@ from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.output_error_scores import OutputErrorScores
+from tests.bench.diagnosis.simulated_logs import follow, write_log
 from tests.exams.planted.model_files import ROVER
 
 RADIUS, TRACK, SPEED = 0.05, 0.2, 6.0
@@ -33,29 +34,20 @@ def write_recording(folder: Path) -> Path:
     """Write runs straight on and with turns, simulated by plain MuJoCo; run 2 is held out."""
     model = mujoco.MjModel.from_xml_string(ROVER)
     model.geom("left_tyre").size[0] *= 1.0 + PLANTED
-    rng, lines = (
-        np.random.default_rng(0),
-        [f"run,t,u.m_left,u.m_right,{','.join(CHANNELS)}"],
-    )
-    times = np.arange(101) / 100
+    rng, runs, times = np.random.default_rng(0), [], np.arange(101) / 100
     turns = SPEED + np.sin(2 * np.pi * np.outer(times, (1.3, 2.1))) * 3.0
     straight = np.full((101, 2), SPEED)
-    for run, commands in ((1, straight), (2, 0.7 * straight), (3, turns), (4, turns[:, ::-1])):
-        data = mujoco.MjData(model)
-        mujoco.mj_step(model, data, nstep=250)
-        for time, command in zip(times, commands.round(4), strict=True):
-            data.ctrl[:] = command
-            row = data.qpos + NOISE * rng.standard_normal(NOISE.size)
-            values = [run, time, *command.tolist(), *row.round(6).tolist()]
-            lines.append(",".join(str(value) for value in values))
-            mujoco.mj_step(model, data, nstep=5)
-    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    for commands in (straight, 0.7 * straight, turns, turns[:, ::-1]):
+        # The robot settles with drives that stand still.
+        positions = follow(model, np.vstack([np.zeros((50, 2)), commands.round(4)]), 5)[50:]
+        readings = positions + NOISE * rng.standard_normal(positions.shape)
+        runs.append((times, commands.round(4), readings))
     tables = ['model = "robot.xml"', *(f'[inputs."u.m_{s}"]\nunit = "rad/s"' for s in SIDES)]
     for name, unit, noise in zip(CHANNELS, UNITS, NOISE.tolist(), strict=True):
         tables.append(f'[channels."{name}"]\nunit = "{unit}"\nnoise = {noise}')
-    (folder / "log.toml").write_text("\n".join([*tables, "[runs.2]\nheld_out = true\n"]))
-    (folder / "robot.xml").write_text(ROVER)
-    return folder / "log.csv"
+    description = "\n".join([*tables, "[runs.2]\nheld_out = true\n"])
+    columns = f"u.m_left,u.m_right,{','.join(CHANNELS)}"
+    return write_log(folder, description, columns, runs, robot=ROVER)
 
 
 @pytest.fixture(scope="module")

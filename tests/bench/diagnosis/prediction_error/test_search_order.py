@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.prediction_error import prediction_error_search
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 ARM = """<mujoco model="arm">
 <option timestep="0.002" integrator="implicitfast"/>
@@ -23,41 +23,27 @@ RIPPLE = 0.35
 """Amplitude of the ripple, N m."""
 PERIOD = 0.4
 """Period of the ripple, rad."""
-SAMPLES = 300
 
 
 def write_recording(folder):
     """Record three runs in plain MuJoCo, with a torque that varies with the angle."""
-    (folder / "arm.xml").write_text(ARM)
+
+    def push(data):
+        data.qfrc_applied[0] = RIPPLE * np.sin(2.0 * np.pi * data.qpos[0] / PERIOD)
+
     model = mujoco.MjModel.from_xml_string(ARM)
-    rng = np.random.default_rng(3)
-    lines = ["run,t,u.servo,q.hinge"]
-    for run in range(3):
-        data = mujoco.MjData(model)
+    rng, times, runs = np.random.default_rng(3), 0.01 * np.arange(300), []
+    for _ in range(3):
         phases = rng.uniform(0.0, 6.0, 2)
-        for sample in range(SAMPLES):
-            t = 0.01 * sample
-            command = 0.9 * np.sin(2.0 * t + phases[0]) + 0.4 * np.sin(5.1 * t + phases[1])
-            if sample == 0:
-                data.qpos[0] = command
-            reading = data.qpos[0] + rng.normal(0.0, 1e-3)
-            lines.append(f"{run},{t:.2f},{command:.8g},{reading:.8g}")
-            data.ctrl[0] = command
-            for _ in range(5):
-                data.qfrc_applied[0] = RIPPLE * np.sin(2.0 * np.pi * data.qpos[0] / PERIOD)
-                mujoco.mj_step(model, data)
-    path = folder / "log.csv"
-    path.write_text("\n".join(lines) + "\n")
-    (folder / "log.toml").write_text(
-        'model = "arm.xml"\n'
-        '[channels."q.hinge"]\nunit = "rad"\nnoise = 0.001\n'
-        '[inputs."u.servo"]\nunit = "rad"\n'
-    )
-    return path
+        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
+        readings = follow(model, commands, 5, start=commands[0], act=push)
+        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
+    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
+    return write_log(folder, description, "u.servo,q.hinge", runs, arm=ARM)
 
 
 def test_a_ripple_is_found_with_few_simulations(tmp_path):
-    answer = explain([write_recording(tmp_path)], ExplainOptions()).answer
+    answer = explain(write_recording(tmp_path)).answer
     (cause,) = answer.causes
     assert cause.effect == "force.ripple@hinge"
     numbers = {name: number.value for name, number in cause.coefficients.items()}

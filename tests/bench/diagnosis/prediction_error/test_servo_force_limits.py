@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 NOISE, RATE, LIMIT = 2e-4, 100, 28.0
 SHARES = (0.2, 0.2, 0.25)
@@ -24,42 +25,27 @@ STATED = {"armature": 0.1, "kp": 2000.0, "damping": 0.0}
 TRUE = {"armature": 0.6, "kp": 1700.0, "damping": 6.0}
 
 
-def log_of(changed, seed):
-    """Return rows of 3 s with one changed parameter, and how often the wrist is at its limit."""
-    rng = np.random.default_rng(seed)
+def explained(folder, changed):
+    """Explain three runs of 3 s, in which the wrist reaches its limit, with a changed parameter."""
     model = mujoco.MjModel.from_xml_string(
         ARM.format(limit=LIMIT, **{**STATED, changed: TRUE[changed]})
     )
-    data, rows, clamped = mujoco.MjData(model), [], 0
-    phases, shares = rng.uniform(0, 2 * np.pi, (3, 3)), SHARES
-    data.qpos[:] = shares * np.sin(phases).mean(axis=1)
-    for k in range(3 * RATE):
-        t = k / RATE
-        waves = [np.sin(2 * np.pi * f * t + phases[:, i]) for i, f in enumerate((0.5, 1.1, 1.9))]
-        data.ctrl[:] = shares * np.mean(waves, axis=0)
-        read = data.qpos + NOISE * rng.standard_normal(3)
-        rows.append([seed, t, *data.ctrl, *read])
-        for _ in range(5):
-            mujoco.mj_step(model, data)
-            clamped += abs(data.qfrc_actuator[2]) >= LIMIT
-    return rows, clamped
-
-
-def explained(folder, changed):
-    (folder / "arm.xml").write_text(ARM.format(limit=LIMIT, **STATED))
-    names = ("shoulder", "elbow", "wrist")
-    lines, clamped = ["run,t,u.s1,u.s2,u.s3," + ",".join(f"q.{n}" for n in names)], 0
+    times, runs, clamped = np.arange(3 * RATE) / RATE, [], []
     for seed in (1, 2, 3):
-        rows, count = log_of(changed, seed)
-        lines += [",".join(f"{value:.9g}" for value in row) for row in rows]
-        clamped += count
-    assert clamped > 30
-    (folder / "log.csv").write_text("\n".join(lines) + "\n")
-    inputs = "".join(f'[inputs."u.s{k}"]\nunit = "rad"\n' for k in (1, 2, 3))
-    channels = "".join(f'[channels."q.{n}"]\nunit = "rad"\nnoise = {NOISE}\n' for n in names)
-    description = f'model = "arm.xml"\n{inputs}{channels}[runs.3]\nheld_out = true\n'
-    (folder / "log.toml").write_text(description)
-    return explain(folder / "log.csv").answer
+        rng = np.random.default_rng(seed)
+        phases = rng.uniform(0, 2 * np.pi, (3, 3))
+        waves = np.sin(2 * np.pi * np.multiply.outer(times, (0.5, 1.1, 1.9))[:, None] + phases)
+        commands = SHARES * waves.mean(axis=2)
+        readings = follow(
+            model, commands, 5, commands[0],
+            act=lambda data: clamped.append(abs(data.qfrc_actuator[2]) >= LIMIT),
+        )  # fmt: skip
+        runs.append((times, commands, readings + NOISE * rng.standard_normal(readings.shape)))
+    assert sum(clamped) > 30
+    names = ("u.s1", "u.s2", "u.s3", "q.shoulder", "q.elbow", "q.wrist")
+    description = describe(dict.fromkeys(names, "rad"), NOISE, "[runs.3]\nheld_out = true\n")
+    known = ARM.format(limit=LIMIT, **STATED)
+    return explain(write_log(folder, description, ",".join(names), runs, arm=known)).answer
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
-import pandas as pd
 import pytest
 
 from bench.diagnosis.explain import explain
@@ -12,6 +12,7 @@ from bench.diagnosis.prediction_error.servo_identification import (
     _solve_damped,
     has_unknown_servos,
 )
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 from tests.exams.robots.robot_signals import profiled
 
 ACCELERATIONS = (15.0, 20.0, 12.0, 25.0)
@@ -49,46 +50,32 @@ def steps_of(rng, times):
     return angles[np.searchsorted(changes, times, side="right")]
 
 
-def write_log(folder):
+def write_recording(folder):
     """Write the log of an arm whose servos have motion profiles, and its model file without them.
 
     The servos of the model file also have a lower stiffness, and its joints no dry friction.
     """
-    mujoco = pytest.importorskip("mujoco")
-    (folder / "arm.xml").write_text(arm(8, 0.3, ""))
     stiff = f'frictionloss="{FRICTION}" solreffriction="0.004 1"'
     model = mujoco.MjModel.from_xml_string(arm(12, 0.5, stiff))
     model.opt.timestep = 0.001
-    rng, times = np.random.default_rng(3), np.arange(0.0, SECONDS, 1.0 / RATE)
-    rows = []
-    for run in range(RUNS):
+    rng, times, runs = np.random.default_rng(3), np.arange(0.0, SECONDS, 1.0 / RATE), []
+    for _ in range(RUNS):
         commands = np.stack([steps_of(rng, times) for _ in range(4)], axis=1)
         limits = zip(commands.T, ACCELERATIONS, strict=True)
         followed = np.stack([profiled(column, times, limit)[0] for column, limit in limits], axis=1)
-        data = mujoco.MjData(model)
-        data.qpos[:] = data.ctrl[:] = commands[0]
-        for _ in range(3000):
-            mujoco.mj_step(model, data)
-        for k, t in enumerate(times):
-            measured = np.round(data.qpos / ENCODER_STEP) * ENCODER_STEP
-            rows.append([run, t, *measured, *commands[k]])
-            for set_points in followed[1000 // RATE * k :][: 1000 // RATE]:
-                data.ctrl[:] = set_points
-                mujoco.mj_step(model, data)
-    columns = ["run", "t", *(f"q.j{i}" for i in range(4)), *(f"u.m{i}" for i in range(4))]
-    pd.DataFrame(rows, columns=columns).to_csv(folder / "log.csv", index=False, float_format="%.6g")
-    tables = [f'{name}{i}"' for name in ('channels."q.j', 'inputs."u.m') for i in range(4)]
-    channels = "".join(f'[{table}]\nunit = "rad"\n' for table in tables)
-    free = 'model = "arm.xml"\nfree = ["actuator.stiffness@*", "actuator.damping@*"]\n'
-    held_out = "[runs.3]\nheld_out = true\n"
-    (folder / "log.toml").write_text(free + channels + held_out)
-    return folder / "log.csv"
+        positions = follow(model, followed, 1, start=commands[0], settle=3000)
+        readings = np.round(positions[:: 1000 // RATE] / ENCODER_STEP) * ENCODER_STEP
+        runs.append((times, readings[: times.size], commands))
+    units = dict.fromkeys([f"{name}{i}" for name in ("q.j", "u.m") for i in range(4)], "rad")
+    free = 'free = ["actuator.stiffness@*", "actuator.damping@*"]\n'
+    description = free + describe(units, more="[runs.4]\nheld_out = true\n")
+    return write_log(folder, description, ",".join(units), runs, arm=arm(8, 0.3, ""))
 
 
 @pytest.mark.long
 def test_profiles_friction_and_stiffness_of_all_servos_are_found(tmp_path):
     """The model lacks two laws at each of four joints, and its stiffness is wrong."""
-    answer = explain(write_log(tmp_path)).answer
+    answer = explain(write_recording(tmp_path)).answer
     found = {cause.effect: cause.coefficients["coefficient"].value for cause in answer.causes}
     assert found.keys() == {
         *(f"servo.profile@m{i}" for i in range(4)),

@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import stdtr
 
-from bench.cli.main import main
 from bench.diagnosis.explain import explain
 from bench.diagnosis.report.consistency_section import (
     MISSING_PHYSICS_NAMES,
@@ -20,9 +19,12 @@ from sims import effects
 from sims.core.simulator import InputError
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
+from tests.bench.diagnosis.simulated_logs import write_log
+from tests.command_output import run_command
 
 NOISE = 1e-3
 TIMES = np.arange(0.0, 3.0, 0.02)
+SLIDER = f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
 
 
 def slide(state, force, mass, coulomb):
@@ -39,7 +41,7 @@ def write(folder, name, mass=2.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
 
     Without friction the motion has a closed form; with it, SciPy integrates.
     """
-    rng, rows = np.random.default_rng(seed), ["run,t,u,x"]
+    rng, columns = np.random.default_rng(seed), []
     for run in range(runs):
         size = sizes[run % len(sizes)]
         u = size * np.sin(3 * TIMES + run + 0.3)
@@ -51,14 +53,8 @@ def write(folder, name, mass=2.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
             else:
                 gain = 0.02 * force / mass
                 state = np.add(state, [0.02 * (state[1] + gain / 2), gain])
-        x += NOISE * rng.standard_normal(x.size)
-        rows += [f"{run},{t:.2f},{a:.6f},{b:.6f}" for t, a, b in zip(TIMES, u, x, strict=True)]
-    path = folder / f"{name}.csv"
-    path.write_text("\n".join(rows))
-    path.with_suffix(".toml").write_text(
-        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
-    )
-    return path
+        columns.append((TIMES, u, x + NOISE * rng.standard_normal(x.size)))
+    return write_log(folder, SLIDER, "u,x", columns, name)
 
 
 def by(spreads, number, group):
@@ -121,7 +117,7 @@ def test_the_p_value_of_disagreeing_groups_is_calibrated(tmp_path):
     assert 0.2 < np.median(chances) < 0.85
 
 
-def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
+def test_what_is_missing_makes_a_number_move(tmp_path):
     """Dry friction fitted as drag looks larger in small motions than in large ones."""
     sizes = {"small": 1.5, "middle": 4.0, "large": 10.0}
     paths = [
@@ -129,8 +125,7 @@ def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
         for i, (name, size) in enumerate(sizes.items())
     ]
     out = tmp_path / "out"
-    assert main(["explain", *map(str, paths), "--out", str(out)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    said = " ".join(run_command("explain", *paths, "--out", out).out.split())
     assert "lacks Coulomb friction" in said
     assert "instead of friction.coulomb, its value would differ between logs" in said
     assert "no number changes steadily over the 3 logs, in the order given" in said.lower()
@@ -146,14 +141,17 @@ def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
     assert 'class="intervals"' in page
 
 
-def test_logs_that_are_not_of_one_system_are_refused(tmp_path, capsys):
+def test_logs_that_are_not_of_one_system_are_refused(tmp_path):
     one, other = write(tmp_path, "one"), write(tmp_path, "other", seed=1)
     other.with_suffix(".toml").write_text(
         'system = "pendulum"\n[channels.q]\nunit = "rad"\n[inputs.u]\nunit = "N*m"\n'
     )
     other.write_text(other.read_text().replace("run,t,u,x", "run,t,u,q"))
-    assert main(["explain", str(one), str(other), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
+    said = (
+        run_command("explain", one, other, "--out", tmp_path / "out", code=2)
+        .err.strip()
+        .splitlines()[-1]
+    )
     assert said.endswith(
         f"{other}: expected a log of slider as {one}, found one of pendulum; explain it by itself"
     )
@@ -194,22 +192,20 @@ def warm(folder, drags, temperatures):
 
     It uses the closed form for a held force: the speed goes to u / drag as exp(-drag t / mass).
     """
-    rng, rows, mass = np.random.default_rng(0), ["run,t,u,x,temperature"], 2.0
+    rng, runs, mass = np.random.default_rng(0), [], 2.0
     for run, (drag, heat) in enumerate(zip(drags, temperatures, strict=True)):
         x, v, fading = 0.0, 0.5, np.exp(-drag * 0.02 / mass)
+        rows = []
         for t, u in zip(TIMES, 4.0 * np.sin(3 * TIMES + run + 0.3), strict=True):
             seen = x + NOISE * rng.standard_normal()
-            rows.append(f"{run},{t:.2f},{u:.6f},{seen:.6f},{heat + rng.standard_normal():.1f}")
+            rows.append((t, u, seen, heat + rng.standard_normal()))
             last = u / drag
             x += last * 0.02 + (v - last) * (1 - fading) * mass / drag
             v = last + (v - last) * fading
-    path = folder / f"warm{temperatures[1]:g}.csv"
-    path.write_text("\n".join(rows))
-    path.with_suffix(".toml").write_text(
-        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
-        '[extra.temperature]\nunit = "degC"\n'
-    )
-    return path
+        runs.append([np.array(rows)])
+    extra = '[extra.temperature]\nunit = "degC"\n'
+    columns, name = "u,x,temperature", f"warm{temperatures[1]:g}"
+    return write_log(folder, SLIDER + extra, columns, runs, name)
 
 
 @pytest.mark.slow
