@@ -1,5 +1,7 @@
 """Read how the finished runs of a study ended."""
 
+import time
+
 from bench.benchmark.storage.run_journal import read_statuses_by_file
 
 
@@ -10,3 +12,14 @@ def read_finished_statuses(folder):
         for _, statuses in read_statuses_by_file(folder)
         for plan_index, status in statuses.items()
     }
+
+
+def wait_for_runs(process, folder, count, seconds=120.0):
+    """Wait until a process has finished this number of runs, has ended, or the time is over."""
+    deadline = time.monotonic() + seconds
+    while (
+        len(read_finished_statuses(folder)) < count
+        and process.poll() is None
+        and time.monotonic() < deadline
+    ):
+        time.sleep(0.01)

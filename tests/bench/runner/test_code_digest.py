@@ -23,6 +23,7 @@ from bench.core.plugin_registries import REGISTRIES, load_plugins, tuners
 from methods.tuner import Tuner
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, FittedValue, write_extended
+from tests.notebook_cells import define_in_cell
 from tests.sample_experiments import SPRING, spring_experiment
 
 REGRESSOR = TunerEntry("regressor", "regressor")
@@ -255,20 +256,8 @@ def test_a_new_file_in_a_room_counts_and_what_python_compiles_does_not(tmp_path,
 
 
 def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatch):
-    """IPython stores the text of a cell in linecache, and its classes belong to `__main__`."""
-    import linecache
-
-    main = sys.modules["__main__"]
-
     def cell(number, step):
-        text = PLUGIN.format(step=step)
-        file = f"<cell {number}>"
-        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
-        space = {"__name__": "__main__"}
-        exec(compile(text, file, "exec"), space)
-        monkeypatch.setattr(main, "Mine", space["Mine"], raising=False)
-        monkeypatch.setattr(main, "__file__", file, raising=False)
-        return space["Mine"]
+        return define_in_cell(monkeypatch, PLUGIN.format(step=step), f"<cell {number}>")
 
     one = cell(1, 1)
     cell(2, 2)
@@ -281,21 +270,13 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
 
 def test_class_of_a_notebook_that_has_no_file_takes_the_text_of_its_cell(monkeypatch):
     """In Jupyter, `__main__` has no file, so that inspect finds functions but no classes."""
-    import linecache
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
 
-    main = sys.modules["__main__"]
-    monkeypatch.delattr(main, "__file__", raising=False)
-
-    def cell(number, step):
+    def digest(step):
         text = PLUGIN.format(step=step)
-        file = f"<cell {number}>"
-        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
-        space = {"__name__": "__main__"}
-        exec(compile(text, file, "exec"), space)
-        monkeypatch.setattr(main, "Mine", space["Mine"], raising=False)
-        return hash_class_source(space["Mine"])
+        return hash_class_source(define_in_cell(monkeypatch, text, file=None))
 
-    assert cell(11, 1) == cell(12, 1) != cell(13, 2)
+    assert digest(1) == digest(1) != digest(2)
 
 
 def define_tuner(number):

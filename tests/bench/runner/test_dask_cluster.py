@@ -2,14 +2,13 @@
 
 import os
 import subprocess
-import time
 
 import pandas as pd
 import pytest
 
-from bench.cli.main import main
 from tests.bench.runner.test_comparison_study import CHAOS, SPRING_PLUGIN, same, simgap, write
-from tests.finished_statuses import read_finished_statuses
+from tests.command_output import run_command
+from tests.finished_statuses import read_finished_statuses, wait_for_runs
 from tests.local_cluster import cluster
 from tests.without_drawing import COMMAND
 
@@ -42,13 +41,7 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
-    deadline = time.monotonic() + 120
-    while (
-        len(read_finished_statuses(folder)) < 10
-        and process.poll() is None
-        and time.monotonic() < deadline
-    ):
-        time.sleep(0.01)
+    wait_for_runs(process, folder, 10)
     started.workers()[0].kill()
     _, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors
@@ -76,13 +69,7 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     process = subprocess.Popen(
         [*command, "--out", str(folder)], text=True, stdout=-1, stderr=subprocess.PIPE
     )
-    deadline = time.monotonic() + 120
-    while (
-        len(read_finished_statuses(folder)) < 12
-        and process.poll() is None
-        and time.monotonic() < deadline
-    ):
-        time.sleep(0.05)
+    wait_for_runs(process, folder, 12)
     started.scheduler.kill()
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
@@ -132,7 +119,7 @@ def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_p
 
 
 @pytest.mark.slow
-def test_nobody_there_is_one_line(tmp_path, capsys):
+def test_nobody_there_is_one_line(tmp_path):
     experiment = write(tmp_path / "e.toml")
     common = [
         "compare",
@@ -144,8 +131,7 @@ def test_nobody_there_is_one_line(tmp_path, capsys):
         "--cluster",
     ]
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:notaport"):
-        assert main([*common, address]) == 2
-        error = capsys.readouterr().err
+        error = run_command(*common, address, code=2).err
         assert f"--cluster {address}: no Dask scheduler answers there" in error
         assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()

@@ -90,23 +90,6 @@ def test_pairing_all_tuners_share_target_start_and_true_parameters(two_workers):
     assert ((inside >= 2.0) & (inside <= 4.0)).all()
 
 
-def test_errors_are_those_of_the_recommendation(two_workers):
-    rows = frame(two_workers)
-    expected = (
-        (rows["recommendation_rate"] - rows["true_rate"]).abs() / 2.0
-        + (rows["recommendation_decay"] - rows["true_decay"]).abs() / 0.4
-    ) / 2
-    np.testing.assert_allclose(rows["param_error"], expected)
-    outside = rows.groupby("target")["outside"].first()
-    assert (outside[[t for t in outside.index if t.startswith("in")]] == 0).all()
-    truth = rows[rows["range"] == "wide"].groupby("target")[["true_rate", "true_decay"]].first()
-    beyond = np.maximum(0, np.maximum(
-        np.maximum(2.0 - truth["true_rate"], truth["true_rate"] - 4.0) / 2.0,
-        np.maximum(0.2 - truth["true_decay"], truth["true_decay"] - 0.6) / 0.4,
-    ))  # fmt: skip
-    np.testing.assert_allclose(outside[truth.index], beyond)
-
-
 def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
     rows = frame(two_workers).query("tuner == 'cma_es' and target == 'in-001' and seed == 1")
     problem = two_workers.problem

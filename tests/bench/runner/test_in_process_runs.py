@@ -1,6 +1,5 @@
 """Tests of runs without worker processes: equal tables, and tuners that can be observed."""
 
-import linecache
 import os
 import sys
 
@@ -17,6 +16,7 @@ from bench.core.plugin_registries import load_plugins, tuners
 from methods.tuner import Tuner
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS
+from tests.notebook_cells import define_in_cell
 from tests.sample_experiments import spring_experiment
 
 PLUGIN_FILES = [str(PLUGINS / "spring.py"), str(PLUGINS / "awkward.py")]
@@ -53,13 +53,7 @@ def plugins():
 
 def in_a_cell(monkeypatch, then):
     """Register a tuner that is defined as in a notebook cell."""
-    text = CELL.format(then=then)
-    linecache.cache["<cell>"] = (len(text), None, text.splitlines(keepends=True), "<cell>")
-    space = {"__name__": "__main__"}
-    exec(compile(text, "<cell>", "exec"), space)
-    monkeypatch.setattr(sys.modules["__main__"], "Mine", space["Mine"], raising=False)
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<cell>", raising=False)
-    return tuners.register(space["Mine"])
+    return tuners.register(define_in_cell(monkeypatch, CELL.format(then=then)))
 
 
 def small(**changes):
@@ -173,19 +167,13 @@ def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_cache
     from bench.core.plugin_registries import simulators
 
     spring = simulators.get("spring")
-    main = sys.modules["__main__"]
 
     def defined(times):
         text = (
             "class Mine(spring):\n    name = 'mine'\n\n    def simulate(self, theta, scenario):\n"
             f"        return {times} * super().simulate(theta, scenario)\n"
         )
-        linecache.cache["<sim>"] = (len(text), None, text.splitlines(keepends=True), "<sim>")
-        space = {"__name__": "__main__", "spring": spring}
-        exec(compile(text, "<sim>", "exec"), space)
-        monkeypatch.setattr(main, "Mine", space["Mine"], raising=False)
-        monkeypatch.setattr(main, "__file__", "<sim>", raising=False)
-        simulators.register(space["Mine"])
+        simulators.register(define_in_cell(monkeypatch, text, "<sim>", spring=spring))
 
     class Same(Tuner):
         name = "same"

@@ -10,6 +10,7 @@ from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner.run_scoring import Notes
 from bench.cli.main import main
 from tests.bench.isolation.isolated_process import experiment, need, outcome
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 
@@ -77,7 +78,7 @@ def test_slow_imports_are_measured_and_a_shared_process_suggested(
         )
 
 
-def test_a_plugin_that_reads_a_file_on_import_is_refused_with_the_reason(tmp_path, capsys):
+def test_a_plugin_that_reads_a_file_on_import_is_refused_with_the_reason(tmp_path):
     need("files")
     plugin = tmp_path / "reads.py"
     (tmp_path / "weights.txt").write_text("1")
@@ -85,8 +86,9 @@ def test_a_plugin_that_reads_a_file_on_import_is_refused_with_the_reason(tmp_pat
         "from pathlib import Path\n\nfrom simgap import Tuner\n\n"
         "weights = Path(__file__).with_name('weights.txt').read_text()\n"
     )
-    assert main(["compare", "ball-drop", "--plugin", str(plugin), "--tuners", "random"]) == 2
-    error = capsys.readouterr().err
+    error = run_command(
+        "compare", "ball-drop", "--plugin", plugin, "--tuners", "random", code=2
+    ).err
     assert error.count("\n") == 1
     assert "PermissionError" in error
     assert error.endswith(f"; {ISOLATION_NOTE}\n")

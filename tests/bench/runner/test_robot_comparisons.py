@@ -5,8 +5,8 @@ tuners are compared on it, and least squares recovers the true parameters.
 import pandas as pd
 import pytest
 
-from bench.cli.main import main
 from tests.bench.diagnosis.pendulum_recordings import SWINGING, written
+from tests.command_output import run_command
 
 TRUE_PARAMETERS = {"drag.linear@elbow": 0.13, "mass.scale@fore": 0.2}
 
@@ -19,7 +19,7 @@ def log(tmp_path_factory):
     given = [f"{name}={value}" for name, value in TRUE_PARAMETERS.items()]
     size = ["--runs", "3", "--seconds", "1.6", "--rate", "50"]
     arguments = ["simulate", "--model", str(model), "--effect", *given, "--noise", "1e-4", *size]
-    assert main([*arguments, "--out", str(folder / "log.csv")]) == 0
+    run_command(*arguments, "--out", folder / "log.csv")
     return folder / "log.csv"
 
 
@@ -32,7 +32,7 @@ def compared(log, tmp_path_factory):
         arguments = ["compare", "--recording", str(log), "--free", "damping@elbow,mass@fore"]
         arguments += ["--tuners", "random,least_squares,tunenet", "--training-budget", "32"]
         arguments += ["--targets", "1", "--budget", "30", "--jobs", "1", "--salt", "public"]
-        assert main([*arguments, "--out", str(out)]) == 0
+        run_command(*arguments, "--out", out)
     return out
 
 
@@ -63,15 +63,17 @@ def test_identifiable_numbers_are_next_to_the_errors(compared):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_a_finished_comparison_is_taken_up_and_one_of_another_file_is_not(compared, log, capsys):
-    assert main(["compare", "--resume", str(compared), "--jobs", "1"]) == 0
+def test_a_finished_comparison_is_taken_up_and_one_of_another_file_is_not(compared, log):
+    run_command("compare", "--resume", compared, "--jobs", "1")
     written(log.parent, SWINGING.replace('mass="0.8"', 'mass="0.81"'))
-    assert main(["compare", "--resume", str(compared)]) == 2
-    assert "its model file changed since it was started" in capsys.readouterr().err
+    assert (
+        "its model file changed since it was started"
+        in run_command("compare", "--resume", compared, code=2).err
+    )
     written(log.parent)
 
 
-def test_options_that_contradict_each_other_are_one_line(tmp_path, capsys):
+def test_options_that_contradict_each_other_are_one_line(tmp_path):
     model = str(written(tmp_path))
     for arguments, message in (
         (["ball-drop", "--model", model], "states what it tunes: leave out model"),
@@ -79,7 +81,6 @@ def test_options_that_contradict_each_other_are_one_line(tmp_path, capsys):
         (["--model", str(tmp_path / "no.xml"), "--free", "x"], "no.xml: no such file"),
         (["--resume", "x", "--free", "damping@*"], "leave out free"),
     ):
-        assert main(["compare", *arguments]) == 2
-        error = capsys.readouterr().err
+        error = run_command("compare", *arguments, code=2).err
         assert message in error
         assert error.count("\n") == 1
