@@ -1,14 +1,30 @@
-"""Kinds of damage to result folders: by name, the file that the message must mention, and a
-function that damages the folder.
-"""
+"""Kinds of damage to result folders by name."""
 
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet
+
+
+class Damage(NamedTuple):
+    """A change of a file in a result folder.
+
+    Attributes:
+        file: name of the file that the message must mention.
+        change: function that changes the file in a folder.
+    """
+
+    file: str
+    change: Callable[[Path], object]
+
+    def __call__(self, folder):
+        self.change(folder)
 
 
 def rows(change, name="runs.parquet"):
@@ -20,7 +36,7 @@ def rows(change, name="runs.parquet"):
         whole = pa.Table.from_pandas(change(pd.read_parquet(path)), preserve_index=False)
         parquet.write_table(whole.replace_schema_metadata(metadata), path)
 
-    return damage
+    return Damage(name, damage)
 
 
 def cell(name, row, value):
@@ -46,7 +62,7 @@ def text(name, old, new, count=1):
         assert old in before, f"{old} is not in {before}"
         path.write_text(before.replace(old, new, count), encoding="utf-8")
 
-    return damage
+    return Damage(name, damage)
 
 
 def lines(name, change):
@@ -55,7 +71,7 @@ def lines(name, change):
         before = path.read_text(encoding="utf-8").splitlines()
         path.write_text("".join(f"{line}\n" for line in change(before)), encoding="utf-8")
 
-    return damage
+    return Damage(name, damage)
 
 
 def raw(name, change):
@@ -63,7 +79,7 @@ def raw(name, change):
         path = folder / name
         path.write_bytes(change(path.read_bytes()))
 
-    return damage
+    return Damage(name, damage)
 
 
 def key(name, value):
@@ -77,7 +93,7 @@ def key(name, value):
             del held[name]
         path.write_text(json.dumps(held), encoding="utf-8")
 
-    return damage
+    return Damage("environment.json", damage)
 
 
 def another(row):
@@ -97,137 +113,134 @@ def column_of(name, place, change):
 
 
 def both(first, second):
-    """Combine two kinds of damage that hide each other."""
-    return lambda folder: (first(folder), second(folder))
+    """Combine two kinds of damage that hide each other; the message is about the second."""
+    return Damage(second.file, lambda folder: (first(folder), second(folder)))
+
+
+def gone(name):
+    """Return the damage of a missing file."""
+    return Damage(name, lambda folder: (folder / name).unlink())
 
 
 PARQUET, STATUS_CSV, PLAN = "runs.parquet", "status.csv", "segments/plan.txt"
+PART = "segments/000001.parquet"
 TRAINED = ["random,0,1,1.5,True"]
 DONE = {
-    "no column": (PARQUET, rows(lambda f: f.drop(columns="loss"))),
-    "no run": (PARQUET, rows(lambda f: f.drop(columns="run"))),
-    "no parameter": (PARQUET, rows(lambda f: f.drop(columns="true_rate"))),
-    "no recommendations": (
-        PARQUET,
-        rows(lambda f: f[[c for c in f if not c.startswith(("proposal", "recomm", "true_"))]]),
+    "no column": rows(lambda f: f.drop(columns="loss")),
+    "no run": rows(lambda f: f.drop(columns="run")),
+    "no parameter": rows(lambda f: f.drop(columns="true_rate")),
+    "no recommendations": rows(
+        lambda f: f[[c for c in f if not c.startswith(("proposal", "recomm", "true_"))]]
     ),
-    "no channel": (PARQUET, rows(lambda f: f.drop(columns="obs_error_x"))),
-    "text for numbers": (PARQUET, column("loss", "much")),
-    "text for k": (PARQUET, rows(lambda f: f.assign(k=f["k"].astype(str)))),
-    "numbers for text": (PARQUET, column("tuner", 3)),
-    "fractional k": (PARQUET, rows(lambda f: f.assign(k=f["k"] + 0.5))),
-    "NaN k": (PARQUET, rows(lambda f: f.assign(k=f["k"].astype(float).replace(2.0, np.nan)))),
-    "no k": (PARQUET, rows(lambda f: f.assign(k=f["k"].astype("Int64").replace(2, pd.NA)))),
-    "negative k": (PARQUET, cell("k", 1, -1)),
-    "huge k": (PARQUET, cell("k", 1, 2**62)),
-    "k beyond a double": (PARQUET, rows(lambda f: f.assign(k=np.uint64(2**64 - 1)))),
-    "k twice": (PARQUET, cell("k", 2, 1)),
-    "k goes on from a double": (PARQUET, both(cell("k", 2, 1), cell("k", 3, 2))),
-    "k left out": (PARQUET, rows(lambda f: f.drop(index=1))),
-    "no start": (PARQUET, rows(lambda f: f.drop(index=0))),
-    "no end": (STATUS_CSV, rows(lambda f: f.drop(index=3))),
-    "loss at the start": (PARQUET, cell("loss", 0, 0.5)),
-    "no loss": (PARQUET, cell("loss", 1, np.nan)),
-    "negative loss": (PARQUET, cell("loss", 1, -1.0)),
-    "infinite error": (PARQUET, cell("param_error", 1, np.inf)),
-    "infinite proposal": (PARQUET, cell("proposal_rate", 1, -np.inf)),
-    "true parameter unknown": (PARQUET, cell("true_rate", 1, np.nan)),
-    "true parameter changes": (PARQUET, cell("true_rate", 1, 2.5)),
-    "true parameter of one run": (
-        PARQUET,
-        rows(lambda f: f.assign(true_rate=f["true_rate"].where(f["run"] != f["run"][0], 2.5))),
+    "no channel": rows(lambda f: f.drop(columns="obs_error_x")),
+    "text for numbers": column("loss", "much"),
+    "text for k": rows(lambda f: f.assign(k=f["k"].astype(str))),
+    "numbers for text": column("tuner", 3),
+    "fractional k": rows(lambda f: f.assign(k=f["k"] + 0.5)),
+    "NaN k": rows(lambda f: f.assign(k=f["k"].astype(float).replace(2.0, np.nan))),
+    "no k": rows(lambda f: f.assign(k=f["k"].astype("Int64").replace(2, pd.NA))),
+    "negative k": cell("k", 1, -1),
+    "huge k": cell("k", 1, 2**62),
+    "k beyond a double": rows(lambda f: f.assign(k=np.uint64(2**64 - 1))),
+    "k twice": cell("k", 2, 1),
+    "k goes on from a double": both(cell("k", 2, 1), cell("k", 3, 2)),
+    "k left out": rows(lambda f: f.drop(index=1)),
+    "no start": rows(lambda f: f.drop(index=0)),
+    "no end": rows(lambda f: f.drop(index=3))._replace(file=STATUS_CSV),
+    "loss at the start": cell("loss", 0, 0.5),
+    "no loss": cell("loss", 1, np.nan),
+    "negative loss": cell("loss", 1, -1.0),
+    "infinite error": cell("param_error", 1, np.inf),
+    "infinite proposal": cell("proposal_rate", 1, -np.inf),
+    "true parameter unknown": cell("true_rate", 1, np.nan),
+    "true parameter changes": cell("true_rate", 1, 2.5),
+    "true parameter of one run": rows(
+        lambda f: f.assign(true_rate=f["true_rate"].where(f["run"] != f["run"][0], 2.5))
     ),
-    "negative seconds": (PARQUET, cell("tuner_seconds", 1, -1.0)),
-    "range changes": (PARQUET, cell("range", 1, "wide")),
-    "unknown range": (PARQUET, column("range", "far")),
-    "tuner changes": (PARQUET, cell("tuner", 1, "nelder_mead")),
-    "run twice": (PARQUET, rows(lambda f: pd.concat([f, f[f["run"] == f["run"][0]]]))),
-    "run missing": (STATUS_CSV, rows(lambda f: f[f["run"] != f["run"][0]])),
-    "another run": (PARQUET, rows(lambda f: f.assign(run=f["run"] + "0"))),
-    "another experiment": (PARQUET, column("experiment", "other")),
-    "no rows": (STATUS_CSV, rows(lambda f: f.iloc[:0])),
-    "truncated": (PARQUET, raw(PARQUET, lambda data: data[: len(data) // 2])),
-    "empty": (PARQUET, raw(PARQUET, lambda _: b"")),
-    "no Parquet": (PARQUET, raw(PARQUET, lambda _: b"run,k\n1,2\n")),
-    "parquet gone": (PARQUET, lambda folder: (folder / PARQUET).unlink()),
-    "pages": (PARQUET, raw(PARQUET, lambda data: data[:4] + b"\xff" * 900 + data[904:])),
-    "unknown status": (STATUS_CSV, text(STATUS_CSV, ",done,", ",perfect,")),
-    "done too early": (
-        STATUS_CSV,
-        both(rows(lambda f: f.drop(index=3)), column_of(STATUS_CSV, -3, lambda _: "2")),
+    "negative seconds": cell("tuner_seconds", 1, -1.0),
+    "range changes": cell("range", 1, "wide"),
+    "unknown range": column("range", "far"),
+    "tuner changes": cell("tuner", 1, "nelder_mead"),
+    "run twice": rows(lambda f: pd.concat([f, f[f["run"] == f["run"][0]]])),
+    "run missing": rows(lambda f: f[f["run"] != f["run"][0]])._replace(file=STATUS_CSV),
+    "another run": rows(lambda f: f.assign(run=f["run"] + "0")),
+    "another experiment": column("experiment", "other"),
+    "no rows": rows(lambda f: f.iloc[:0])._replace(file=STATUS_CSV),
+    "truncated": raw(PARQUET, lambda data: data[: len(data) // 2]),
+    "empty": raw(PARQUET, lambda _: b""),
+    "no Parquet": raw(PARQUET, lambda _: b"run,k\n1,2\n"),
+    "parquet gone": gone(PARQUET),
+    "pages": raw(PARQUET, lambda data: data[:4] + b"\xff" * 900 + data[904:]),
+    "unknown status": text(STATUS_CSV, ",done,", ",perfect,"),
+    "done too early": both(
+        rows(lambda f: f.drop(index=3)), column_of(STATUS_CSV, -3, lambda _: "2")
     ),
-    "status shortened": (STATUS_CSV, lines(STATUS_CSV, lambda ls: ls[:-1])),
-    "status header": (STATUS_CSV, lines(STATUS_CSV, lambda ls: ls[:1])),
-    "status twice": (STATUS_CSV, lines(STATUS_CSV, lambda ls: [*ls, ls[-1]])),
-    "status cut": (STATUS_CSV, raw(STATUS_CSV, lambda data: data[:-30])),
-    "status empty": (STATUS_CSV, raw(STATUS_CSV, lambda _: b"")),
-    "status gone": (STATUS_CSV, lambda folder: (folder / STATUS_CSV).unlink()),
-    "other bytes": (STATUS_CSV, raw(STATUS_CSV, lambda data: data + b"\xff\xfe")),
-    "zeros": (STATUS_CSV, raw(STATUS_CSV, lambda data: data + bytes(9))),
-    "wrong separators": (STATUS_CSV, raw(STATUS_CSV, lambda data: data.replace(b",", b";"))),
-    "a cell more": (STATUS_CSV, lines(STATUS_CSV, lambda ls: [ls[0], ls[1] + ",1", *ls[2:]])),
-    "open quote": (STATUS_CSV, text(STATUS_CSV, ",done,", ',"')),
-    "column gone": (STATUS_CSV, text(STATUS_CSV, "seconds", "minutes")),
-    "column twice": (STATUS_CSV, text(STATUS_CSV, "reason", "status")),
-    "negative time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda v: f"-{v}")),
-    "infinite time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "inf")),
-    "no time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "")),
-    "time in words": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "1_0")),
-    "half a simulation": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda v: f"{v}.5")),
-    "more simulations": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda _: "4")),
-    "endless simulations": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda _: "9" * 40)),
-    "another tuner": (STATUS_CSV, column_of(STATUS_CSV, 1, another)),
-    "another target": (STATUS_CSV, column_of(STATUS_CSV, 3, lambda _: "in-001")),
-    "another seed": (STATUS_CSV, column_of(STATUS_CSV, 4, lambda _: "7")),
-    "another simulator": (STATUS_CSV, column_of(STATUS_CSV, 2, lambda _: "pendulum")),
-    "escapes": (STATUS_CSV, column_of(STATUS_CSV, 1, lambda _: "\x1b[31m\u2028")),
-    "training header": ("training.csv", text("training.csv", "seconds", "s")),
-    "training of nobody": (
-        "training.csv",
-        lines("training.csv", lambda ls: [*ls, "me,0,1,1,True"]),
-    ),
-    "training twice": ("training.csv", lines("training.csv", lambda ls: [ls[0], *TRAINED * 2])),
-    "training cost": (
-        "training.csv",
-        lines("training.csv", lambda ls: [*ls, "random,0,-1,1,True"]),
-    ),
-    "training gone": ("training.csv", lambda folder: (folder / "training.csv").unlink()),
-    "no direction": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "0")),
-    "directions": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "2")),
-    "neither": ("identifiability.csv", column_of("identifiability.csv", 6, lambda _: "perhaps")),
-    "component": ("identifiability.csv", column_of("identifiability.csv", 7, lambda _: "1.5")),
+    "status shortened": lines(STATUS_CSV, lambda ls: ls[:-1]),
+    "status header": lines(STATUS_CSV, lambda ls: ls[:1]),
+    "status twice": lines(STATUS_CSV, lambda ls: [*ls, ls[-1]]),
+    "status cut": raw(STATUS_CSV, lambda data: data[:-30]),
+    "status empty": raw(STATUS_CSV, lambda _: b""),
+    "status gone": gone(STATUS_CSV),
+    "other bytes": raw(STATUS_CSV, lambda data: data + b"\xff\xfe"),
+    "zeros": raw(STATUS_CSV, lambda data: data + bytes(9)),
+    "wrong separators": raw(STATUS_CSV, lambda data: data.replace(b",", b";")),
+    "a cell more": lines(STATUS_CSV, lambda ls: [ls[0], ls[1] + ",1", *ls[2:]]),
+    "open quote": text(STATUS_CSV, ",done,", ',"'),
+    "column gone": text(STATUS_CSV, "seconds", "minutes"),
+    "column twice": text(STATUS_CSV, "reason", "status"),
+    "negative time": column_of(STATUS_CSV, -2, lambda v: f"-{v}"),
+    "infinite time": column_of(STATUS_CSV, -2, lambda _: "inf"),
+    "no time": column_of(STATUS_CSV, -2, lambda _: ""),
+    "time in words": column_of(STATUS_CSV, -2, lambda _: "1_0"),
+    "half a simulation": column_of(STATUS_CSV, -3, lambda v: f"{v}.5"),
+    "more simulations": column_of(STATUS_CSV, -3, lambda _: "4"),
+    "endless simulations": column_of(STATUS_CSV, -3, lambda _: "9" * 40),
+    "another tuner": column_of(STATUS_CSV, 1, another),
+    "another target": column_of(STATUS_CSV, 3, lambda _: "in-001"),
+    "another seed": column_of(STATUS_CSV, 4, lambda _: "7"),
+    "another simulator": column_of(STATUS_CSV, 2, lambda _: "pendulum"),
+    "escapes": column_of(STATUS_CSV, 1, lambda _: "\x1b[31m\u2028"),
+    "training header": text("training.csv", "seconds", "s"),
+    "training of nobody": lines("training.csv", lambda ls: [*ls, "me,0,1,1,True"]),
+    "training twice": lines("training.csv", lambda ls: [ls[0], *TRAINED * 2]),
+    "training cost": lines("training.csv", lambda ls: [*ls, "random,0,-1,1,True"]),
+    "training gone": gone("training.csv"),
+    "no direction": column_of("identifiability.csv", 3, lambda _: "0"),
+    "directions": column_of("identifiability.csv", 3, lambda _: "2"),
+    "neither": column_of("identifiability.csv", 6, lambda _: "perhaps"),
+    "component": column_of("identifiability.csv", 7, lambda _: "1.5"),
 }  # fmt: skip
 BOTH = {
-    "environment empty": ("environment.json", raw("environment.json", lambda _: b"")),
-    "environment listed": ("environment.json", raw("environment.json", lambda _: b"[]")),
-    "environment nested": ("environment.json", raw("environment.json", lambda _: b"[" * 99999)),
-    "environment bytes": ("environment.json", raw("environment.json", lambda _: b"\xff\xfe")),
-    "no experiment": ("environment.json", key("experiment", None)),
-    "no packages": ("environment.json", key("packages", None)),
-    "numbered experiment": ("environment.json", key("experiment", 3)),
-    "numbered plugins": ("environment.json", key("plugins", [1])),
-    "plugins in words": ("environment.json", key("plugins", "spring.py")),
-    "hashes listed": ("environment.json", key("fingerprint", ["x"])),
-    "numbered hashes": ("environment.json", key("fingerprint", {"code": 1})),
-    "jobs in words": ("environment.json", key("jobs", "two")),
-    "true jobs": ("environment.json", key("jobs", True)),
-    "budget in words": ("experiment.toml", text("experiment.toml", "budget = 3", 'budget = "x"')),
-    "configuration bytes": ("experiment.toml", raw("experiment.toml", lambda data: data + b"\xff")),
+    "environment empty": raw("environment.json", lambda _: b""),
+    "environment listed": raw("environment.json", lambda _: b"[]"),
+    "environment nested": raw("environment.json", lambda _: b"[" * 99999),
+    "environment bytes": raw("environment.json", lambda _: b"\xff\xfe"),
+    "no experiment": key("experiment", None),
+    "no packages": key("packages", None),
+    "numbered experiment": key("experiment", 3),
+    "numbered plugins": key("plugins", [1]),
+    "plugins in words": key("plugins", "spring.py"),
+    "hashes listed": key("fingerprint", ["x"]),
+    "numbered hashes": key("fingerprint", {"code": 1}),
+    "jobs in words": key("jobs", "two"),
+    "true jobs": key("jobs", True),
+    "budget in words": text("experiment.toml", "budget = 3", 'budget = "x"'),
+    "configuration bytes": raw("experiment.toml", lambda data: data + b"\xff"),
 }
 HALF = {
-    "plan of others": (PLAN, text(PLAN, "random/", "annealing/")),
-    "plan of other targets": (PLAN, text(PLAN, "in-000", "in-999")),
-    "plan without ids": (PLAN, raw(PLAN, lambda _: b"one\ntwo\n")),
-    "plan twice": (PLAN, lines(PLAN, lambda ls: [*ls, ls[0]])),
-    "plan shortened": (PLAN, lines(PLAN, lambda ls: ls[:-1])),
-    "plan bytes": (PLAN, raw(PLAN, lambda data: data + b"\xff")),
-    "part cut": ("segments/000001.parquet", raw("segments/000001.parquet", lambda d: d[:-7])),
-    "part empty": ("segments/000001.parquet", raw("segments/000001.parquet", lambda _: b"")),
-    "part named": (
+    "plan of others": text(PLAN, "random/", "annealing/"),
+    "plan of other targets": text(PLAN, "in-000", "in-999"),
+    "plan without ids": raw(PLAN, lambda _: b"one\ntwo\n"),
+    "plan twice": lines(PLAN, lambda ls: [*ls, ls[0]]),
+    "plan shortened": lines(PLAN, lambda ls: ls[:-1]),
+    "plan bytes": raw(PLAN, lambda data: data + b"\xff"),
+    "part cut": raw(PART, lambda d: d[:-7]),
+    "part empty": raw(PART, lambda _: b""),
+    "part named": Damage(
         "segments/old.parquet",
         lambda f: shutil.copy(f / "segments/000001.parquet", f / "segments/old.parquet"),
     ),
-    "part twice": (
+    "part twice": Damage(
         "segments/000009.parquet",
         lambda f: shutil.copy(f / "segments/000001.parquet", f / "segments/000009.parquet"),
     ),
@@ -235,16 +248,16 @@ HALF = {
 
 
 def statuses(change):
-    """Return the damaged segment file and a function that changes its statuses."""
+    """Return a function that changes the statuses in a segment file."""
 
     def damage(folder):
-        path = folder / "segments" / "000001.parquet"
+        path = folder / PART
         table = parquet.read_table(path)
         held = json.loads(table.schema.metadata[b"statuses"])
         table = table.replace_schema_metadata({"statuses": json.dumps(change(held))})
         parquet.write_table(table, path)
 
-    return "segments/000001.parquet", damage
+    return Damage(PART, damage)
 
 
 def change_status(**changes):
@@ -265,11 +278,10 @@ HALF |= {
     "statuses no list": statuses(lambda _: {"a": 1}),
     "status without a column": statuses(lambda held: [[0, {"run": "x"}]]),
 }
-PART = "segments/000001.parquet"
 ROWS_OF_PARTS = {
-    "part without a column": (PART, rows(lambda f: f.drop(columns="loss"), PART)),
-    "part without a run": (PART, rows(lambda f: f[f["run"] != f["run"][0]], PART)),
-    "part with other k": (PART, rows(lambda f: f.assign(k=f["k"] * 2), PART)),
-    "part without an end": (PART, rows(lambda f: f.drop(index=3), PART)),
-    "part with text": (PART, rows(lambda f: f.assign(loss="x"), PART)),
+    "part without a column": rows(lambda f: f.drop(columns="loss"), PART),
+    "part without a run": rows(lambda f: f[f["run"] != f["run"][0]], PART),
+    "part with other k": rows(lambda f: f.assign(k=f["k"] * 2), PART),
+    "part without an end": rows(lambda f: f.drop(index=3), PART),
+    "part with text": rows(lambda f: f.assign(loss="x"), PART),
 }

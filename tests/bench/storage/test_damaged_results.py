@@ -1,8 +1,6 @@
 """Tests of damaged result folders: each reader gives one line that names the file."""
 
 import shutil
-from contextlib import redirect_stderr
-from io import StringIO
 
 import pandas as pd
 import pyarrow as pa
@@ -28,7 +26,6 @@ from bench.benchmark.storage.table_schemas import (
     expand_columns,
 )
 from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as OF_SHOTS
-from bench.cli.main import main
 from sims.core.simulator import InputError
 from tests.bench.storage.damaged_files import (
     BOTH,
@@ -41,10 +38,12 @@ from tests.bench.storage.damaged_files import (
     both,
     cell,
     column,
+    gone,
     lines,
     rows,
     text,
 )
+from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import spring_experiment
 
@@ -70,19 +69,14 @@ def folders(tmp_path_factory, spring):
 
 
 def by_api(folder):
-    """Read the runs with the Python API; return exit code and message like a command."""
-    try:
+    """Read the runs with the Python API; return the message like a command."""
+    with pytest.raises(InputError) as caught:
         ComparisonResult(folder).runs  # noqa: B018
-    except InputError as error:
-        return 2, f"simgap: {error}\n"
-    return 0, ""
+    return f"simgap: {caught.value}\n"
 
 
 def command(*arguments):
-    errors = StringIO()
-    with redirect_stderr(errors):
-        code = main(list(map(str, arguments)))
-    return code, errors.getvalue()
+    return run_command(*arguments, code=2).err
 
 
 COMMANDS = {
@@ -100,8 +94,7 @@ def damaged(folders, kind, damage, tmp_path):
     return tmp_path / kind
 
 
-def is_one_line(code, message, folder, name):
-    assert code == 2, message
+def is_one_line(message, folder, name):
     assert message.count("\n") == 1
     assert message[:-1].isprintable(), message
     assert 20 < len(message) < 900, message
@@ -112,29 +105,29 @@ def is_one_line(code, message, folder, name):
 
 @pytest.mark.parametrize("damage", [*DONE, *BOTH])
 def test_a_damaged_folder_is_one_line_that_names_the_file(damage, folders, tmp_path):
-    name, act = (DONE | BOTH)[damage]
+    act = (DONE | BOTH)[damage]
     folder = damaged(folders, "done", act, tmp_path)
     before = sorted(path.name for path in folder.iterdir())
     for who, does in COMMANDS.items():
         # On resume, an edited experiment.toml is reported as a change, and the folder is named.
-        changed = who == "resume" and name in ("experiment.toml",)
-        is_one_line(*does(folder), folder, "" if changed else name)
+        changed = who == "resume" and act.file == "experiment.toml"
+        is_one_line(does(folder), folder, "" if changed else act.file)
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
 @pytest.mark.parametrize("damage", [*HALF, *BOTH])
 def test_so_is_one_that_is_under_way(damage, folders, tmp_path):
-    name, act = (HALF | BOTH)[damage]
+    act = (HALF | BOTH)[damage]
     folder = damaged(folders, "half", act, tmp_path)
     for who in ("status", "resume"):
-        is_one_line(*COMMANDS[who](folder), folder, name)
+        is_one_line(COMMANDS[who](folder), folder, act.file)
 
 
 @pytest.mark.parametrize("damage", ROWS_OF_PARTS)
 def test_rows_of_a_part_are_checked_before_more_are_made(damage, folders, tmp_path):
-    name, act = ROWS_OF_PARTS[damage]
+    act = ROWS_OF_PARTS[damage]
     folder = damaged(folders, "half", act, tmp_path)
-    is_one_line(*COMMANDS["resume"](folder), folder, name)
+    is_one_line(COMMANDS["resume"](folder), folder, act.file)
     again = RunJournal(folder)  # the folder is not locked
     again.close()
 
@@ -169,34 +162,33 @@ def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path
     )
 
 
-def test_results_of_one_that_is_under_way_are_written_again_by_resuming(folders, tmp_path, capsys):
+def test_results_of_one_that_is_under_way_are_written_again_by_resuming(folders, tmp_path):
     folder = damaged(folders, "half", lambda _: None, tmp_path)
     for name in (PARQUET, STATUS_CSV, "training.csv"):
         shutil.copy(folders / "done" / name, folder / name)
     assert len(read_comparison(folder).statuses) == 12
     (folder / STATUS_CSV).write_bytes(b"\xff")
-    code, read_damaged = COMMANDS["plot"](folder)
-    assert (code, read_damaged.count("\n")) == (2, 1)
-    assert f"write it again with simgap compare --resume {folder}" in read_damaged
-    assert main(["status", str(folder)]) == 1, "its results are not written"
-    assert "12 of 12 runs finished\n" in capsys.readouterr().out
+    message = COMMANDS["plot"](folder)
+    assert message.count("\n") == 1
+    assert f"write it again with simgap compare --resume {folder}" in message
+    # Its results are not written.
+    assert "12 of 12 runs finished\n" in run_command("status", folder, code=1).out
     comparison = Comparison.resume(folder)
     assert comparison.run(jobs=0).is_complete
     assert len(read_checked_comparison(folder).statuses) == 12
 
 
-def test_without_a_plan_nothing_is_complete(folders, tmp_path, capsys):
-    folder = damaged(folders, "half", lambda f: (f / PLAN).unlink(), tmp_path)
-    assert main(["status", str(folder)]) == 1
-    assert "complete" not in capsys.readouterr().out
+def test_without_a_plan_nothing_is_complete(folders, tmp_path):
+    folder = damaged(folders, "half", gone(PLAN), tmp_path)
+    assert "complete" not in run_command("status", folder, code=1).out
     begun = Comparison.resume(folder)
     begun.close()
     assert len(read_plan(folder)) == 12
 
 
 def test_a_damaged_part_that_was_deleted_is_made_again(folders, tmp_path):
-    folder = damaged(folders, "half", lambda f: (f / "segments/000002.parquet").unlink(), tmp_path)
-    assert main(["status", str(folder)]) == 1
+    folder = damaged(folders, "half", gone("segments/000002.parquet"), tmp_path)
+    run_command("status", folder, code=1)
     comparison = Comparison.resume(folder)
     assert len(comparison.results.run_sink.statuses) == 7
     assert comparison.run(jobs=0).is_complete
@@ -215,7 +207,7 @@ def test_tuners_that_were_skipped_have_no_rows(folders, tmp_path):
     )
     parquet.write_table(pa.table({}), folder / PARQUET)
     assert read_comparison(folder).runs.empty
-    assert main(["status", str(folder)]) == 0
+    run_command("status", folder)
 
 
 def test_a_column_that_older_folders_lack_has_its_default(folders, tmp_path):
