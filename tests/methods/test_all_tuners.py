@@ -13,7 +13,15 @@ from methods.tuners.entropy_search import EntropySearch
 from methods.tuners.least_squares import LeastSquares
 from methods.tuners.nelder_mead import NelderMead
 from methods.tuners.random_search import RandomSearch
-from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, problem, run, smooth
+from tests.methods.analytic_problems import (
+    START,
+    TRUE_PARAMETERS,
+    decays,
+    errors,
+    problem,
+    run,
+    smooth,
+)
 
 TUNERS = [
     RandomSearch(),
@@ -43,6 +51,30 @@ def test_starts_at_the_start(tuner: Tuner) -> None:
         assert (run(tuner, *smooth(dim, 1)).proposals[0] == START[:dim]).all()
 
 
+@pytest.mark.parametrize(
+    ("tuner", "dim", "budget", "error", "seeds"),
+    [
+        (BayesianOptimisation(), 1, 20, 1.5e-2, 1),
+        (BayesianOptimisation(), 2, 35, 3e-2, 1),
+        (CMAES(), 1, 200, 1e-3, 5),
+        (CMAES(), 2, 300, 1e-3, 5),
+        (CMAES(), 5, 1000, 1e-2, 5),
+        (EntropySearch(), 2, 40, 2e-2, 3),
+        (LeastSquares(), 1, 10, 1e-8, 1),
+        (LeastSquares(), 2, 14, 1e-8, 1),
+        (LeastSquares(), 5, 35, 1e-8, 1),
+        (NelderMead(), 1, 40, 1e-6, 1),
+        (NelderMead(), 2, 120, 1e-6, 1),
+        (NelderMead(), 5, 600, 1e-4, 1),
+    ],
+    ids=lambda value: getattr(value, "name", str(value)),
+)
+def test_converges(tuner: Tuner, dim: int, budget: int, error: float, seeds: int) -> None:
+    truth, start = TRUE_PARAMETERS[:dim], START[:dim]
+    ends = [errors(tuner, decays, truth, start, budget, seed)[-1] for seed in range(seeds)]
+    assert np.median(ends) < error
+
+
 @each
 def test_another_seed_is_another_run_where_the_tuner_says_so(tuner: Tuner) -> None:
     budget = 14 if tuner.name in {"bayes", "entropy_search"} else 60
@@ -66,17 +98,10 @@ def test_failed_simulations_are_survived(tuner: Tuner) -> None:
 
 @each
 def test_flat_loss_is_survived(tuner: Tuner) -> None:
-    trace = run(
-        tuner,
-        *problem(
-            lambda theta: np.ones((9, 1)),
-            TRUE_PARAMETERS[:1],
-            START[:1],
-            30,
-            observed=np.zeros((9, 1)),
-        ),
+    task, evaluate = problem(
+        lambda theta: np.ones((9, 1)), TRUE_PARAMETERS[:1], START[:1], 30, np.zeros((9, 1))
     )
-    assert len(trace.losses) >= 2
+    assert len(run(tuner, task, evaluate).losses) >= 2
 
 
 @each

@@ -7,7 +7,7 @@ from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern
 from skopt.utils import cook_estimator
 
 from methods.tuners.bayesian_optimisation import BayesianOptimisation
-from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, errors, run, smooth
+from tests.methods.analytic_problems import START, run, smooth
 
 
 @pytest.mark.parametrize("dim", [1, 3])
@@ -44,20 +44,6 @@ def test_process_is_that_of_gp_minimize() -> None:
     assert kernel.k2.nu == 2.5
     assert optimiser.base_estimator_.noise == "gaussian"
     assert optimiser.acq_optimizer == "lbfgs"
-
-
-@pytest.mark.parametrize(("dim", "budget", "error"), [(1, 20, 1.5e-2), (2, 35, 3e-2)])
-def test_converges(dim: int, budget: int, error: float) -> None:
-    assert (
-        errors(BayesianOptimisation(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1]
-        < error
-    )
-
-
-def test_first_points_fill_the_interval() -> None:
-    first = np.sort(run(BayesianOptimisation(), *smooth(1, 5)).proposals[1:, 0])
-    assert np.diff(first).max() < 0.55
-    assert np.diff(first).min() > 0.1
 
 
 def test_repeated_points_are_not_reported_as_warnings() -> None:

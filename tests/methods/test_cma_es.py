@@ -8,8 +8,6 @@ from methods.tuners.cma_es import CMAES
 from tests.methods.analytic_problems import (
     START,
     TRUE_PARAMETERS,
-    decays,
-    errors,
     problem,
     run,
     smooth,
@@ -40,21 +38,6 @@ def test_proposes_what_the_bare_library_proposes(population: int | None) -> None
     cma.fmin2(objective, START[:3], 0.25, options, eval_initial_x=True)
     trace = run(CMAES(population=population), task, evaluate, seed=7)
     assert np.array_equal(trace.proposals[:180], bare[:180])
-
-
-@pytest.mark.parametrize(
-    ("dim", "budget", "error"), [(1, 200, 1e-3), (2, 300, 1e-3), (5, 1000, 1e-2)]
-)
-def test_converges(dim: int, budget: int, error: float) -> None:
-    assert (
-        np.median(
-            [
-                errors(CMAES(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget, s)[-1]
-                for s in range(5)
-            ]
-        )
-        < error
-    )
 
 
 def test_a_single_parameter_is_simulated_alone() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from methods.tuners.direct_regressor import DirectRegressor
-from tests.methods.test_tunenet import Toy, run
+from tests.methods.test_tunenet import Toy, check_state, run
 
 
 @pytest.fixture(scope="module")
@@ -25,27 +25,16 @@ def test_estimates_from_the_target_alone_and_simulates_once(fitted):
 
 
 def test_the_start_does_not_matter(fitted):
-    from dataclasses import replace
-
-    from methods.tuner import Task
-
-    toy = Toy()
-    observed = toy.observe(np.array([[0.4]]), [1.5])[0]
-    task = Task(1, np.zeros(1), observed, np.ones(2), toy.training, 5, toy.lengths)
-    asked = [
-        next(fitted.tune(t, np.random.default_rng(0))).points
-        for t in (task, replace(task, start=np.ones(1)))
-    ]
+    observed = Toy().observe(np.array([[0.4]]), [1.5])[0]
+    tasks = [Toy().task(observed, start=np.full(1, start)) for start in (0.0, 1.0)]
+    asked = [next(fitted.tune(task, np.random.default_rng(0))).points for task in tasks]
     assert np.array_equal(*asked)
     assert asked[0] == pytest.approx(0.4, abs=0.02)
 
 
 def test_state_round_trip(fitted):
-    copy = DirectRegressor(points=60)
-    copy.restore(fitted.state())
-    assert np.array_equal(run(copy, Toy(), 3)[0].proposals, run(fitted, Toy(), 3)[0].proposals)
-    with pytest.raises(ValueError, match="expected"):
-        copy.restore({"limit": np.zeros(1)})
+    faulty = {"limit": np.zeros(1)}
+    check_state(fitted, fitted.state(), DirectRegressor(points=60), faulty, toy=Toy())
     with pytest.raises(RuntimeError, match="not been trained"):
         next(DirectRegressor().tune(None, np.random.default_rng(0)))
 

@@ -77,14 +77,6 @@ def test_default_is_not_bounded_by_a_grid() -> None:
     assert run(EntropySearch(), *smooth(1, 30)).status == "done"
 
 
-def test_converges_in_two_dimensions() -> None:
-    found = [
-        errors(EntropySearch(), decays, TRUE_PARAMETERS[:2], START[:2], 40, seed)[-1]
-        for seed in range(3)
-    ]
-    assert np.median(found) < 2e-2
-
-
 def test_spread_points_are_even() -> None:
     def gap(points: Array) -> float:
         return float(np.diff(np.sort(points[:, 0])).max())

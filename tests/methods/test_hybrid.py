@@ -117,14 +117,12 @@ def test_complement_is_orthonormal():
 
 def test_everything_fails_and_it_still_uses_its_budget(two):
     toy = Toy(2, runs=3)
-    toy.observe = lambda points, scenario: np.full((len(points), 180, 2), np.nan)
-    task = Task(2, np.full(2, 0.5), np.zeros((180, 2)), np.ones(2), TRAINING[2], 9, (60, 60, 60))
-    trace = drive_tuner(
-        two,
-        task,
-        lambda p: (toy.observe(p, None), np.full(len(p), np.inf)),
-        np.random.default_rng(0),
-    )
+    task = toy.task(np.zeros((180, 2)), start=np.full(2, 0.5))
+
+    def fail(points):
+        return np.full((len(points), 180, 2), np.nan), np.full(len(points), np.inf)
+
+    trace = drive_tuner(two, task, fail, np.random.default_rng(0))
     assert trace.status == "diverged"
     assert trace.reason.startswith("none of 9 simulations has a finite loss")
     assert len(trace.losses) == 9

@@ -19,11 +19,6 @@ from tests.methods.analytic_problems import (
 PLAIN = LeastSquares(horizons=(1.0,), secant=False, difference=1e-6, damping=1e-12, restart=False)
 
 
-@pytest.mark.parametrize(("dim", "budget"), [(1, 10), (2, 14), (5, 35)])
-def test_converges(dim: int, budget: int) -> None:
-    assert errors(LeastSquares(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1] < 1e-8
-
-
 @pytest.mark.parametrize("dim", [1, 2, 5])
 def test_convergence_is_quadratic_with_finite_differences(dim: int) -> None:
     found = errors(PLAIN, decays, TRUE_PARAMETERS[:dim], START[:dim], 6 * (dim + 1))

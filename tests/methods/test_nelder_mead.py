@@ -9,8 +9,6 @@ from methods.tuners.nelder_mead import NelderMead
 from tests.methods.analytic_problems import (
     START,
     TRUE_PARAMETERS,
-    decays,
-    errors,
     problem,
     run,
     smooth,
@@ -33,13 +31,6 @@ def test_proposes_what_the_bare_library_proposes(dim: int) -> None:
     optimiser.set_maxeval(60)
     optimiser.optimize(START[:dim])
     assert (run(NelderMead(), task, evaluate).proposals == np.array(bare)).all()
-
-
-@pytest.mark.parametrize(
-    ("dim", "budget", "error"), [(1, 40, 1e-6), (2, 120, 1e-6), (5, 600, 1e-4)]
-)
-def test_converges(dim: int, budget: int, error: float) -> None:
-    assert errors(NelderMead(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1] < error
 
 
 def test_initial_step_is_nlopts() -> None:

@@ -53,6 +53,14 @@ class Toy:
     def observe(self, points, scenario):
         return np.concatenate([swing(points, amplitude) for amplitude in scenario], axis=1)
 
+    def task(self, observed, scenario=None, start=None, budget=9):
+        """Return the task to find the parameters of an observation, from zero by default."""
+        start = np.zeros(self.dim) if start is None else start
+        scene = self.scene if scenario is None else self.known(scenario)
+        return Task(
+            self.dim, start, observed, self.scale, self.training, budget, self.lengths, scene
+        )
+
     def simulate(self, rng, points):
         assert (points >= self.training[0]).all()
         assert (points <= self.training[1]).all()
@@ -73,9 +81,7 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
     observed = toy.observe(truth[None], scenario)[0]
     if spoil is not None:
         spoil(observed)
-    task = Task(
-        toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths, toy.known(scenario)
-    )
+    task = toy.task(observed, scenario, start, budget)
 
     def evaluate(points):
         seen = toy.observe(points, scenario)
@@ -148,9 +154,7 @@ def test_a_noisy_target_is_left_to_the_network_that_knows_noise(one):
         observed += 0.01 * noise.standard_normal(observed.shape)
 
     assert errors(one, Toy(), spoil=spoil)[10] < 0.01
-    task = Task(
-        1, np.zeros(1), swing(np.full((1, 1), 0.9), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)
-    )
+    task = Toy().task(swing(np.full((1, 1), 0.9), 1.5)[0])
     assert one._fitted.select_for(task) is one._fitted.clean
     spoil(task.observed)
     assert one._fitted.select_for(task) is one._fitted.noisy
@@ -218,10 +222,7 @@ def test_published_is_clamped_at_zero_only_and_does_not_settle():
         Toy().observe(np.array([[0.5]]), [1.5]), (60,)
     )[0]
     assert np.abs(tuner._fitted.clean.predict_difference(seen, seen)).max() > 1e-6
-    steps = tuner.tune(
-        Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
-        None,
-    )
+    steps = tuner.tune(Toy().task(swing(np.ones((1, 1)), 1.5)[0]), None)
     next(steps)
     tuner._fitted.clean.weights["output.bias"] = np.full(1, 9.0)
     assert steps.send(evaluation(0.9))[0] > 1.5
@@ -267,31 +268,37 @@ def test_same_seed_gives_the_same_weights_and_touches_no_global_state(request):
     assert threads == torch.get_num_threads()
 
 
+def check_state(tuner, state, copy, *faulty_states, toy, match="expected", **options):
+    """Check that a copy with this state acts as the tuner, and that it refuses faulty states."""
+    copy.restore(state)
+    first, again = (run(one, toy, 4, **options)[0] for one in (tuner, copy))
+    np.testing.assert_array_equal(first.proposals, again.proposals)
+    np.testing.assert_array_equal(first.recommendations, again.recommendations)
+    for faulty in faulty_states:
+        with pytest.raises(ValueError, match=match):
+            copy.restore(faulty)
+
+
 def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
     np.savez(tmp_path / "state.npz", **one.state())
     with np.load(tmp_path / "state.npz", allow_pickle=False) as stored:
         state = dict(stored)
-    copy = TuneNet(scenarios=40, points=60)
-    copy.restore(state)
-    assert np.array_equal(run(copy, Toy(), 4)[0].proposals, run(one, Toy(), 4)[0].proposals)
-    for broken in (
+    check_state(
+        one,
+        state,
+        TuneNet(scenarios=40, points=60),
         {k: v for k, v in state.items() if k != "clean.joined.bias"},
         {**state, "extra": np.zeros(1)},
         {**state, "noisy.joined.weight": state["noisy.joined.weight"].T},
         {k: v for k, v in state.items() if not k.startswith("noisy")},
         {k: v for k, v in state.items() if k != "limit"},
         {**state, "clean.output.bias": np.array([np.nan])},
-    ):
-        with pytest.raises(ValueError, match="expected"):
-            copy.restore(broken)
+        toy=Toy(),
+    )
     with pytest.raises(ValueError, match="train on"):
         one._fitted.clean.features.observation_features(np.zeros((1, 60, 1)), (60,))
     with pytest.raises(RuntimeError, match="not been trained"):
-        next(
-            TuneNet().tune(
-                Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 1, (1,)), None
-            )
-        )
+        next(TuneNet().tune(Toy().task(np.zeros((60, 2))), None))
 
 
 def test_weight_decay_is_that_of_equation_1():
@@ -364,7 +371,7 @@ def test_inputs_prefer_what_follows_the_parameters():
 
 def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
     matrix, root = np.array([[-0.6, 0.2], [0.1, -1.5]]), np.array([0.4, 0.7])
-    task = Task(2, np.array([0.1, 0.9]), np.zeros((1, 1)), np.ones(1), TRAINING[2], 9, (1,))
+    task = Toy(2).task(np.zeros((1, 1)), start=np.array([0.1, 0.9]))
     search, guess = BroydenSearch(task), task.start
     distances = []
     for _ in range(6):
@@ -375,17 +382,14 @@ def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
 
 
 def test_search_survives_a_failed_simulation():
-    search = BroydenSearch(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
+    search = BroydenSearch(Toy().task(np.zeros((1, 1))))
     assert search.propose_next(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
     assert search.propose_next(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
     assert search.propose_next(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])
 
 
 def test_failed_simulation_is_no_evidence(one):
-    steps = one.tune(
-        Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
-        None,
-    )
+    steps = one.tune(Toy().task(swing(np.ones((1, 1)), 1.5)[0]), None)
     next(steps)
     failed = evaluation(0.0)._replace(observations=np.full((1, 60, 2), np.nan))
     assert steps.send(failed).recommend.tolist() == [
@@ -400,9 +404,4 @@ def test_torch_stays_out_until_it_trains(one):
         "import methods.tuners.tunenet, methods.tuners.direct_regressor, sys; "
         "print('torch' in sys.modules)"
     )
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        == "False\n"
-    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "False\n"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from methods.tuner import ScenarioInfo, Task
+from methods.tuner import ScenarioInfo
 from methods.tuners.tunenet_vision import TuneNetVision
-from tests.methods.test_tunenet import Toy, errors, run
+from tests.methods.test_tunenet import Toy, check_state, errors
 
 
 class Filmed(Toy):
@@ -56,16 +56,7 @@ def test_gaps_are_bridged_by_the_proposed_model(tuner):
     target[:, 0] = np.nan
 
     def off(observed):
-        task = Task(
-            1,
-            np.full(1, 0.4),
-            observed,
-            toy.scale,
-            toy.training,
-            9,
-            toy.lengths,
-            toy.known(scenario),
-        )
+        task = toy.task(observed, scenario, start=np.full(1, 0.4))
         return abs(
             tuner.get_trained_network()
             .select_for(task)
@@ -84,16 +75,7 @@ def test_sides_read_their_own_channels(tuner):
     target, proposed = (toy.observe(np.array([[value]]), scenario) for value in (0.6, 0.4))
 
     def estimate(seen, shown):
-        task = Task(
-            1,
-            np.full(1, 0.4),
-            seen[0],
-            toy.scale,
-            toy.training,
-            9,
-            toy.lengths,
-            toy.known(scenario),
-        )
+        task = toy.task(seen[0], scenario, start=np.full(1, 0.4))
         return tuner.get_trained_network().select_for(task).make_estimator(task)(shown)[0]
 
     blind, deaf = target.copy(), proposed.copy()
@@ -105,11 +87,8 @@ def test_sides_read_their_own_channels(tuner):
 
 
 def test_state_survives_a_round_trip(tuner):
-    again = TuneNetVision(scenarios=150, points=60, epochs=150)
-    again.restore(tuner.state())
-    first, second = (run(t, Filmed(), 3, spoil=hide)[0].recommendations for t in (tuner, again))
-    assert first.tolist() == second.tolist()
-    for name in ("clean.own-inputs.gain", "clean.own-inputs.centre", "clean.inputs.gain"):
-        lacking = {k: v for k, v in tuner.state().items() if k != name}
-        with pytest.raises(ValueError, match="inputs"):
-            TuneNetVision(scenarios=150, points=60).restore(lacking)
+    names = ("clean.own-inputs.gain", "clean.own-inputs.centre", "clean.inputs.gain")
+    lacking = [{k: v for k, v in tuner.state().items() if k != name} for name in names]
+    copy = TuneNetVision(scenarios=150, points=60, epochs=150)
+    options = {"toy": Filmed(), "match": "inputs", "spoil": hide}
+    check_state(tuner, tuner.state(), copy, *lacking, **options)
