@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -36,7 +35,6 @@ BACKENDS = {
     "matplotlib.backends.backend_svg",
 }
 """Modules of Matplotlib that are needed only for vector graphics and notebooks."""
-ROOT = Path(__file__).resolve().parents[3]
 RUN = """
 import json, sys
 import bench.cli.main
@@ -78,9 +76,8 @@ def test_explain_loads_no_package_that_it_does_not_need(swing, tmp_path):
     }  # fmt: skip
 
 
-def test_explain_of_a_robot_loads_mujoco_but_no_other_large_package(tmp_path):
-    log = ROOT / "examples/robot/log.csv"
-    modules = loaded("explain", log, "--jobs", 1, "--out", tmp_path / "out")
+def test_explain_of_a_robot_loads_mujoco_but_no_other_large_package(arm_log, tmp_path):
+    modules = loaded("explain", arm_log, "--jobs", 1, "--out", tmp_path / "out")
     assert modules >= ROBOTS
     assert modules & (HEAVY | BACKENDS) == {"mujoco"}
 

@@ -31,17 +31,6 @@ FOUND = {
 }
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("arm")
-    lines = (EXAMPLE / "log.csv").read_text().splitlines()
-    (folder / "log.csv").write_text("\n".join(lines[:401]) + "\n")
-    text = (EXAMPLE / "log.toml").read_text().split("[runs.5]")[0]
-    (folder / "log.toml").write_text(text)
-    (folder / "arm2.xml").write_text((EXAMPLE / "arm2.xml").read_text())
-    return folder / "log.csv"
-
-
 def build_sheet(log: Path, joint: str) -> SheetContent:
     recording, kind = load_joined([log])
     return build_datasheet(
@@ -53,8 +42,8 @@ def row(sheet: SheetContent, name: str) -> SheetRow:
     return next(row for row in sheet.rows if row.name == name)
 
 
-def test_what_was_found_is_added_to_what_the_file_states(log: Path) -> None:
-    sheet = build_sheet(log, "elbow")
+def test_what_was_found_is_added_to_what_the_file_states(arm_log: Path) -> None:
+    sheet = build_sheet(arm_log, "elbow")
     drag = row(sheet, "drag.linear@elbow")
     assert drag.stated == pytest.approx(0.1)
     assert drag.number is not None
@@ -74,8 +63,8 @@ def test_what_was_found_is_added_to_what_the_file_states(log: Path) -> None:
     assert list(sheet.elsewhere()) == ["gravity.scale"]
 
 
-def test_what_may_be_nothing_at_a_joint_of_a_family_is_not_shown_there(log: Path) -> None:
-    friction = row(build_sheet(log, "shoulder"), "friction.coulomb@shoulder")
+def test_what_may_be_nothing_at_a_joint_of_a_family_is_not_shown_there(arm_log: Path) -> None:
+    friction = row(build_sheet(arm_log, "shoulder"), "friction.coulomb@shoulder")
     assert friction.state == "not shown"
     assert friction.detection_limit is not None
     assert friction.detection_limit.size == pytest.approx(0.004)

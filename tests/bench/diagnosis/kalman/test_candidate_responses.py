@@ -1,27 +1,19 @@
 """Tests of the filter of a model whose parameters differ from those of a known filter."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns, _linearise_run
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
-from bench.logs.recording_loading import load_joined
-
-LOG = Path(__file__).parents[4] / "examples/robot/log.csv"
 
 
 @pytest.fixture(scope="module")
-def followed():
+def followed(example_arm):
     """Return two runs of the example robot, followed with its model file."""
-    recording, kind = load_joined([LOG])
-    evaluator = RunEvaluator(kind, recording, recording.runs[:2], engine=None)
     noise = NoiseModel(np.full(2, 0.001), np.zeros(2))
-    return FollowedRuns.follow(evaluator, evaluator.get_nominal_theta(), noise)
+    return FollowedRuns.follow(example_arm, example_arm.get_nominal_theta(), noise)
 
 
 def with_effect(followed, name, coefficient):

@@ -1,13 +1,10 @@
 """Tests of the linear model about a measured motion against simulations with an effect."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.recording_loading import load_joined
 from sims.robot.dynamics.linearisation_about_recording import (
     MeasuredLinear,
     Trajectory,
@@ -15,8 +12,6 @@ from sims.robot.dynamics.linearisation_about_recording import (
 )
 from sims.robot.dynamics.linearisation_about_simulation import compute_control_changes
 from sims.robot.floating_joints import FloatingState
-
-EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 
 EFFECTS = {
     "drag.linear@elbow": (0.02,),
@@ -28,55 +23,49 @@ EFFECTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def evaluator():
-    recording, kind = load_joined([EXAMPLE], None, None, ())
-    return RunEvaluator(kind, recording, recording.training()[:2], kind.default_engine)
-
-
-def theta_of(evaluator, name, c):
-    theta = evaluator.get_nominal_theta()
-    theta[evaluator.coefficient_slices[name]] = c
+def theta_of(example_arm, name, c):
+    theta = example_arm.get_nominal_theta()
+    theta[example_arm.coefficient_slices[name]] = c
     return theta
 
 
-def start_of(evaluator, run=0):
+def start_of(example_arm, run=0):
     """Return the first positions and velocities of a run."""
-    return np.split(evaluator.initial_state_guesses[run], 2)
+    return np.split(example_arm.initial_state_guesses[run], 2)
 
 
-def follow(evaluator, theta=None, run=0, start=None, trajectory=None):
+def follow(example_arm, theta=None, run=0, start=None, trajectory=None):
     """Return the linear model about a motion, by default the one that is simulated from a start."""
-    theta = evaluator.get_nominal_theta() if theta is None else theta
-    start = start_of(evaluator, run) if start is None else start
-    scenario = evaluator.prepared_runs[run].scenario
-    return MeasuredLinear(evaluator.simulator, theta, scenario, start, trajectory)
+    theta = example_arm.get_nominal_theta() if theta is None else theta
+    start = start_of(example_arm, run) if start is None else start
+    scenario = example_arm.prepared_runs[run].scenario
+    return MeasuredLinear(example_arm.simulator, theta, scenario, start, trajectory)
 
 
-def motion_with(evaluator, theta):
+def motion_with(example_arm, theta):
     """Return the linear model about the motion simulated with these parameters."""
-    x, v, _ = follow(evaluator, theta).trajectory
+    x, v, _ = follow(example_arm, theta).trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
-    return follow(evaluator, trajectory=Trajectory(x, v, nothing))
+    return follow(example_arm, trajectory=Trajectory(x, v, nothing))
 
 
-def added(linear, evaluator, name, c):
+def added(linear, example_arm, name, c):
     """Return the force and readings that an effect adds about the motion, at zero deviation."""
-    size = 2 * (len(evaluator.state_names) // 2)
+    size = 2 * (len(example_arm.state_names) // 2)
     return linear.added(
-        [(evaluator.available_effects[name], c)], np.zeros((linear.knots.size, size))
+        [(example_arm.available_effects[name], c)], np.zeros((linear.knots.size, size))
     )
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(evaluator, name):
+def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(example_arm, name):
     """Eq. (3) of `linearisation_about_recording` with δ = 0: the defects are Σ c b."""
     c = np.array(EFFECTS[name])
-    linear = motion_with(evaluator, theta_of(evaluator, name, c))
+    linear = motion_with(example_arm, theta_of(example_arm, name, c))
     maps = linear.interval_maps()
-    pushed, _ = added(linear, evaluator, name, c)
+    pushed, _ = added(linear, example_arm, name, c)
     expected = (maps.inputs @ pushed)[:, :, 0]
-    joints = len(evaluator.state_names) // 2
+    joints = len(example_arm.state_names) // 2
     # Only velocities are compared: the model uses the mean force, which moves positions
     # differently.
     found, wanted = maps.defects[:, joints:], expected[:, joints:]
@@ -84,60 +73,62 @@ def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(evaluator, na
     assert error < 0.02, f"{name}: {error:.3f}"
 
 
-def test_without_an_effect_nothing_is_missed(evaluator):
-    maps = motion_with(evaluator, evaluator.get_nominal_theta()).interval_maps()
+def test_without_an_effect_nothing_is_missed(example_arm):
+    maps = motion_with(example_arm, example_arm.get_nominal_theta()).interval_maps()
     assert np.abs(maps.defects).max() < 1e-9
 
 
-def test_a_sensor_effect_changes_readings_alone(evaluator):
-    linear = motion_with(evaluator, evaluator.get_nominal_theta())
-    pushed, readings = added(linear, evaluator, "sensor.bias@q.elbow", np.array([0.01]))
-    column = evaluator.channels.index("q.elbow")
+def test_a_sensor_effect_changes_readings_alone(example_arm):
+    linear = motion_with(example_arm, example_arm.get_nominal_theta())
+    pushed, readings = added(linear, example_arm, "sensor.bias@q.elbow", np.array([0.01]))
+    column = example_arm.channels.index("q.elbow")
     np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
     assert not pushed.any()
 
 
-def test_a_gain_of_a_sensor_acts_on_what_is_predicted(evaluator):
+def test_a_gain_of_a_sensor_acts_on_what_is_predicted(example_arm):
     """If the gain scaled the reading itself, it would explain the noise."""
-    linear = motion_with(evaluator, evaluator.get_nominal_theta())
-    predicted = np.zeros((linear.knots.size, 2 * (len(evaluator.state_names) // 2)))
-    elbow = evaluator.channels.index("q.elbow")
-    predicted[:, evaluator.simulator.system.coordinates.index("q.elbow")] = 0.2
+    linear = motion_with(example_arm, example_arm.get_nominal_theta())
+    predicted = np.zeros((linear.knots.size, 2 * (len(example_arm.state_names) // 2)))
+    elbow = example_arm.channels.index("q.elbow")
+    predicted[:, example_arm.simulator.system.coordinates.index("q.elbow")] = 0.2
     _, readings = linear.added(
-        [(evaluator.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted
+        [(example_arm.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted
     )
     wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
     np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
 
 
-def test_jacobians_of_other_commands_are_not_used_again(evaluator):
+def test_jacobians_of_other_commands_are_not_used_again(example_arm):
     """Delayed steps change between samples, so the model is evaluated at more times."""
-    scenario, start = evaluator.prepared_runs[0].scenario, start_of(evaluator)
+    scenario, start = example_arm.prepared_runs[0].scenario, start_of(example_arm)
     steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
     for values in steps.values():
         for sample in (3, 8, 14, 21, 29):
             values[sample:] += 0.06
     scenario = replace(scenario, inputs=steps)
-    nominal = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
-    delayed = theta_of(evaluator, "input.delay@m_shoulder", (0.013,))
+    nominal = MeasuredLinear(
+        example_arm.simulator, example_arm.get_nominal_theta(), scenario, start
+    )
+    delayed = theta_of(example_arm, "input.delay@m_shoulder", (0.013,))
     given = delayed, scenario, start, nominal.trajectory
-    anew = MeasuredLinear(evaluator.simulator, *given)
-    reused = MeasuredLinear(evaluator.simulator, *given, nearby=nominal)
+    anew = MeasuredLinear(example_arm.simulator, *given)
+    reused = MeasuredLinear(example_arm.simulator, *given, nearby=nominal)
     np.testing.assert_allclose(
         reused.interval_maps().defects, anew.interval_maps().defects, atol=1e-4
     )
 
 
-def test_maps_carry_a_deviation_as_the_simulator_does(evaluator):
+def test_maps_carry_a_deviation_as_the_simulator_does(example_arm):
     """Compare a state deviation mapped to the next sample with that of two simulations."""
-    linear = motion_with(evaluator, evaluator.get_nominal_theta())
+    linear = motion_with(example_arm, example_arm.get_nominal_theta())
     maps = linear.interval_maps()
-    half = len(evaluator.state_names) // 2
+    half = len(example_arm.state_names) // 2
     moved = 1e-5
-    base, (positions, velocities) = follow(evaluator), start_of(evaluator)
+    base, (positions, velocities) = follow(example_arm), start_of(example_arm)
     for column in range(half):
         other = positions + moved * np.eye(half)[column]
-        changed = follow(evaluator, start=(other, velocities))
+        changed = follow(example_arm, start=(other, velocities))
         for sample in (1, 4):
             step = base.knots[sample]
             x = (changed.trajectory.x[step] - base.trajectory.x[step]) / moved
@@ -165,14 +156,14 @@ def test_a_quintic_goes_through_values_and_derivatives():
     assert beyond[0] == pytest.approx(value[-1] + 0.2 * slope[-1])
 
 
-def test_control_changes_of_several_runs_are_those_of_each_run(evaluator):
-    linear = [follow(evaluator, run=run) for run in range(len(evaluator.prepared_runs))]
+def test_control_changes_of_several_runs_are_those_of_each_run(example_arm):
+    linear = [follow(example_arm, run=run) for run in range(len(example_arm.prepared_runs))]
     laws = ("input.lag@", "input.rate@")
-    names = [n for n in evaluator.library if n.startswith(laws) and not n.endswith("@*")]
+    names = [n for n in example_arm.library if n.startswith(laws) and not n.endswith("@*")]
     effects = [
         (
-            evaluator.available_effects[name],
-            np.full(len(evaluator.get_coefficient_indices(name)), 0.02),
+            example_arm.available_effects[name],
+            np.full(len(example_arm.get_coefficient_indices(name)), 0.02),
         )
         for name in names
     ]

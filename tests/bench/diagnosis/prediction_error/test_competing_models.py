@@ -1,22 +1,18 @@
 """Which effects are tried in place of another one."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import competing_models, single_effect_fits
 from bench.diagnosis.prediction_error.filters_with_effects import (
     FilteredSet,
     list_joint_model_effects,
 )
-from bench.logs.recording_loading import load_joined
 from sims.effects.drag import LinearDrag
 
-EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")
 
 
@@ -30,10 +26,8 @@ JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")
         ("mass.scale@upper_arm", "shoulder"),
     ],
 )
-def test_laws_of_the_same_joint_compete_with_an_effect(effect, joint):
-    recording, kind = load_joined([EXAMPLE], None, None, ())
-    evaluator = RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
-    assert list_joint_model_effects(evaluator, effect) == {f"{law}@{joint}" for law in JOINT_LAWS}
+def test_laws_of_the_same_joint_compete_with_an_effect(example_arm, effect, joint):
+    assert list_joint_model_effects(example_arm, effect) == {f"{law}@{joint}" for law in JOINT_LAWS}
 
 
 @pytest.mark.parametrize(("lowest_cost", "expected"), [(250.0, [1.25]), (450.0, [])])

@@ -1,23 +1,19 @@
 """The joints at which forces are missing decide which effects are fitted."""
 
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error import competing_models
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, get_only_joint
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
-from bench.logs.recording_loading import load_joined
 from tests.bench.diagnosis.arm_model import ARM
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
-EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 DAMPING = {"shoulder": 0.3, "elbow": 0.1}
 """Damping of the joints in the model file, N m s/rad."""
 RATES = (2.0, 2.7), (5.1, 4.3)
@@ -106,10 +102,8 @@ def test_wrong_dampings_of_two_joints_are_found(tmp_path):
         ("gravity.scale", None),
     ],
 )
-def test_most_effects_at_a_joint_act_there_alone(effect, joint):
-    recording, kind = load_joined([EXAMPLE], None, None, ())
-    evaluator = RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
-    assert get_only_joint(evaluator, effect) == joint
+def test_most_effects_at_a_joint_act_there_alone(example_arm, effect, joint):
+    assert get_only_joint(example_arm, effect) == joint
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,17 @@
 """Tests that first states of fitted runs are found again after a fit lost them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.validation.held_out_runs import find_first_states
-from bench.logs.recording_loading import load_joined
-
-EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
 
 
 @pytest.fixture(scope="module")
-def fitter():
-    recording, kind = load_joined([EXAMPLE], None, None, ())
-    evaluator = RunEvaluator(kind, recording, recording.training()[:2], kind.default_engine)
-    sigma = np.full(len(evaluator.channels), 1e-3)
-    yield TrajectoryFitter(evaluator, NoiseModel(sigma, np.zeros(sigma.size)))
-    evaluator.close()
+def fitter(example_arm):
+    return TrajectoryFitter(example_arm, NoiseModel(np.full(2, 1e-3), np.zeros(2)))
 
 
 def fit(fitter, states, iterations):
