@@ -6,27 +6,21 @@ from methods.tuner import Evaluation, Task
 from methods.tuners.hybrid import TuneNetLeastSquares, _compute_orthogonal_complement
 from methods.tuners.least_squares import EvaluationHistory, LeastSquares
 from methods.tuners.tunenet import TuneNet
-from tests.methods.test_tunenet import TRAINING, Toy, run
-
-
-def trained(toy, **options):
-    tuner = TuneNetLeastSquares(**{"scenarios": 40, "points": 60, "epochs": 100, **options})
-    tuner.fit(toy, np.random.default_rng(0), toy.budget)
-    return tuner
+from tests.methods import test_tunenet
+from tests.methods.test_tunenet import TRAINING, Toy
 
 
 @pytest.fixture(scope="module")
-def two():
-    return trained(Toy(2, runs=3), scenarios=80)
+def two(two):
+    """Return the trained network with least squares after it."""
+    tuner = TuneNetLeastSquares(points=60)
+    tuner.restore(two.state())
+    return tuner
 
 
-def errors(tuner, toy, budget=12, seeds=12, **kwargs):
-    rows = []
-    for seed in range(seeds):
-        trace, truth = run(tuner, toy, seed, budget=budget, **kwargs)
-        row = np.abs(trace.recommendations - truth).mean(axis=1)
-        rows.append(np.append(row, np.full(budget + 1 - len(row), row[-1])))
-    return np.mean(rows, axis=0)
+def errors(tuner, toy, budget=12, **options):
+    """Return the mean absolute error after each simulation, (budget + 1,)."""
+    return test_tunenet.errors(tuner, toy, range(12), budget, **options)
 
 
 def test_starts_as_the_network_and_ends_as_least_squares(two):
@@ -39,7 +33,8 @@ def test_starts_as_the_network_and_ends_as_least_squares(two):
 
 def test_finishes_where_the_network_is_wrong():
     """The network has one epoch on two scenarios, and targets are outside its training range."""
-    poor = trained(Toy(2, budget=16), scenarios=2, epochs=1)
+    poor = TuneNetLeastSquares(scenarios=2, points=60, epochs=1)
+    poor.fit(Toy(2, budget=16), np.random.default_rng(0), 16)
     alone = TuneNet(points=60)
     alone.restore(poor.state())
     assert errors(alone, Toy(2), budget=30, wide=True)[30] > 1e-3
