@@ -13,9 +13,14 @@ def swing():
     )  # fmt: skip
 
 
-def test_a_recording_is_explained_from_memory_as_from_its_file(swing, tmp_path):
+@pytest.fixture(scope="module")
+def explained(swing):
+    return simgap.explain(swing)
+
+
+def test_a_recording_is_explained_from_memory_as_from_its_file(swing, explained, tmp_path):
     swing.write(tmp_path / "swing.csv")
-    found = [simgap.explain(one) for one in (swing, swing.recording, tmp_path / "swing.csv")]
+    found = [explained, *map(simgap.explain, (swing.recording, tmp_path / "swing.csv"))]
     assert [one.verdict for one in found] == ["named"] * 3
     (cause,) = found[0].causes
     assert cause.effect == "drag.linear"
@@ -43,13 +48,12 @@ def test_what_a_cell_shows_is_one_line(swing):
     assert len(repr(swing)) < 200
 
 
-def test_the_extended_simulator_scores_and_simulates(swing, tmp_path):
-    found = simgap.explain(swing)
-    found.write(tmp_path / "out")
+def test_the_extended_simulator_scores_and_simulates(swing, explained, tmp_path):
+    explained.write(tmp_path / "out")
     swing.write(tmp_path / "swing.csv")
     errors = simgap.score(tmp_path / "out" / "extended.toml", tmp_path / "swing.csv")
     assert errors["normalised_rmse"] == pytest.approx(1.0, abs=0.1)
-    simulator = found.extended.simulator()
+    simulator = explained.extended.simulator()
     assert [p.name for p in simulator.parameters] == ["inertia", "drag.linear"]
 
 

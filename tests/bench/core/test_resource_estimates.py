@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pandas as pd
 import pytest
 import tomli_w
 
@@ -210,11 +211,10 @@ DESCRIPTION = 'system = "pendulum"\n[channels.q]\nunit = "rad"\n'
 def swing(folder, factor=1.0, gap=0.0, start=0.0, toml=DESCRIPTION, name="1"):
     """Write a recording of a swing; stamps are `start + factor * t`, with a gap after t = 0.6 s."""
     t = np.arange(120) * 0.01
-    q = 0.5 * np.cos(8.2 * t)
     stamps = start + factor * np.where(t > 0.6, t + gap, t)
-    rows = [f"{name},{a!r},{b:.6f}" for a, b in zip(stamps.tolist(), q.tolist(), strict=True)]
     path = folder / "swing.csv"
-    path.write_text("\n".join(["run,t,q", *rows]) + "\n")
+    frame = pd.DataFrame({"run": name, "t": stamps, "q": 0.5 * np.cos(8.2 * t)})
+    frame.to_csv(path, index=False)
     path.with_suffix(".toml").write_text(toml)
     return path
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.diagnosis.explain import explain
+from tests.bench.diagnosis.report_tables import table
 
 MASS, NOISE, INTERVAL, SAMPLES = 1.2, 1e-3, 0.02, 100
 
@@ -29,18 +30,14 @@ def path(force, speed, stiffness, place, loss):
 
 def test_an_end_stop_is_named_with_its_place_and_what_it_takes(tmp_path):
     stiffness, place, loss = 1500.0, 0.45, 0.4
-    rng, rows = np.random.default_rng(3), ["run,t,u,x"]
+    rng, runs = np.random.default_rng(3), []
     times = INTERVAL * np.arange(SAMPLES)
     for run, speed in enumerate((0.4, 0.25, 0.3)):
         force = np.where(times % 1.0 < 0.5, 2.0 + 0.6 * run, -2.0 - 0.6 * run)
         x = path(force, speed, stiffness, place, loss)
-        x = x + NOISE * rng.standard_normal(SAMPLES)
-        rows += [f"{run},{t:.4f},{u},{a:.7f}" for t, u, a in zip(times, force, x, strict=True)]
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    (tmp_path / "log.toml").write_text(
-        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
-    )
-    answer = explain(tmp_path / "log.csv").answer
+        runs.append((times, x + NOISE * rng.standard_normal(SAMPLES), force))
+    log = table(tmp_path, runs, ["x"], "slider", {"x": NOISE}, ["u"])
+    answer = explain(log).answer
     (cause,) = answer.causes
     assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "state.limit", ())
     found = cause.coefficients

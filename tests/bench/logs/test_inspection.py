@@ -9,6 +9,7 @@ from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.servo import Servo
+from tests.bench.diagnosis.report_tables import table
 from tests.command_output import run_command
 from tests.simulation_arguments import simulation_spec, write
 
@@ -77,13 +78,11 @@ def test_a_single_run_is_one_although_its_end_is_held_out(tmp_path):
 
 
 def test_many_runs_are_cut_short(tmp_path):
-    rows = [f"{run},{t},{run + t}" for run in range(300) for t in range(3)]
-    (tmp_path / "many.csv").write_text("run,t,q\n" + "\n".join(rows))
-    (tmp_path / "many.toml").write_text('system = "pendulum"\n[channels.q]\nunit = "rad"\n')
-    said = lines(tmp_path / "many.csv")
+    path = table(tmp_path, [(np.arange(3), run + np.arange(3)) for run in range(300)], ["q"])
+    said = lines(path)
     assert "... and 260 more runs" in said
     assert len(said) < 60
-    run_command("inspect", tmp_path / "many.csv", "--out", tmp_path / "out")
+    run_command("inspect", path, "--out", tmp_path / "out")
 
 
 def test_noise_is_found_under_motion_and_uneven_sampling():

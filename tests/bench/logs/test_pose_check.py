@@ -6,6 +6,7 @@ import pytest
 
 from bench.logs.quality.pose_check import find_overlaps
 from bench.logs.recording_loading import load_recording
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.command_output import run_command
 
 LEG = """<mujoco model="leg"><worldbody>
@@ -19,12 +20,11 @@ EXCLUDED = '<contact><exclude body1="base" body2="hip"/></contact>'
 
 def log(folder, height, more=""):
     """Write a log of a leg whose hip is at some height above the middle of its fixed base."""
-    (folder / "leg.xml").write_text(LEG.format(height=height, more=more))
-    toml = 'model = "leg.xml"\n[channels."q.hip"]\nunit = "rad"\n[inputs."u.m"]\nunit = "N*m"\n'
-    (folder / "log.toml").write_text(toml)
-    rows = [f"a,{k / 50},{0.3 * np.sin(k / 9):.6f},{np.cos(k / 9):.6f}" for k in range(120)]
-    (folder / "log.csv").write_text("run,t,q.hip,u.m\n" + "\n".join(rows) + "\n")
-    return folder / "log.csv"
+    k = np.arange(120)
+    description = describe({"q.hip": "rad", "u.m": "N*m"}, model="leg")
+    run = (k / 50, 0.3 * np.sin(k / 9), np.cos(k / 9))
+    leg = LEG.format(height=height, more=more)
+    return write_log(folder, description, "q.hip,u.m", [run], leg=leg)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from tests.bench.diagnosis.pendulum_recordings import SWINGING, written
+from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.command_output import run_command
 
 SHORT = {"runs": 2, "seconds": 0.4, "rate": 100.0}
@@ -79,13 +80,10 @@ def test_a_specification_names_a_system_or_a_model(tmp_path):
 def odd_log(tmp_path):
     """Log in which degrees are declared as radians and one command is missing."""
     written(tmp_path)
-    (tmp_path / "log.toml").write_text(
-        'model = "swinging.xml"\n[channels."q.shoulder"]\nunit = "rad"\n'
-        '[inputs."u.s_elbow"]\nunit = "rad"\n'
-    )
-    rows = [f"{run},{k / 50},{0.1 * k},{30.0 * np.sin(k)}" for run in (1, 2) for k in range(20)]
-    (tmp_path / "log.csv").write_text("\n".join(["run,t,u.s_elbow,q.shoulder", *rows]))
-    return tmp_path / "log.csv"
+    k = np.arange(20)
+    description = describe({"q.shoulder": "rad", "u.s_elbow": "rad"}, model="swinging")
+    run = (k / 50, 0.1 * k, 30.0 * np.sin(k))
+    return write_log(tmp_path, description, "u.s_elbow,q.shoulder", [run, run])
 
 
 def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path):

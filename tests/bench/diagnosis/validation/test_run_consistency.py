@@ -171,19 +171,14 @@ def test_logs_of_other_channels_are_refused(tmp_path):
 
 def test_a_constant_that_logs_state_differently_is_one_of_their_runs(tmp_path):
     def log(name, mass):
-        path = tmp_path / f"{name}.csv"
-        rows = [f"{run},{0.1 * i:.1f},{0.1 * np.cos(i):.4f}" for run in (0, 1) for i in range(9)]
-        path.write_text("\n".join(["run,t,q", *rows]))
-        path.with_suffix(".toml").write_text(
-            f'system = "pendulum"\n[channels.q]\nunit = "rad"\n[constants]\nmass = {mass}\n'
-            "gravity = 9.8\n"
-        )
-        return path
+        description = f'[channels.q]\nunit = "rad"\n[constants]\nmass = {mass}\ngravity = 9.8\n'
+        run = (0.1 * np.arange(9), 0.1 * np.cos(np.arange(9)))
+        return write_log(tmp_path, f'system = "pendulum"\n{description}', "q", [run, run], name)
 
     joined, _ = load_joined([log("one", 0.2), log("other", 0.3)])
     assert joined.constants == {"gravity": 9.8}
     assert [run.constants["mass"] for run in joined.runs] == [0.2, 0.2, 0.3, 0.3]
-    assert [run.name for run in joined.runs] == ["one: 0", "one: 1", "other: 0", "other: 1"]
+    assert [run.name for run in joined.runs] == ["one: 1", "one: 2", "other: 1", "other: 2"]
     assert [run.held_out for run in joined.runs] == [False, True, False, True]
 
 
