@@ -108,5 +108,4 @@ COMPILED = ArrayFunctions(
     __name__,
     "the effects with memory",
     {step_elements: ("#", "ls", "ls", "l2", "ls")},
-    can_run_uncompiled=True,
 )

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,7 +52,7 @@ from sims.robot.dynamics.effect_forces import (
     select_model_field_effects,
     slice_active_effects,
 )
-from sims.robot.dynamics.midpoint_state import IndexArray, Mask
+from sims.robot.dynamics.midpoint_state import IndexArray
 from sims.robot.dynamics.mujoco_batch import (
     BATCH_SIZE,
     JointAddresses,
@@ -248,14 +248,12 @@ class RobotSimulator(SystemSimulator):
         """
         max_samples = max(s.times.size for s in runs.unique_scenarios)
         all_observations = np.full((len(x), max_samples, len(self.channels)), np.nan)
-        derived = find_active_elements(acting, len(x), changes_derived_constants)
-        is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for group in _group_batch_elements(acting, derived, is_stepwise):
+            for indices in _group_batch_elements(acting, len(x)):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
-                order = np.argsort(runs.scenario_index[group.indices], kind="stable")
-                sorted_indices = group.indices[order]
+                order = np.argsort(runs.scenario_index[indices], kind="stable")
+                sorted_indices = indices[order]
                 batch_count = max(-(-sorted_indices.size // BATCH_SIZE), 1)
                 for batch_indices in np.array_split(sorted_indices, batch_count):
                     run_batches = [
@@ -270,11 +268,7 @@ class RobotSimulator(SystemSimulator):
                     ]
                     try:
                         run_observations = self._simulate_run_batch(
-                            run_batches,
-                            slice_active_effects(acting, batch_indices),
-                            group.derived,
-                            group.is_stepwise,
-                            group.added,
+                            run_batches, slice_active_effects(acting, batch_indices)
                         )
                     except RefusedModelError:
                         # These elements stay NaN, like those of a diverging motion; the others are
@@ -289,12 +283,7 @@ class RobotSimulator(SystemSimulator):
         return all_observations
 
     def _simulate_run_batch(
-        self,
-        run_batches: Sequence[RobotRunBatch],
-        acting: ActiveEffects,
-        derived: bool,
-        is_stepwise: bool,
-        added: AddedElements = (),
+        self, run_batches: Sequence[RobotRunBatch], acting: ActiveEffects
     ) -> list[Array]:
         """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
 
@@ -303,13 +292,7 @@ class RobotSimulator(SystemSimulator):
         Args:
             run_batches: batch elements of each run.
             acting: active effects with their coefficients for all batch elements, run after run.
-            derived: whether effects change numbers from which MuJoCo computes further constants of
-                the model (`mj_setConst`), such as masses.
-            is_stepwise: whether forces are evaluated in every step.
-            added: elements that effects add to the model.
         """
-        if not run_batches:
-            return []
         # A sensor at the end needs a further step, since MuJoCo computes its reading within the
         # step that begins then.
         extra_steps = int(self._reads_sensors())
@@ -322,11 +305,7 @@ class RobotSimulator(SystemSimulator):
         x = np.concatenate([batch.x for batch in run_batches])
         v = np.concatenate([batch.v for batch in run_batches])
         stepped = self._simulate_steps(
-            BatchStart(x, v, acting, self._get_floating_states(run_batches)),
-            inputs,
-            derived,
-            is_stepwise,
-            added=added,
+            BatchStart(x, v, acting, self._get_floating_states(run_batches)), inputs
         )
         observations = []
         first = 0
@@ -543,36 +522,18 @@ class RobotSimulator(SystemSimulator):
     def step_batch(
         self, batch: RobotRunBatch, inputs: BatchInputs, extra_fields: Sequence[str] = ()
     ) -> BatchResult:
-        """Step the batch elements of one run.
-
-        It finds out what the effects need (derived constants, evaluation in each step, elements
-        added to the model), and simulates all batch elements together; their effects must add the
-        same elements to the model.
+        """Step batch elements of one run, whose effects must add the same elements to the model.
 
         Args:
             batch: batch elements of the run.
             inputs: inputs over the steps.
             extra_fields: additional fields of MuJoCo's data to record.
         """
-        element_count = len(batch.x)
-        derived = bool(
-            find_active_elements(batch.acting, element_count, changes_derived_constants).any()
-        )
-        is_stepwise = bool(
-            find_active_elements(batch.acting, element_count, is_evaluated_per_step).any()
-        )
-        (added,) = group_by_added_elements(batch.acting, element_count)
         start = BatchStart(batch.x, batch.v, batch.acting, self._get_floating_states([batch]))
-        return self._simulate_steps(start, inputs, derived, is_stepwise, extra_fields, added)
+        return self._simulate_steps(start, inputs, extra_fields)
 
     def _simulate_steps(
-        self,
-        start: BatchStart,
-        inputs: BatchInputs,
-        derived: bool,
-        is_stepwise: bool,
-        extra_fields: Sequence[str] = (),
-        added: AddedElements = (),
+        self, start: BatchStart, inputs: BatchInputs, extra_fields: Sequence[str] = ()
     ) -> BatchResult:
         """Simulate a batch of n elements over all steps, and return its states and readings.
 
@@ -581,15 +542,16 @@ class RobotSimulator(SystemSimulator):
         otherwise between steps. Sensors of drives are corrected afterwards.
 
         Args:
-            start: initial states, and the active effects.
+            start: initial states, and the active effects, which must all add the same elements to
+                the model.
             inputs: controls, forces and activations over the steps.
-            derived: whether masses or armatures change, from which MuJoCo derives constants.
-            is_stepwise: whether an effect depends on the state, so that it is evaluated in each
-                step.
             extra_fields: additional fields of MuJoCo's data to record.
-            added: elements that effects add to the model.
         """
         batch_size = len(start.x)
+        derived = bool(
+            find_active_elements(start.acting, batch_size, changes_derived_constants).any()
+        )
+        (added,) = group_by_added_elements(start.acting, batch_size)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
         mujoco_batch = self._get_batch(derived, 1 if batch_size == 1 else BATCH_SIZE, added)
@@ -606,7 +568,7 @@ class RobotSimulator(SystemSimulator):
             field_names.append("sensordata")
         field_names = list(dict.fromkeys(field_names))
         forces = mujoco_batch.map_forces(inputs.forces)
-        if is_stepwise:
+        if find_active_elements(start.acting, batch_size, is_evaluated_per_step).any():
             servos = mujoco_batch.robot, joints.velocities, inputs.off
             step_forces = StepForces(
                 self.robotic,
@@ -724,40 +686,29 @@ class RobotSimulator(SystemSimulator):
         return next(s for s in self.robot.sensors if s.name == element_name).address
 
 
-class _ElementGroup(NamedTuple):
-    """Batch elements that can be simulated together, since they need the same kind of simulation.
+def _group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArray]:
+    """Yield the indices of batch elements that can be simulated together.
 
-    Attributes:
-        added: elements that effects add to the model.
-        derived: whether effects change constants that MuJoCo derives.
-        is_stepwise: whether forces are evaluated in every step.
-        indices: indices of the batch elements.
-    """
-
-    added: AddedElements
-    derived: bool
-    is_stepwise: bool
-    indices: IndexArray
-
-
-def _group_batch_elements(
-    acting: ActiveEffects, derived: Mask, is_stepwise: Mask
-) -> Iterator[_ElementGroup]:
-    """Group batch elements that can be simulated together.
+    Their effects add the same elements to the model; all or none of them change constants that
+    MuJoCo derives; and the forces of all or none are evaluated in every step.
 
     Shapes: L batch elements, K coefficients.
 
     Args:
         acting: active effects, with coefficients (K, L, 1).
-        derived: (L,) whether effects change constants that MuJoCo derives.
-        is_stepwise: (L,) whether forces are evaluated in every step.
+        count: number L of batch elements.
     """
-    for added, element_indices in group_by_added_elements(acting, len(derived)).items():
-        has_model = np.zeros(len(derived), dtype=bool)
-        has_model[element_indices] = True
-        for stepwise, changed in product((False, True), repeat=2):
-            is_in_group = has_model & (derived == changed) & (is_stepwise == stepwise)
-            yield _ElementGroup(added, changed, stepwise, np.flatnonzero(is_in_group))
+    kinds = np.stack(
+        [
+            find_active_elements(acting, count, needs_work)
+            for needs_work in (is_evaluated_per_step, changes_derived_constants)
+        ]
+    )
+    for indices in group_by_added_elements(acting, count).values():
+        for kind in product((False, True), repeat=2):
+            is_in_group = np.all(kind == kinds[:, indices].T, axis=1)
+            if is_in_group.any():
+                yield np.array(indices)[is_in_group]
 
 
 def make_robot_simulator(

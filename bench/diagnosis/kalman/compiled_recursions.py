@@ -353,6 +353,5 @@ COMPILED = ArrayFunctions(
             *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "zz", "cz"),
         ),
     },
-    can_run_uncompiled=True,
 )
 """Recursions for b runs, t samples, i = t - 1 intervals, c channels, z states and e forces."""

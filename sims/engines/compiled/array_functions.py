@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -24,8 +23,6 @@ from sims.core.simulator import InputError
 from sims.engines.compiled import intrinsics, machine_code
 from sims.engines.compiled.data_layout import INTEGERS, Array, measure_arrays
 
-HAS_LLVMLITE = importlib.util.find_spec("llvmlite") is not None
-"""True if machine code can be loaded; numba may not support this Python version yet."""
 _MAX_COMPILE_SECONDS = 20
 """Approximate compilation time of the batch engine in seconds, the longest one."""
 _PYTHON_MODULES = ("array_programs.py", "batch_runner.py", "force_program.py")
@@ -41,7 +38,6 @@ class ArrayFunctions:
         module: str,
         description: str,
         shapes: Mapping[Callable[..., None], Sequence[str]],
-        can_run_uncompiled: bool = False,
     ) -> None:
         """Store which functions to compile; compilation happens at their first use.
 
@@ -52,12 +48,9 @@ class ArrayFunctions:
                 letters are equal sizes, and ``#`` marks integers (see `data_layout`). A function
                 with one parameter receives all arguments as one tuple, whose class is its
                 annotation.
-            can_run_uncompiled: whether the functions run as Python where llvmlite is not installed,
-                a hundred times slower.
         """
         self._module, self._description = module, description
         self._shapes = dict(shapes)
-        self._can_run_uncompiled = can_run_uncompiled
         self._compiled: Callable[..., None] | None = None
 
     def call(self, function: Callable[..., None], *arguments: Any) -> list[Array]:
@@ -106,16 +99,13 @@ class ArrayFunctions:
 
         All functions are compiled into one entry (`make_entry`), which has a single argument: the
         address of an array of integers. They are the number of the function, the sizes of its
-        arrays, and then each argument: the address of an array, or an integer itself. If llvmlite
-        is not installed, the Python function itself runs.
+        arrays, and then each argument: the address of an array, or an integer itself.
 
         Args:
             function: One of the functions of this object.
             sizes: Sizes of the arguments by letter of their shapes.
             arguments: Arrays and integers.
         """
-        if self._can_run_uncompiled and not HAS_LLVMLITE:
-            return partial(function, *arguments)
         words = np.array(
             [
                 list(self._shapes).index(function),

@@ -250,11 +250,8 @@ class MeasuredLinear(RunLinearisation):
         tangent, state_size = self._tangent, self._tangent.state_size
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = self._compose(self._tangent.defects)
-        states = np.tile(np.eye(state_size), (self.knots.size - 1, 1, 1))
         points, quotients = tangent.point_of_step, tangent.quotients
-        # The first step of all intervals at once, then the second, and so on.
-        for steps, active in self._list_active_intervals():
-            states[active] = quotients.states[points[steps]] @ states[active]
+        no_changes = np.broadcast_to(0.0, (points.size, state_size, state_size))
         count = self._motion.x.shape[0]
         unit_changes = np.broadcast_to(
             STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
@@ -269,7 +266,7 @@ class MeasuredLinear(RunLinearisation):
             )
         readings = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
         return IntervalMaps(
-            states=states,
+            states=self._compose(no_changes, np.eye(state_size)),
             defects=defects,
             forces=self._input_responses[:, :, : quotients.forces.shape[2]],
             inputs=self._input_responses,
@@ -292,14 +289,28 @@ class MeasuredLinear(RunLinearisation):
             changes = self._tangent.compute_defect_changes(similar._tangent)
         return self._compose(changes), self.observed - similar.observed
 
-    def _compose(self, values: Array) -> Array:
-        """Compose state changes (S, Z) in each step to those of each interval, (T - 1, Z)."""
-        result = np.zeros((self.knots.size - 1, self._tangent.state_size))
+    def _compose(
+        self, values: Array, initial: Array | float = 0.0, rows: IndexArray | None = None
+    ) -> Array:
+        """Compose state changes in each step to those of each interval between samples.
+
+        Args:
+            values: (S, Z) or (S, Z, m) state changes in each step.
+            initial: (Z, m) changes of the state at the beginnings of the intervals; none by
+                default.
+            rows: (S,) row of `values` for each step, if they are not in the order of the steps.
+
+        Returns:
+            (T - 1, Z) or (T - 1, Z, m) state changes at the ends of the intervals.
+        """
+        columns = values[:, :, None] if values.ndim == 2 else values
+        result = np.full((self.knots.size - 1, *columns.shape[1:]), initial)
         points, states = self._tangent.point_of_step, self._tangent.quotients.states
+        # The first step of all intervals at once, then the second, and so on.
         for steps, active in self._list_active_intervals():
-            ahead = np.einsum("izy,iy->iz", states[points[steps]], result[active])
-            result[active] = ahead + values[steps]
-        return result
+            changes = columns[steps if rows is None else rows[steps]]
+            result[active] = states[points[steps]] @ result[active] + changes
+        return result.reshape(-1, *values.shape[1:])
 
     def _compute_limit_jumps(self) -> Array:
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos.
@@ -333,7 +344,7 @@ class MeasuredLinear(RunLinearisation):
             return np.zeros((self.knots.size - 1, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             errors = tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
-            return self._compose(errors[tangent.point_of_step])
+            return self._compose(errors, rows=tangent.point_of_step)
 
     def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
         """Return which intervals between samples have a first step, a second step, and so on.
@@ -413,14 +424,9 @@ class MeasuredLinear(RunLinearisation):
         They are per unit of a generalised force or a control that is constant over the
         interval.
         """
-        tangent = self._tangent
-        point_of_step, quotients = tangent.point_of_step, tangent.quotients
+        quotients = self._tangent.quotients
         input_matrices = np.concatenate([quotients.forces, quotients.controls], axis=2)
-        result = np.zeros((self.knots.size - 1, *input_matrices.shape[1:]))
-        for steps, active in self._list_active_intervals():
-            points = point_of_step[steps]
-            result[active] = quotients.states[points] @ result[active] + input_matrices[points]
-        return result
+        return self._compose(input_matrices, rows=self._tangent.point_of_step)
 
     def _compute_direct_readings(
         self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
