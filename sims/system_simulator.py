@@ -28,7 +28,6 @@ from sims.core.simulator import Array, Indices, InputError, Parameter, Scenario,
 from sims.core.system import System
 from sims.core.toml_validation import format_value
 from sims.engines import HIDDEN_STATE_ENGINES, make_engine
-from sims.engines.hidden_states import integrate_with_hidden_states
 from sims.engines.step_inputs import compute_applied_inputs
 from sims.engines.time_grid import (
     Commands,
@@ -250,12 +249,7 @@ class SystemSimulator(Simulator):
                 steps_per_state,
             )
             clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
-            has_hidden_states = any(isinstance(effect, HiddenStateEffect) for effect, _ in forces)
-            motion = (
-                integrate_with_hidden_states(self.engine, batch)
-                if has_hidden_states
-                else self.engine.integrate(batch)
-            )
+            motion = self.engine.integrate(batch)
             observations = self._read(motion, batch, plan, sensors, clock)
         # Readings of a shorter run while it waits at its end are not samples.
         sizes = np.array([s.times.size for s in runs.unique_scenarios])

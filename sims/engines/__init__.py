@@ -20,7 +20,7 @@ ENGINE_MODULES = {
 }
 """Module of each engine by name; a module is imported when its engine is first requested."""
 HIDDEN_STATE_ENGINES = ("batch",)
-"""Engines that can integrate the hidden states of effects (`sims.engines.hidden_states`)."""
+"""Engines that can integrate the hidden states of effects."""
 
 
 def describe_stepping() -> str:

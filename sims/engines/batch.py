@@ -11,7 +11,7 @@ import numpy as np
 
 from sims.core.engine import IntegrationBatch, Trajectories, check_positive
 from sims.core.plain_values import truncate_text
-from sims.core.simulator import Indices, InputError
+from sims.core.simulator import InputError
 from sims.core.system import System
 from sims.engines.compiled.batch_runner import integrate_batch
 from sims.engines.compiled.data_layout import MAX_COORDINATES
@@ -117,26 +117,3 @@ def make_engine(
         The engine; see `BatchEngine`.
     """
     return BatchEngine(time_step, turn, patience, jobs)
-
-
-def join_trajectories(
-    parts: list[tuple[Indices, Trajectories]], batch: IntegrationBatch
-) -> Trajectories:
-    """Join the trajectories of parts of a batch, in the order of the batch.
-
-    Args:
-        parts: indices (n,) of the elements of each part, with their trajectories.
-        batch: whole batch.
-
-    Returns:
-        The trajectories of the whole batch.
-    """
-    first, motion = parts[0]
-    if len(parts) == 1 and (first == np.arange(len(batch.x))).all():
-        return motion
-    count, dim = batch.x.shape
-    records = batch.steps.shape[1] // batch.steps_per_sample + 1
-    joined_states = np.empty((3, count, records, dim))
-    for i, motion in parts:
-        joined_states[:, i] = motion.x, motion.v, motion.a
-    return Trajectories(*joined_states)

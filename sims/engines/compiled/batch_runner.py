@@ -7,9 +7,10 @@ from itertools import compress
 
 import numpy as np
 
-from sims.core.effect import Contact, Effect, Force, Friction
+from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
+from sims.core.system import StateSnapshot
 from sims.engines.compiled.data_layout import (
     FLOOR,
     GROUND_FRICTION,
@@ -18,7 +19,11 @@ from sims.engines.compiled.data_layout import (
     BatchArrays,
     allocate_block,
 )
-from sims.engines.compiled.force_program import ForceProgram, get_force_program
+from sims.engines.compiled.force_program import (
+    ForceProgram,
+    compute_own_inertia,
+    get_force_program,
+)
 from sims.engines.compiled.kernel import COMPILED, integrate_elements
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
@@ -35,7 +40,8 @@ def integrate_batch(
     """Integrate the motion of all elements of a batch in machine code.
 
     Elements with the same active effects have the same force program (see `force_program`), so
-    they are grouped by effects, and each group is integrated with its program.
+    they are grouped by effects, and each group is integrated with its program. With hidden states
+    of effects, a group has coordinates of its own, and arrays of its own.
 
     Args:
         batch: batch to integrate.
@@ -48,30 +54,53 @@ def integrate_batch(
     """
     # Loaded first, so that an error of the compiler is not reported as an error of the system.
     COMPILED.load()
-    all_elements = _make_arrays(batch, max_phase, patience)
+    all_elements = _make_arrays(batch, [], max_phase, patience)
+    count, record_count, _ = all_elements.records.shape
+    trajectories = all_elements.records.reshape(count, record_count, 3, -1)
     for elements, effects in _group_by_effects(batch):
+        arrays = all_elements._replace(order=elements.astype(np.int64))
+        hidden = [(e, c[:, elements]) for e, c in effects if isinstance(e, HiddenStateEffect)]
+        if hidden:
+            arrays = _make_arrays(batch.select(elements), hidden, max_phase, patience)
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
         columns = [batch.theta[elements], *(c[elements] for c in batch.constants.values())]
         columns += [c[:, elements, 0].T for _, c in effects]
         parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
-        arrays = all_elements._replace(order=elements.astype(np.int64), parameters=parameters)
-        _integrate_group(program, arrays, jobs)
+        _integrate_group(program, arrays._replace(parameters=parameters), jobs)
+        if hidden:
+            records = arrays.records.reshape(len(elements), record_count, 3, -1)
+            trajectories[elements] = records[..., : batch.x.shape[1]]
     # A record is position, velocity and acceleration, one after the other.
-    return Trajectories(*np.split(all_elements.records, 3, axis=2))
+    return Trajectories(*np.moveaxis(trajectories, 2, 0))
 
 
-def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> BatchArrays:
+def _make_arrays(
+    batch: IntegrationBatch,
+    hidden: list[tuple[HiddenStateEffect, Array]],
+    max_phase: float,
+    patience: float,
+) -> BatchArrays:
     """Convert a batch to the contiguous arrays that the machine code reads.
 
-    No elements are selected yet (`order` and `parameters` are empty); each group of
-    elements sets its own. If all elements have the same steps, one row of steps is stored for all.
+    All elements are selected, without parameters. If all elements have the same steps, one row of
+    steps is stored for all.
 
     Args:
         batch: batch: system, initial states, inputs and effects of all elements.
+        hidden: effects with a hidden state in all elements, with their coefficients.
         max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
     """
-    count, dimensions = batch.x.shape
+    count, system = len(batch.x), batch.system
+    x, v, fastest = batch.x, batch.v, system.fastest
+    if hidden:
+        start = np.zeros((count, 1))
+        inputs = {name: values[:, :1] for name, values in batch.inputs.items()}
+        moment = StateSnapshot(system, batch.theta, batch.constants, start, x, v, inputs)
+        states = [effect.begin(c, moment) for effect, c in hidden]
+        x = np.concatenate([x, *(state.x for state in states)], axis=1)
+        v = np.concatenate([v, *(state.v for state in states)], axis=1)
+        fastest = max(fastest, *(effect.fastest for effect, _ in hidden))
     # A broadcast array, whose rows are the same memory, has a stride of zero.
     are_steps_shared = batch.steps.strides[0] == 0
     steps = np.ascontiguousarray(
@@ -79,14 +108,15 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
     )
     ones = np.ones(count)
     longest_steps = steps.max(axis=1, initial=0.0) * ones
-    divisions = np.ceil(batch.system.fastest * longest_steps / max_phase)
+    divisions = np.ceil(fastest * longest_steps / max_phase)
+    inertia = compute_own_inertia(system, batch.theta, batch.constants, hidden)
     record_count = steps.shape[1] // batch.steps_per_sample + 1
     return BatchArrays(
-        order=np.zeros(0, dtype=np.int64),
+        order=np.arange(count),
         parameters=np.zeros((0, 0)),
-        mass=_to_column(batch.system.mass(batch.theta, batch.constants), count),
-        x=np.ascontiguousarray(batch.x, dtype=np.float64),
-        v=np.ascontiguousarray(batch.v, dtype=np.float64),
+        mass=_to_column(inertia, count),
+        x=np.ascontiguousarray(x, dtype=np.float64),
+        v=np.ascontiguousarray(v, dtype=np.float64),
         steps=steps,
         inputs=_stack_inputs(list(batch.inputs.values()), steps.shape[1]),
         max_steps=longest_steps,
@@ -94,7 +124,7 @@ def _make_arrays(batch: IntegrationBatch, max_phase: float, patience: float) -> 
         divisions=np.clip(divisions, 1.0, MAX_STEP_DIVISIONS),
         ground=_get_ground_parameters(batch),
         limits=np.array([patience, max_phase]),
-        records=np.empty((count, record_count, 3 * dimensions)),
+        records=np.empty((count, record_count, 3 * x.shape[1])),
         steps_per_record=batch.steps_per_sample,
     )
 
@@ -185,19 +215,28 @@ def _get_ground_parameters(batch: IntegrationBatch) -> Array:
 def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
     """Group the elements by their active effects, since each group needs its own force program.
 
-    Only effects that are part of a force program count: forces, friction and contact laws. An
-    effect is active in an element if its coefficients there are not zero.
+    Only effects that are part of a force program count: forces, friction, contact laws and hidden
+    states. An effect is active in an element if its coefficients there are not zero; one with a
+    hidden state, if the first is above zero.
 
     Returns:
         Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
     """
     effects: list[tuple[Effect, Array]] = [
-        (e, c) for e, c in batch.effects if isinstance(e, Force | Friction | Contact)
+        (e, c)
+        for e, c in batch.effects
+        if isinstance(e, Force | Friction | Contact | HiddenStateEffect)
     ]
     if not effects:
         return [(np.arange(len(batch.x)), [])]
     # Row l: whether each effect acts in element l.
-    patterns = np.stack([is_active(c)[:, 0] for _, c in effects], axis=1)
+    patterns = np.stack(
+        [
+            c[0, :, 0] > 0 if isinstance(e, HiddenStateEffect) else is_active(c)[:, 0]
+            for e, c in effects
+        ],
+        axis=1,
+    )
     # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
     if (patterns == patterns[0]).all():
         groups = [np.arange(len(patterns))]

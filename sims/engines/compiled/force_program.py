@@ -1,15 +1,23 @@
-"""Force program of a declared system with effects, for the engines of the project."""
+"""Force program of a declared system with effects, for the engines of the project.
+
+The hidden state of an effect is one more coordinate, after those of the system. Forces are divided
+by the inertia that remains for the system's own coordinates,
+
+    M' = M (1 - sum of the load-side shares)                               (1)
+
+so that the rate r of a hidden state is written as the force M' r.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.core.effect import Contact, Effect, Force, Friction
+from sims.core.effect import Contact, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.engine import IntegrationBatch
 from sims.core.simulator import Array, Indices
 from sims.core.system import StateSnapshot, System
@@ -111,8 +119,9 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
     """Return the array function of a system and its effects.
 
     The groups of inputs are time, position, velocity, inputs, parameters; restitution and friction
-    of the ground, and speed of an impact. The parameters are those of the system, its constants,
-    and the coefficients of each effect. The outputs are the force and the limit of dry friction;
+    of the ground, and speed of an impact. Positions, velocities and forces are those of the system,
+    followed by those of hidden states. The parameters are those of the system, its constants, and
+    the coefficients of each effect. The outputs are the force and the limit of dry friction;
     restitution and friction with effects.
 
     Args:
@@ -120,7 +129,8 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
         names: names and sizes of its inputs.
         effects: effects that act.
     """
-    d = names.coordinates
+    own = names.coordinates
+    d = own + _count_hidden_states(effects)
     sizes = [names.parameters, *(1 for _ in names.constants)]
     sizes += [len(effect.coefficients) for effect in effects]
 
@@ -133,19 +143,29 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
         coefficients = [c.T[:, :, None] for c in columns[len(constants) :]]
         acting = list(zip(effects, coefficients, strict=True))
         inputs = {name: u[:, k, None] for k, name in enumerate(names.inputs)}
-        moment = StateSnapshot(system, theta, constants, t, x, v, inputs)
+        moment = StateSnapshot(system, theta, constants, t, x[:, :own], v[:, :own], inputs)
 
         def evaluate_forces() -> tuple[Any, Any]:
             """Return the force, and the limit of dry friction."""
             force = system.force(moment)
             limit: Any = None
+            hidden_forces: list[Any] = []
             for effect, c in acting:
                 if isinstance(effect, Force):
                     force = force + effect.force(c, moment)
                 elif isinstance(effect, Friction):
                     added = effect.limit(c, moment)
                     limit = added if limit is None else limit + added
+                elif isinstance(effect, HiddenStateEffect):
+                    k = own + len(hidden_forces)
+                    added, rate = effect.act(c, moment, HiddenState(x[:, k, None], v[:, k, None]))
+                    force = force + added
+                    hidden_forces.append(inertia * rate)
+            if hidden_forces:
+                force = np.concatenate([force, *hidden_forces], axis=1)
             return force, 0.0 if limit is None else limit
+
+        inertia = 1.0 if d == own else compute_own_inertia(system, theta, constants, acting)
 
         def evaluate_impact() -> tuple[Any, Any]:
             """Return restitution and friction coefficient."""
@@ -163,6 +183,32 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
     return ArrayFunction(groups, ((d, 1), (1, 1)), bind)
 
 
+def compute_own_inertia(
+    system: System,
+    theta: Array,
+    constants: Mapping[str, Array],
+    acting: Sequence[tuple[Effect, Array]],
+) -> Array:
+    """Return the inertia (L, 1) that remains for the system's own coordinates, by eq. (1).
+
+    Args:
+        system: the system.
+        theta: (L, p) its parameters.
+        constants: (L, 1) constants by name.
+        acting: effects with their coefficients (K, L, 1).
+    """
+    remaining_share: Any = 1.0
+    for effect, c in acting:
+        if isinstance(effect, HiddenStateEffect):
+            remaining_share = remaining_share - effect.behind(c)
+    inertia: Array = system.mass(theta, constants) * remaining_share  # (1)
+    return inertia
+
+
+def _count_hidden_states(effects: Sequence[Effect]) -> int:
+    return sum(isinstance(effect, HiddenStateEffect) for effect in effects)
+
+
 def _make_samples(
     batch: IntegrationBatch, first: Indices, effects: Sequence[Effect]
 ) -> list[Array]:
@@ -177,7 +223,8 @@ def _make_samples(
     constants = [values[first] for values in batch.constants.values()]
     parameters = np.concatenate([batch.theta[first], *constants, *coefficients], axis=1)[0]
     inputs = [values[first[0], 0] for values in batch.inputs.values()]
-    x, v = batch.x[first[0]], batch.v[first[0]]
+    hidden = np.zeros(_count_hidden_states(effects))
+    x, v = (np.append(state[first[0]], hidden) for state in (batch.x, batch.v))
     impact = _TEST_RESTITUTION, _TEST_FRICTION
     return [
         np.concatenate([[t], x + shift, v - 2.0 * shift, inputs, parameters, [*impact, speed]])[
@@ -190,9 +237,9 @@ def _make_samples(
 def _make_flags(system: System, names: _InputNames, effects: Sequence[Effect]) -> IntTable:
     """Return `ProgramArrays.flags`: integers from which compiled code skips what is not needed.
 
-    `system.bends` is true if its own force may change sharply, as with hidden states such as a
-    motor's current. `system.guided` is the number of coordinates, from the first, on which dry
-    friction acts; zero stands for all.
+    `system.bends` is true if its own force may change sharply, as that of hidden states may.
+    `system.guided` is the number of coordinates, from the first, on which dry friction acts; zero
+    stands for all that are not hidden states.
 
     Args:
         system: System that is integrated.
@@ -201,13 +248,15 @@ def _make_flags(system: System, names: _InputNames, effects: Sequence[Effect]) -
     """
     has_friction = any(isinstance(effect, Friction) for effect in effects)
     has_forces = any(isinstance(effect, Force) for effect in effects)
+    hidden_count = _count_hidden_states(effects)
+    bends = system.bends or hidden_count > 0
     # In the order of the constants from DIMENSIONS to HAS_HIDDEN_STATES.
     flags = (
-        names.coordinates,
+        names.coordinates + hidden_count,
         has_friction,
-        has_forces or system.bends,
+        has_forces or bends,
         system.bounces,
         system.guided or names.coordinates,
-        system.bends,
+        bends,
     )
     return np.array(flags, dtype=np.int64)

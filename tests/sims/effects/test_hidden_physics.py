@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import InputError, Scenario
-from sims.engines.hidden_states import make_augmented_system
+from sims.engines.compiled.force_program import compute_own_inertia
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider, SliderSystem
 from tests.sims.effects.effect_systems import batch_coefficients, moment
@@ -138,10 +138,12 @@ def test_inertia_is_that_of_the_drive_side():
     from sims.effects.friction import FrictionHysteresis
     from sims.effects.transmission import JointFlexibility
 
-    system = make_augmented_system(SliderSystem, (JointFlexibility, FrictionHysteresis))()
-    theta = np.array([[2.0, 0.25, 30.0, 0.1, 0.5, 0.01]])
-    assert system.mass(theta, {})[0, 0] == pytest.approx(1.5)
-    assert system.coordinates == ("x", "joint.flexibility", "friction.hysteresis")
+    acting = [
+        (JointFlexibility(), batch_coefficients(0.25, 30.0, 0.1)),
+        (FrictionHysteresis(), batch_coefficients(0.5, 0.01)),
+    ]
+    inertia = compute_own_inertia(SliderSystem(), np.array([[2.0]]), {}, acting)
+    assert inertia[0, 0] == pytest.approx(1.5)
 
 
 def test_a_share_beyond_all_leaves_something_to_either_side():
