@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from bench.benchmark import best_tuner_summary
 from bench.benchmark.comparison_charts import CHARTS, ComparisonView
 from bench.benchmark.comparison_figures import FIGURE_FILES, format_threshold_caption
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
-from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL, SIGNIFICANCE
+from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import TRUSTED_TUNERS_NOTE
 from bench.pages.html_page import HtmlPage
-from bench.pages.text_format import format_number, joined
 
 
 @dataclass(frozen=True)
@@ -55,244 +54,118 @@ class ComparisonReportData:
         return shlex.join(words)
 
 
-SIGNIFICANCE_LEVEL = SIGNIFICANCE
-"""Corrected p-value below which one tuner is called better than another."""
-
-
 class RangeResult(NamedTuple):
     """Verdicts on the tuners in one range of targets.
 
     Attributes:
         where: The range in words, for the middle of a sentence.
-        title: The range with its number of targets, for the beginning of a sentence.
+        targets: Its number of targets, in words.
         rankings: Verdicts after 1, 3, 10 and all simulations.
-        has_failures: Whether a tuner failed in all of its runs.
-        notes: Failed runs, and how the verdicts were decided.
+        running_times: Rows of the table of expected running times, for the best tuners that reach
+            the reference threshold.
+        failed_runs: Sentence on failed runs.
+        explanation: Sentence on how the verdicts were decided.
+        warning: Sentence on too few targets.
     """
 
     where: str
-    title: str
+    targets: str
     rankings: list[best_tuner_summary.TunerRanking]
-    has_failures: bool
-    notes: list[str]
+    running_times: list[dict[Hashable, Any]]
+    failed_runs: str
+    explanation: str
+    warning: str
+
+    @property
+    def title(self) -> str:
+        """The range with its number of targets, for the beginning of a sentence."""
+        return f"{self.where[0].upper()}{self.where[1:]} ({self.targets})"
 
 
-def list_range_results(view: ComparisonView) -> list[RangeResult]:
+def list_range_results(results: ComparisonReportData) -> list[RangeResult]:
     """List the verdicts on the tuners by range of targets.
 
-    Each result ranks the tuners after 1, 3, 10 and all simulations, with notes on failed runs and
-    on how to read the ranking.
-
     Args:
-        view: Comparison with its statistics.
+        results: Comparison with its statistics and tables.
     """
-    results = []
-    for kind in view.ranges:
-        rankings = best_tuner_summary.rank_at_checkpoints(view.statistics, kind)
-        notes = (
-            best_tuner_summary.list_failed_runs(view.statistics, kind),
-            best_tuner_summary.explain_ranking(view.statistics, kind),
+    statistics = results.view.statistics
+    return [
+        RangeResult(
+            best_tuner_summary.RANGE_PHRASES[kind],
+            best_tuner_summary.format_target_count(statistics, kind),
+            best_tuner_summary.rank_at_checkpoints(statistics, kind),
+            _list_running_times(statistics, results.tables["ert"], kind),
+            best_tuner_summary.list_failed_runs(statistics, kind),
+            best_tuner_summary.explain_ranking(statistics, kind),
+            best_tuner_summary.warn_about_target_count(statistics, kind),
         )
-        results.append(
-            RangeResult(
-                best_tuner_summary.RANGE_PHRASES[kind],
-                _format_title(view, kind),
-                rankings,
-                any(ranking.failed for ranking in rankings),
-                [note for note in notes if note],
-            )
-        )
-    return results
-
-
-def _format_title(view: ComparisonView, kind: str) -> str:
-    text = best_tuner_summary.RANGE_PHRASES[kind]
-    count = best_tuner_summary.format_target_count(view.statistics, kind)
-    return f"{text[0].upper()}{text[1:]} ({count})"
-
-
-def write_conclusion(view: ComparisonView) -> list[str]:
-    """List the tuners that are worse than the best after all simulations, by range."""
-    return [_conclude_range(view, kind) for kind in view.ranges]
-
-
-def _conclude_range(view: ComparisonView, kind: str) -> str:
-    """Write one sentence with the verdicts on all tuners of a range after all simulations.
-
-    Tuners that share the smallest error are not listed here.
-
-    Args:
-        view: comparison with its statistics, experiment and styles of tuners.
-        kind: range of the targets.
-    """
-    rankings = best_tuner_summary.rank_at_checkpoints(view.statistics, kind)
-    title = _format_title(view, kind)
-    if not rankings:
-        return f"{title}: the errors on the targets do not decide."
-    last_ranking = rankings[-1]
-    # The wording of the first one explains the format of the others.
-    first = [
-        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
-        for text in last_ranking.worse[:1]
+        for kind in results.view.ranges
     ]
-    parts = {
-        "worse than the best": [*first, *last_ranking.worse[1:]],
-        "not decided": last_ranking.undecided,
-        "all runs failed": last_ranking.failed,
-    }
-    verdicts = "; ".join(f"{verdict}: {joined(names)}" for verdict, names in parts.items() if names)
-    return (
-        f"{title}, after {last_ranking.simulations} simulations: {verdicts or 'no tuner is worse'}."
-    )
 
 
-def write_running_times(results: ComparisonReportData) -> list[str]:
-    """Describe how soon the best tuners of each range reach an error for good."""
-    texts = ((kind, _format_running_times(results, kind)) for kind in results.view.ranges)
-    return [f"{_format_title(results.view, kind)}: {text}" for kind, text in texts if text]
-
-
-def _format_running_times(results: ComparisonReportData, kind: str) -> str:
-    """Write a sentence with the expected running time (ERT) of the best tuners of a range.
+def _list_running_times(
+    statistics: ComparisonStatistics, table: pd.DataFrame, kind: str
+) -> list[dict[Hashable, Any]]:
+    """List the expected running times (ERT) of the best tuners of a range, in their order.
 
     The ERT is the expected number of simulations until the error stays below the reference
-    threshold (`reference_level`). The text is empty if none of the best tuners has reached the
-    threshold.
+    threshold (`reference_level`); tuners that never reach it are left out.
 
     Args:
-        results: the comparison.
+        statistics: statistics of the comparison.
+        table: table of ERT.
         kind: range of the targets, such as ``in``.
     """
-    view, table = results.view, results.tables["ert"]
-    statistics, level = view.statistics, view.statistics.reference_level
     ranking = statistics.ranking[statistics.ranking["range"] == kind]
     final_rows = ranking[ranking["simulations"] == ranking["simulations"].max()]
     best = list(final_rows.loc[final_rows["verdict"].isin((BEST, EQUAL)), "tuner"])
     rows = table[
         (table["range"] == kind)
-        & (table["threshold"] == level)
+        & (table["threshold"] == statistics.reference_level)
         & (table["successes"] > 0)
         & table["tuner"].isin(best)
     ]
-    if rows.empty:
-        return ""
-    ordered = sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
-    tuner_texts = ", ".join(_format_running_time(view, row) for row in ordered)
-    unit = view.unit_of_levels or f" in {view.format_metric_label(statistics.metric)}"
-    return (
-        "expected simulations of the best tuners until the error stays at or below "
-        f"{format_number(level)}{unit.replace('[', '').replace(']', '')}: {tuner_texts}."
-    )
+    return sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
 
 
-def _format_running_time(view: ComparisonView, row: Mapping[Any, Any]) -> str:
-    """Format the expected running time (ERT) of one tuner.
-
-    The text has its 95 % interval, the successful runs and the simulations of a training. An
-    interval without an upper limit ends with ∞.
-
-    Args:
-        view: the comparison, with the costs of trainings.
-        row: row of the table of ERT.
-    """
-    high = format_number(row["high"]) if np.isfinite(row["high"]) else "∞"
-    interval = f"95 % {format_number(row['low'])} to {high}"
-    simulations, _ = view.stored.costs.get(str(row["tuner"]), (0.0, 0.0))
-    training = f"; training {format_number(simulations, 6)}" if simulations else ""
-    successes = f"{int(row['successes'])} of {int(row['runs'])} runs"
-    return f"{row['tuner']} {format_number(row['ert'])} ({interval}; {successes}{training})"
+def explain_first(worse: Sequence[str]) -> list[str]:
+    """Write out the first of several worse tuners, which explains the format of the others."""
+    first = [
+        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
+        for text in worse[:1]
+    ]
+    return [*first, *worse[1:]]
 
 
-class FailureCounts(NamedTuple):
-    """Number of failed runs, of all runs, and of tuners that could not be used."""
-
-    failed: int
-    runs: int
-    skipped: int
-
-
-def count_failures(view: ComparisonView) -> FailureCounts:
-    """Count the runs that failed and the tuners that were skipped."""
-    statuses = view.stored.statuses
-    return FailureCounts(
-        int(statuses["status"].isin(FAILED_STATUSES).sum()),
-        len(statuses),
-        int(statuses[statuses["status"] == "skipped"]["tuner"].nunique()),
-    )
-
-
-class Failure(NamedTuple):
-    """Kind of failure: its tuner, status, number of runs, a run and the reason of that run."""
-
-    tuner: str
-    status: str
-    run_count: int
-    run: str
-    reason: str
-
-    @property
-    def last_line(self) -> str:
-        """Last line of the reason."""
-        return (self.reason.strip().splitlines() or ["no reason was given"])[-1]
-
-
-def list_failures(view: ComparisonView) -> list[Failure]:
+def list_failures(view: ComparisonView) -> list[dict[str, Any]]:
     """List every kind of failure with its first reason, the most frequent one first.
 
     Runs that failed or were skipped are grouped by tuner, status and reason.
     """
     statuses = view.stored.statuses
     failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
-    failures = [
-        Failure(str(tuner), str(status), len(group), str(group["run"].iloc[0]), str(reason))
-        for (tuner, status, reason), group in failed.groupby(
-            ["tuner", "status", "reason"], sort=False
-        )
-    ]
-    return sorted(failures, key=lambda failure: -failure.run_count)
+    groups = failed.groupby(["tuner", "status", "reason"], sort=False)["run"]
+    counts = groups.agg(run_count="size", run="first").reset_index()
+    counts = counts.sort_values("run_count", ascending=False, kind="stable")
+    return [{str(key): value for key, value in row.items()} for row in counts.to_dict("records")]
 
 
-def list_small_samples(view: ComparisonView) -> list[str]:
-    """List warnings about ranges with too few targets for a significant difference."""
-    texts = (
-        best_tuner_summary.warn_about_target_count(view.statistics, kind) for kind in view.ranges
-    )
-    return list(dict.fromkeys(text for text in texts if text))
-
-
-def format_redraws(results: ComparisonReportData) -> str:
-    """Describe how many targets were drawn again; empty for none.
-
-    A target is drawn again if its own simulation diverges, because it then has no observations.
+def collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
+    """Collect the values of both templates, that of the page and that of the printed summary.
 
     Args:
-        results: Comparison with the record of its environment.
+        results: Comparison with its statistics and tables.
     """
-    redrawn_count, draws = (
-        results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
-    )
-    targets = sum(results.view.statistics.target_counts.values())
-    if not redrawn_count:
-        return ""
-    return (
-        f"{redrawn_count} of {targets} targets were drawn again because their own simulation "
-        f"diverged ({draws} draws in all)."
-    )
-
-
-def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
-    """Yield notes on isolation, salt and targets that limit how far the results can be trusted.
-
-    Args:
-        results: Comparison with its configuration and the record of its environment.
-    """
-    experiment = results.view.experiment
-    if experiment.trusted:
-        yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
-    if not experiment.salt_sha256:
-        yield "The targets have a public salt, so anyone can draw them."
-    if redraw_note := format_redraws(results):
-        yield redraw_note
+    view = results.view
+    return {
+        "results": results,
+        "view": view,
+        "range_results": list_range_results(results),
+        "floor_text": best_tuner_summary.format_error_floor(view.statistics),
+        "shown_label": view.format_metric_label(view.shown_metric),
+        "trust_note": TRUSTED_TUNERS_NOTE if view.experiment.trusted else "",
+        "target_count": sum(view.statistics.target_counts.values()),
+    }
 
 
 def list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:
@@ -328,33 +201,24 @@ def render_page(results: ComparisonReportData) -> str:
     }
     for chart in charts.values():
         page.add_tables(chart.tables if chart else {}, _DIGITS)
-    range_results = list_range_results(view)
-    rankings = [result.rankings for result in range_results]
-    equal_errors = best_tuner_summary.format_error_floor(view.statistics)
+    statuses = view.stored.statuses
+    values = collect_text_values(results)
+    rankings = [result.rankings for result in values["range_results"]]
     return page.render(
         _TEMPLATE,
-        results=results,
-        view=view,
+        **values,
         charts=charts,
         tuner_count=view.stored.runs["tuner"].nunique(),
         run_count=view.stored.runs["run"].nunique(),
-        equal_errors=equal_errors.capitalize(),
-        floor_text=equal_errors,
-        range_results=range_results,
         together=list(zip(*rankings, strict=True)) if all(rankings) else [],
-        best_headings=[f"best (median error), {result.where}" for result in range_results],
-        conclusion=write_conclusion(view),
-        small_samples=list_small_samples(view),
-        failure_counts=count_failures(view),
+        explain_first=explain_first,
+        failed_count=int(statuses["status"].isin(FAILED_STATUSES).sum()),
+        skipped_count=statuses[statuses["status"] == "skipped"]["tuner"].nunique(),
         failures=list_failures(view),
-        provenance_notes=list(write_provenance_notes(results)),
-        running_times=write_running_times(results),
         mean_seconds=list_mean_seconds(results),
-        shown_label=view.format_metric_label(view.shown_metric),
         last_simulations=str(int(results.tables["table"]["simulations"].max())),
         threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
         stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
         targets_per_training=TARGETS_PER_TRAINING,
         figure_files=FIGURE_FILES,
-        joined=joined,
     )

@@ -17,7 +17,6 @@ import pandas as pd
 
 from bench.benchmark.comparison_charts import make_simulations_axis
 from bench.benchmark.comparison_figures import draw_critical_difference_figure
-from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
@@ -29,6 +28,7 @@ from bench.benchmark.statistics.expected_running_time import (
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
 from bench.benchmark.statistics.tuner_ranking import (
     MIN_PROBLEMS_FOR_RANKS,
+    SIGNIFICANCE,
     compute_nemenyi_p_values,
     compute_problem_ranks,
 )
@@ -418,9 +418,7 @@ def render_multi_problem_page(
     undecided_tuners: list[str] = []
     if p_values is not None:
         for tuner, p_value in p_values[best].drop(best).items():
-            (significantly_worse if p_value < SIGNIFICANCE_LEVEL else undecided_tuners).append(
-                str(tuner)
-            )
+            (significantly_worse if p_value < SIGNIFICANCE else undecided_tuners).append(str(tuner))
     return page.render(
         _TEMPLATE,
         tuners=collection.tuners,
