@@ -98,7 +98,7 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
         **collect_text_values(results),
         error_tables=list(_list_error_tables(tables["table"], view)),
         failures=format_failures(failed),
-        seconds=_format_run_seconds(results),
+        seconds=_build_run_seconds(results),
         figures=figures,
         table_files=[f"{name}.csv" for name in tables if name != "table"],
         report_file=REPORT_FILE,
@@ -147,7 +147,7 @@ def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:
 
 def _list_error_tables(
     lines: pd.DataFrame, view: ComparisonView
-) -> Iterator[tuple[str, str, str, str, bool]]:
+) -> Iterator[tuple[str, str, pd.DataFrame, pd.DataFrame | None, bool]]:
     """Yield the median errors of each range as tables for the terminal.
 
     Args:
@@ -155,7 +155,7 @@ def _list_error_tables(
         view: the comparison.
 
     Yields:
-        Range, metric and table; the table of errors along directions, empty if there are none, and
+        Range, metric and table; the table of errors along directions, None if there are none, and
         whether it has errors in unseen scenarios.
     """
     metrics, statistics = set(lines["metric"]), view.statistics
@@ -167,22 +167,16 @@ def _list_error_tables(
         medians["trained on"] = [
             f"{training[t]:.0f}" if training[t] else "-" for t in medians.index
         ]
-        table = _format_frame(medians.rename(index=statistics.format_label))
-        yield kind, metric, table, *_format_direction_errors(lines, kind, view)
+        table = medians.rename(index=statistics.format_label)
+        yield kind, metric, table, *_build_direction_errors(lines, kind, view)
 
 
-def _format_frame(frame: pd.DataFrame) -> str:
-    """Format numbers with two digits, without names of rows and columns."""
-    unnamed_frame = frame.rename_axis(index=None, columns=None)
-    return unnamed_frame.to_string(float_format=lambda value: f"{value:.2g}")
-
-
-def _format_direction_errors(
+def _build_direction_errors(
     lines: pd.DataFrame, kind: str, view: ComparisonView
-) -> tuple[str, bool]:
-    """Format errors along stiff and sloppy directions, and held-out errors, of one range.
+) -> tuple[pd.DataFrame | None, bool]:
+    """Build the table of errors along directions, and of held-out errors, of one range.
 
-    The table is empty if there are none; the second result is whether it has held-out errors.
+    The table is None if there are none; the second result is whether it has held-out errors.
 
     Args:
         lines: error curves: one row for each tuner, range, metric and number of simulations.
@@ -193,7 +187,7 @@ def _format_direction_errors(
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
     shown_lines = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
     if kind == "real" or shown_lines.empty:
-        return "", False
+        return None, False
     budget = shown_lines["simulations"].max()
     shown_counts = [k for k in (*_PRINTED_CHECKPOINTS, budget) if k <= budget]
     shown_lines = shown_lines[shown_lines["simulations"].isin(shown_counts)]
@@ -206,20 +200,19 @@ def _format_direction_errors(
     medians = shown_lines.pivot(index="tuner", columns="column", values="median")
     medians = medians[[c for c in order if c in medians]].dropna(axis=1, how="all")
     medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
-    table = _format_frame(medians.rename(index=statistics.format_label))
+    table = medians.rename(index=statistics.format_label)
     return table, "heldout_error" in set(shown_lines["metric"])
 
 
-def _format_run_seconds(results: ComparisonReportData) -> str:
-    """Format the mean seconds per run of each tuner, of its simulations, and of its training."""
+def _build_run_seconds(results: ComparisonReportData) -> pd.DataFrame:
+    """Build the table of mean seconds per run: tuner, simulations and training."""
     columns = {
         "tuner_seconds": "tuner",
         "simulator_seconds": "simulator",
         "fit_seconds": "one training",
     }
     rows = dict(list_mean_seconds(results))
-    seconds = pd.DataFrame.from_dict(rows, orient="index")[list(columns)].rename(columns=columns)
-    return _format_frame(seconds)
+    return pd.DataFrame.from_dict(rows, orient="index")[list(columns)].rename(columns=columns)
 
 
 def format_failures(failed: pd.DataFrame) -> list[str]:

@@ -33,7 +33,7 @@ from bench.figures.style import (
     add_trust_note,
     make_panel_grid,
 )
-from bench.pages.chart_figure import draw_chart
+from bench.pages.chart_figure import draw_chart, finish_chart
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -116,11 +116,9 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     # Width and height in inches, with the space for each category.
     size = (2.0 + 1.5 * len(panel.across.names), 4.2)
     figure, axes = draw_chart([replace(panel, title="")], {panel.table: table}, size=size)
-    entries = axes[0].get_legend_handles_labels()
-    figure.legend(*entries, loc="outside right upper", fontsize=8, frameon=False)
     note = "each shot with a ball and a recorded drop of its own; bars: 95 % intervals (Wilson)"
-    figure.suptitle(f"{experiment.title or experiment.name}\n{note}", fontsize=10)
-    return figure
+    title = f"{experiment.title or experiment.name}\n{note}"
+    return finish_chart(figure, axes[0], title, legend="outside right upper")
 
 
 def _label_methods(axis: Axes, methods: Sequence[str]) -> None:

@@ -16,9 +16,9 @@ from bench.diagnosis import many_logs
 from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult
 from bench.diagnosis.report import effect_and_unit_text
 from bench.figures import figure_output, style
-from bench.figures.style import add_caption, break_name
+from bench.figures.style import break_name
 from bench.pages.chart import Axis, Panel, ReferenceLine, Series
-from bench.pages.chart_figure import draw_chart
+from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 from sims.core.simulator import InputError
@@ -258,8 +258,4 @@ def draw_summary_figure(
     figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
     for axis, panel in zip(axes, panels, strict=True):
         axis.set_title(break_name(panel.title, _TITLE_LINE), fontsize=8.5, parse_math=False)
-    if len(panels[0].series) > 1:
-        entries = axes[0].get_legend_handles_labels()
-        figure.legend(*entries, loc="outside upper center", fontsize=8, frameon=False)
-    add_caption(figure, caption, letters=17)
-    return figure
+    return finish_chart(figure, axes[0], caption=caption, legend="outside upper center")

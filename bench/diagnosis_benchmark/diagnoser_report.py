@@ -38,7 +38,7 @@ from bench.diagnosis_benchmark.result_tables import (
 from bench.figures import style
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
 from bench.figures.style import add_trust_note
-from bench.pages.chart_figure import draw_chart
+from bench.pages.chart_figure import draw_chart, finish_chart
 from sims.core.files import write_atomically
 from sims.core.plain_values import align_columns
 
@@ -91,11 +91,8 @@ def draw_chart_figures(data: DiagnoserReportData) -> dict[str, Figure]:
         if charts[name]:
             size = _SINGLE_PANEL_SIZE if len(charts[name]) == 1 else None
             figure, axes = draw_chart(charts[name], tables, size=size)
-            entries = axes[0].get_legend_handles_labels()
-            figure.legend(*entries, loc="outside right upper", fontsize=9, frameon=False)
-            figure.suptitle(data.title, fontsize=11)
-            style.add_caption(figure, caption.format(**data.counts), letters=16)
-            figures[name] = figure
+            text = caption.format(**data.counts)
+            figures[name] = finish_chart(figure, axes[0], data.title, text, "outside right upper")
     return figures
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from bench.figures.style import (
     CAPTION_GREY,
     NOISE_BAND_GREY,
+    add_caption,
     break_name,
     make_panel_grid,
     set_title,
@@ -86,14 +87,17 @@ def draw_chart(
     columns = columns or max(len(panels), 1)
     row_count = max(-(-len(panels) // columns), 1)
     width, height = size or PANEL_SIZE
-    shared = all(panel.up == panels[0].up for panel in panels)
+    shared = all(
+        panel.up == panels[0].up and (not horizontal or panel.across == panels[0].across)
+        for panel in panels
+    )
     figure, grid = make_panel_grid(
         row_count,
         columns,
         # Width and height in inches: margins and panels.
         (1.2 + width * columns, 0.6 + height * row_count),
-        sharey=shared or ("row" if row_count > 1 else False),
-        sharex=row_count > 1,
+        sharey=shared or ("row" if row_count > 1 and not horizontal else False),
+        sharex=row_count > 1 and not horizontal,
     )
     axes = list(grid.flat)
     for axis in axes[len(panels) :]:
@@ -102,13 +106,40 @@ def draw_chart(
         _draw_panel(axis, panel, tables[panel.table], horizontal)
     for i, axis in enumerate(axes[: len(panels)]):
         # Panels that share an axis have its label once.
-        if i + columns < len(panels) and row_count > 1:
+        below = axes[i + columns] if i + columns < len(panels) else None
+        if below is not None and axis.get_xlabel() == below.get_xlabel():
             axis.set_xlabel("")
         if i % columns and axis.get_ylabel() == axes[i - 1].get_ylabel():
             axis.set_ylabel("")
     for axis, panel in zip(axes, panels, strict=False):
         _draw_rules(axis, panel.rules, horizontal)
     return figure, axes[: len(panels)]
+
+
+def finish_chart(
+    figure: Figure,
+    axis: Axes,
+    title: str = "",
+    caption: str = "",
+    legend: Any = "outside right center",
+) -> Figure:
+    """Add the legend, title and caption to a figure of a chart, and return it.
+
+    Args:
+        figure: Figure of `draw_chart`.
+        axis: Panel whose series are in the legend, if there are several.
+        title: Title; empty for none.
+        caption: Caption; empty for none.
+        legend: Location of the legend.
+    """
+    handles, labels = axis.get_legend_handles_labels()
+    if len(labels) > 1:
+        figure.legend(handles, labels, loc=legend, fontsize=8, frameon=False)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    if caption:
+        add_caption(figure, caption, letters=16)
+    return figure
 
 
 def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizontal: bool) -> None:

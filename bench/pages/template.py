@@ -34,6 +34,7 @@ from bench.pages.text_format import (
 from sims.core.plain_values import align_columns, format_count
 
 if TYPE_CHECKING:
+    import pandas as pd
     from jinja2 import Environment, Template
 
 
@@ -62,7 +63,7 @@ def render_text(path: Path, **values: Any) -> list[str]:
     Returns:
         Lines of the text.
     """
-    return load_template(path).render(**values).split("\n")
+    return load_template(path).render(**values).removesuffix("\n").split("\n")
 
 
 @cache
@@ -96,6 +97,7 @@ def _get_environment(is_html: bool = True) -> Environment:
         "count": format_count,
         "document": format_document,
         "fill": textwrap.fill,
+        "frame": format_frame,
         "joined": joined,
         "number": format_number,
         "p_value": format_p_value,
@@ -149,6 +151,18 @@ def align_cells(text: str, left_columns: int) -> str:
     """
     rows = [line.split(CELL_SEPARATOR) for line in text.strip("\n").split("\n")]
     return "\n".join(align_columns(rows, left_columns)) + "\n"
+
+
+def format_frame(frame: pd.DataFrame, spec: str) -> str:
+    """Format a table of numbers for a terminal, without names of its axes.
+
+    Args:
+        frame: Table with the names of its rows as index.
+        spec: Format of its numbers, such as ``.2g``.
+    """
+    unnamed: pd.DataFrame = frame.rename_axis(index=None, columns=None)
+    text: str = unnamed.to_string(float_format=lambda value: f"{value:{spec}}")
+    return text
 
 
 def quote_words(words: Iterable[object]) -> Markup:
