@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -31,8 +31,6 @@ from bench.figures.style import (
 )
 from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 from bench.pages.html_page import HtmlPage
-from bench.pages.text_format import format_p_value, format_percent, sanitise
-from sims.core.plain_values import format_count
 
 
 @dataclass(frozen=True)
@@ -307,130 +305,52 @@ def _make_cost(data: DiagnoserReportData) -> list[Panel]:
 
 _SIGNIFICANCE_LEVEL = 0.05
 """Maximum Holm-corrected p-value for a significant difference between two diagnosers."""
-_SENTENCES_BY_KIND = {
-    "clean": "false alarms in {of} clean recordings",
-    "single": "of {of} single effects of at least one noise",
-    "double": "of {of} pairs",
-    "foreign": "of {of} causes outside the library",
-}
 
 
-class OwnFailures(NamedTuple):
-    """Number of questions that simgap fails on, of all questions, and failures by kind."""
-
-    wrong: int
-    questions: int
-    kinds: list[str]
-
-
-def count_own_failures(data: DiagnoserReportData) -> OwnFailures | None:
-    """Count the incorrect graded answers of simgap itself, in total and by kind of case.
+def count_own_failures(data: DiagnoserReportData) -> dict[str, tuple[int, int]]:
+    """Count the incorrect graded answers of simgap itself, and all of them, by kind of case.
 
     The report states these numbers, so that the failures of simgap itself are visible.
-
-    Returns:
-        The counts; None if simgap does not take part in the comparison.
     """
-    graded_rows = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
-    if graded_rows.empty:
-        return None
-    wrong_rows = graded_rows[~is_correct(graded_rows)]
-    counts = {kind: int((graded_rows["kind"] == kind).sum()) for kind in _SENTENCES_BY_KIND}
-    kinds = [
-        f"{int((wrong_rows['kind'] == kind).sum())} {_SENTENCES_BY_KIND[kind].format(of=count)}"
-        for kind, count in counts.items()
-        if count
-    ]
-    return OwnFailures(len(wrong_rows), len(graded_rows), kinds)
+    rows = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
+    wrong = rows[~is_correct(rows)]["kind"].value_counts()
+    counts = rows["kind"].value_counts()
+    return {kind: (int(wrong.get(kind, 0)), int(counts[kind])) for kind in counts.index}
 
 
-class Leader(NamedTuple):
-    """Best diagnoser among those with few false alarms.
-
-    Attributes:
-        name: Name of the diagnoser; empty if all have too many false alarms.
-        candidates: Names of the diagnosers with few false alarms.
-        share: Causes that it names.
-        significance: Whether its lead over the others is significant.
-        clean: Number of clean recordings.
-        alarms: Its false alarms in words; empty if they show that its rate is below the limit.
-        alarm_limit: Upper limit of its rate of false alarms.
-    """
-
-    name: str
-    candidates: tuple[str, ...] = ()
-    share: str = ""
-    significance: str = ""
-    clean: int = 0
-    alarms: str = ""
-    alarm_limit: float = 0.0
-
-
-def find_leader(data: DiagnoserReportData) -> Leader | None:
+def find_leader(data: DiagnoserReportData) -> dict[str, Any] | None:
     """Find the best diagnoser among those with few false alarms.
 
     The best one has the highest primary metric. Diagnosers with more than `TARGET_FALSE_ALARM_RATE`
     false alarms cannot lead, because a diagnoser that always alarms finds every cause.
 
     Returns:
-        The best diagnoser, with name "" if all have too many false alarms; None if there are no
-        clean cases, in which false alarms could be counted.
+        ``name`` of the best one; ``candidates``, the diagnosers with few false alarms; ``alarms``
+        and ``named`` causes, the rows of the best one. If it is simgap, ``similar`` are the
+        diagnosers that do not differ significantly from it, and ``p_value`` is the largest one.
+        None if there are no clean cases, in which false alarms could be counted.
     """
-    metrics = data.tables["table"]
-    alarms = index_by_diagnoser(metrics, "false alarms")
-    named_shares = index_by_diagnoser(metrics, PRIMARY_METRIC)
+    alarms = index_by_diagnoser(data.tables["table"], "false alarms")
+    named = index_by_diagnoser(data.tables["table"], PRIMARY_METRIC)
     if not any(row["of"] for row in alarms.values()):
         return None
-    with_few_alarms = [
-        name for name in data.order if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE
+    candidates = [
+        name
+        for name in data.order
+        if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE and named[name]["of"]
     ]
-    candidates = [name for name in with_few_alarms if named_shares[name]["of"]]
     if not candidates:
-        return Leader("")
-    leader = max(candidates, key=lambda name: float(named_shares[name]["share"]))
-    other_names = [name for name in candidates if name != leader]
-    named = named_shares[leader]
-    low, high = format_percent(named["low"]), format_percent(named["high"])
-    share_text = (
-        f"{int(named['count'])} of {int(named['of'])}, "
-        f"{format_percent(named['share'])} (95 % interval {low} to {high})"
-    )
-    leader_alarms, alarms_text = alarms[leader], ""
-    if leader_alarms["high"] > TARGET_FALSE_ALARM_RATE:
-        alarms_text = format_count(int(leader_alarms["count"]), "false alarm")
-    return Leader(
-        leader,
-        tuple(candidates),
-        share_text,
-        significance=_format_significance(data, leader, other_names),
-        clean=int(leader_alarms["of"]),
-        alarms=alarms_text,
-        alarm_limit=float(leader_alarms["high"]),
-    )
-
-
-def _format_significance(data: DiagnoserReportData, best: str, other_names: list[str]) -> str:
-    """Say whether simgap as the best diagnoser differs significantly from the others.
-
-    The p-values are those of McNemar's test, corrected by Holm's method for several comparisons.
-
-    Args:
-        data: tables of the comparison.
-        best: name of the best diagnoser.
-        other_names: names of the others.
-
-    Returns:
-        One sentence, or an empty text if there are no others or if simgap is not the best: only
-        pairs with simgap are tested.
-    """
-    if not other_names or best != REFERENCE_DIAGNOSER:
-        return ""
-    rows = index_by_diagnoser(data.tables["pairs"], "named")
-    similar = [name for name in other_names if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
-    if similar:
-        return f"It does not differ significantly from {', '.join(similar)} (McNemar, Holm)."
-    largest = max(float(rows[name]["p_holm"]) for name in other_names)
-    return f"It differs significantly from all others ({format_p_value(largest)}; McNemar, Holm)."
+        return {"candidates": []}
+    best = max(candidates, key=lambda name: float(named[name]["share"]))
+    rows = {"alarms": alarms[best], "named": named[best]}
+    leader = {"name": best, "candidates": candidates, **rows, "similar": [], "p_value": None}
+    if best != REFERENCE_DIAGNOSER or len(candidates) == 1:
+        return leader
+    # McNemar's test, corrected by Holm's method for several comparisons.
+    pairs = index_by_diagnoser(data.tables["pairs"], "named")
+    p_values = {name: float(pairs[name]["p_holm"]) for name in candidates if name != best}
+    similar = [name for name, p_value in p_values.items() if p_value >= _SIGNIFICANCE_LEVEL]
+    return {**leader, "similar": similar, "p_value": max(p_values.values())}
 
 
 def list_better_diagnosers(data: DiagnoserReportData) -> list[dict[Hashable, Any]]:
@@ -440,33 +360,6 @@ def list_better_diagnosers(data: DiagnoserReportData) -> list[dict[Hashable, Any
         return []
     significant = pairs["p_holm"] < _SIGNIFICANCE_LEVEL
     return pairs[significant & (pairs["only_other"] > pairs["only_simgap"])].to_dict("records")
-
-
-def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
-    """Yield sentences about limitations of the results.
-
-    They concern diagnosers without isolation, missing cases, failed answers, unsupported cases, and
-    skipped diagnosers.
-
-    Args:
-        data: graded answers and result tables of all diagnosers.
-    """
-    if data.experiment.trusted:
-        yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
-    if data.case_count < data.planned:
-        yield (
-            f"{data.case_count} of {data.planned} questions: those that every diagnoser has "
-            "answered. Questions are asked in random order, so these are a fair sample."
-        )
-    failed = data.rows[data.rows["status"] != "done"]
-    if len(failed):
-        counts = failed.groupby("diagnoser").size()
-        counts_text = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
-        yield f"Without an answer (crashed, too late or too costly): {counts_text}."
-    for name, reason, count in summarise_unsupported(data.left_out):
-        yield f"{sanitise(name, 60)} does not support {count} of the cases: {reason}."
-    for name, reason in data.skipped.items():
-        yield f"{sanitise(name, 60)} was not run: {reason}"
 
 
 def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
@@ -514,10 +407,12 @@ def render_page(data: DiagnoserReportData) -> str:
         PRIMARY_METRIC=PRIMARY_METRIC,
         own=count_own_failures(data),
         leader=find_leader(data),
-        limit=f"{100 * TARGET_FALSE_ALARM_RATE:g} %",
+        alarm_limit=TARGET_FALSE_ALARM_RATE,
         better=better_diagnosers,
         has_pairs=len(data.tables["pairs"]) > 0,
-        warnings=list(write_warnings(data)),
+        trust_note=TRUSTED_TUNERS_NOTE if data.experiment.trusted else "",
+        unanswered=data.rows[data.rows["status"] != "done"].groupby("diagnoser").size(),
+        unsupported=summarise_unsupported(data.left_out),
         has_own_failures=bool((failures["diagnoser"] == REFERENCE_DIAGNOSER).any()),
         charts=make_charts(data),
         **data.counts,

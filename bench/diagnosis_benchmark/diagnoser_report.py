@@ -5,7 +5,7 @@ The printed figures are readable in greyscale.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -39,8 +39,8 @@ from bench.figures import style
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
 from bench.figures.style import add_trust_note
 from bench.pages.chart_figure import draw_chart, finish_chart
+from bench.pages.template import render_text
 from sims.core.files import write_atomically
-from sims.core.plain_values import align_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -371,30 +371,34 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
     for name, picture in report_data.pictures.items():
         write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
     write_atomically(study.folder / REPORT_FILE, render_page(report_data))
-    for line in format_summary(tables, order):
-        print_line(line)
-    for name, reason, count in summarise_unsupported(left_out):
-        print_line(f"{name} does not support {count} of the cases: {reason}")
-    answered_count, planned_count = rows["question"].nunique(), len(study.cases)
-    undetectable_count = sum(not answer["item"] for answer in study.answers.values())
-    print_line(
-        f"{answered_count} questions of {planned_count}; of {undetectable_count} the sensors "
-        "cannot show what is hidden"
-    )
-    print_line(
-        f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, "
-        f"{', '.join(f'{n}.csv' for n in tables)}"
-    )
-    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(report_data.pictures))}")
-    print_line(f"report: {study.folder / REPORT_FILE}")
     failed = rows[rows["status"] != "done"]
-    for _, row in failed.head(_MAX_LISTED_FAILURES).iterrows():
-        print_line(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
-    if len(failed) > _MAX_LISTED_FAILURES:
-        print_line(f"({len(failed)} answers failed; see {ANSWERS_TABLE_FILE})")
+    lines = render_text(
+        _TEMPLATE,
+        shown=report_data,
+        shares={metric: index_by_diagnoser(tables["table"], metric) for metric in _SUMMARY_METRICS},
+        columns=list(_SUMMARY_METRICS.values()),
+        costs=index_by_diagnoser(tables["costs"]),
+        unsupported=summarise_unsupported(left_out),
+        undetectable_count=sum(not answer["item"] for answer in study.answers.values()),
+        answers_file=ANSWERS_TABLE_FILE,
+        report_path=study.folder / REPORT_FILE,
+        failed=failed.to_dict("records"),
+        max_failures=_MAX_LISTED_FAILURES,
+    )
+    for line in lines:
+        print_line(line)
     return len(failed)
 
 
+_TEMPLATE = Path(__file__).with_name("diagnosers.txt")
+_SUMMARY_METRICS = {
+    "false alarms": "false alarms",
+    "named, alone": "named alone",
+    PRIMARY_METRIC: "in a set of 2",
+    "pairs: both named": "both of two",
+    "foreign causes: unknown or partial": "foreign",
+}
+"""Metrics of the printed leaderboard, with the headings of their columns."""
 _MAX_LISTED_FAILURES = 5
 """Maximum number of failed answers that are printed."""
 
@@ -425,37 +429,3 @@ def draw_figures(data: DiagnoserReportData) -> dict[str, FigureFiles]:
         name: render_all_formats(add_trust_note(figure, data.experiment.trusted))
         for name, figure in figures.items()
     }
-
-
-def format_summary(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
-    """Format the leaderboard as aligned text lines.
-
-    Args:
-        tables: tables by name.
-        order: names of the diagnosers.
-
-    Returns:
-        A header line and one line per diagnoser with its false alarms, diagnosed single causes,
-        pairs, unmodelled causes and median cost.
-    """
-    columns = (
-        ("false alarms", "false alarms"),
-        ("named, alone", "named alone"),
-        (PRIMARY_METRIC, "in a set of 2"),
-        ("pairs: both named", "both of two"),
-        ("foreign causes: unknown or partial", "foreign"),
-    )
-    rows_by_metric = {metric: index_by_diagnoser(tables["table"], metric) for metric, _ in columns}
-    costs = index_by_diagnoser(tables["costs"])
-    head = ["diagnoser", *(title for _, title in columns), "simulations", "seconds"]
-    lines = [head]
-    for name in order:
-        cells = [name]
-        for metric, _ in columns:
-            line = rows_by_metric[metric][name]
-            interval = f"{100 * line['low']:.0f}-{100 * line['high']:.0f}"
-            cells.append(f"{100 * line['share']:.0f} % ({interval})" if line["of"] else "-")
-        cost = costs[name]
-        cells += [f"{cost['simulations_median']:.0f}", f"{cost['processor_seconds_median']:.2f}"]
-        lines.append(cells)
-    return align_columns(lines, len(head))

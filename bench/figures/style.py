@@ -266,21 +266,6 @@ class TunerStyles:
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
         self.order = [label for label in order if label in self._places]
 
-    def get_plot_style(self, tuner: str) -> dict[str, Any]:
-        """Return keyword arguments for plotting `tuner`.
-
-        Args:
-            tuner: Label of the tuner.
-        """
-        i = self._places[tuner]
-        return {
-            "color": _COLOURS[i % len(_COLOURS)],
-            "marker": get_marker(i),
-            "linestyle": _LINES[i % len(_LINES)],
-            "linewidth": 1.6,
-            "label": tuner,
-        }
-
     def get_mark_style(self, tuner: str) -> MarkStyle:
         """Return the style of `tuner` on a page."""
         return get_mark_style(self._places[tuner])
