@@ -80,7 +80,7 @@ def best_table(held):
 
 
 def conclusions(held):
-    return re.findall("<li>(.*?)</li>", part(held, '<div class="conclusion">', "</div>"))
+    return re.findall("<li>(.*?)</li>", part(held, '<div class="conclusion">', '<p class="'))
 
 
 def running_times(held):
