@@ -26,11 +26,12 @@ KNOCKS = (1e-5, 5e-4)  # Larger, because the force has a kink if a flank is met 
 TURNS = (2e-3, 8e-3)  # Larger, because the force jumps if a motion reverses between two steps.
 BASE = {"ball": {"restitution": 0.7}, "pendulum": {"inertia": 0.004}, "slider": {"mass": 1.2}}
 OTHER_COEFFICIENTS = {
+    ("pendulum", "friction.warming"): (0.015, 1e-3, 0.8),
     ("pendulum", "sensor.eccentricity"): (0.05, 0.04),
     ("pendulum", "sensor.gain"): (0.05,),
     ("slider", "state.limit"): (40.0, 0.6, 0.3),
 }
-"""Coefficients of effects that would change these motions too little with those of the engines."""
+"""Coefficients of effects with which those of the engines change too little, or are 1."""
 EFFECTS = [
     (system, effect)
     for system, simulator in SIMULATORS.items()

@@ -5,7 +5,6 @@ import pytest
 
 from sims.core.simulator import InputError, Scenario
 from sims.engines.compiled.force_program import compute_own_inertia
-from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider, SliderSystem
 from tests.sims.effects.effect_systems import batch_coefficients, moment
 
@@ -18,69 +17,6 @@ def slide(effects, u=0.0, v=0.0, **settings):
     simulator = Slider(engine="batch", fixed=effects, **settings)
     run = Scenario(TIMES, {"x": 0.0, "v": v}, {"u": np.broadcast_to(u, TIMES.shape).copy()})
     return simulator.simulate(np.array([[MASS]]), run)[0].T
-
-
-def test_two_masses_under_a_steady_push_swing_about_their_centre():
-    share, frequency, push = 0.3, 20.0, 2.0
-    x, v = slide({"joint.flexibility": (share, frequency, 0.0)}, push)
-    stretched = push / (MASS * frequency**2)
-    together = frequency / np.sqrt(1 - share)
-    swing = share * stretched * (1 - np.cos(together * TIMES))
-    np.testing.assert_allclose(x, push / MASS * TIMES**2 / 2 + swing, atol=2e-8)
-    rate = share * stretched * together * np.sin(together * TIMES)
-    np.testing.assert_allclose(v, push / MASS * TIMES + rate, atol=1e-6)
-
-
-def test_a_load_hangs_from_its_drive_where_the_run_begins():
-    # At 90 degrees the drive holds the whole weight; the load stays at its deflected angle.
-    mass, length, gravity = 0.2, 0.5, 9.81
-    constants = {"mass": mass, "length": length, "gravity": gravity}
-    simulator = Pendulum(constants, engine="batch", fixed={"joint.flexibility": (0.5, 60.0, 0.3)})
-    inertia, torque = 0.06, mass * gravity * length
-    run = Scenario(TIMES, {"q": np.pi / 2, "qd": 0.0}, {"u": np.full(TIMES.shape, torque)})
-    q, _ = simulator.simulate(np.array([[inertia]]), run)[0].T
-    # The weight torque at the load's angle is smaller by the square of its deflection.
-    sag = torque / inertia / 60.0**2
-    assert sag > 4e-3
-    less = 0.5 * torque * (1 - np.cos(sag)) / inertia
-    np.testing.assert_allclose(q - np.pi / 2, less * TIMES**2 / 2, atol=2e-4)
-
-
-def test_a_damped_load_comes_to_rest_on_its_drive():
-    pulse = np.where(TIMES < 0.2, 3.0, 0.0)
-    _, v = slide({"joint.flexibility": (0.6, 30.0, 0.5)}, pulse)
-    # Only the momentum of the pulse remains.
-    np.testing.assert_allclose(v[150:], 3.0 * 0.2 / MASS, rtol=1e-6)
-
-
-def test_through_a_gap_the_drive_moves_alone_until_it_meets_the_flank():
-    gap, share, push = 0.08, 0.4, 1.5
-    x, v = slide({"joint.backlash": (gap, share)}, push)
-    near = (1 - share) * MASS
-    alone = push / near * TIMES**2 / 2
-    apart = alone < gap / 2
-    assert 20 < apart.sum() < 40
-    np.testing.assert_allclose(x[apart], alone[apart], rtol=1e-6, atol=1e-9)
-    met = np.sqrt(gap * near / push)
-    # The impact has no rebound: then both move together and momentum is conserved.
-    together = x[met + 0.15 < TIMES] - (push / MASS * TIMES**2 / 2)[met + 0.15 < TIMES]
-    assert np.ptp(together) < 2e-4
-    np.testing.assert_allclose(v[-1], push * TIMES[-1] / MASS, rtol=1e-3)
-
-
-def test_surfaces_that_yield_take_the_work_of_their_curve():
-    most, deflection, push = 0.8, 0.05, 2.0
-    x, v = slide({"friction.hysteresis": (most, deflection)}, push)
-    rubbed = most * (x - deflection * (1 - np.exp(-x / deflection)))
-    np.testing.assert_allclose(MASS * v**2 / 2, push * x - rubbed, rtol=2e-5, atol=1e-6)
-
-
-def test_stiff_hysteresis_acts_as_dry_friction():
-    pulses = np.where(TIMES % 0.8 < 0.4, 3.0, -3.0)
-    dry, _ = slide({"friction.coulomb": 0.7}, pulses)
-    yielding, _ = slide({"friction.hysteresis": (0.7, 1e-4)}, pulses)
-    free, _ = slide({}, pulses)
-    assert np.abs(yielding - dry).max() < 0.01 * np.abs(free - dry).max()
 
 
 def test_dry_friction_holds_the_drive_while_the_load_swings_on():

@@ -34,17 +34,6 @@ def test_input_delay_is_an_exact_shift(delay, within):
     assert x == pytest.approx(since**2 / 2, abs=within)
 
 
-def test_input_hold_goes_straight_from_sample_to_sample():
-    """The input of each interval is the mean of its end samples; a coefficient of 0.3 mixes it with
-    the held input.
-    """
-    wave = 2 * np.sin(4 * TIMES)
-    middles = 0.5 * (wave[1:] + wave[:-1])
-    assert compute_applied_input({"input.hold": 1.0}, wave) == pytest.approx(middles, abs=1e-9)
-    mixed = 0.7 * wave[:-1] + 0.3 * middles
-    assert compute_applied_input({"input.hold": 0.3}, wave) == pytest.approx(mixed, abs=1e-9)
-
-
 def moved(effects=(), coefficients=(), **stated):
     """Simulate a driven slider with additional properties of its inputs in the recording."""
     times = np.arange(0, 3, 0.02)
@@ -76,61 +65,6 @@ def test_a_chain_starts_settled():
     assert compute_applied_input(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
     readings, _ = slide({"sensor.gain": 0.5, "sensor.bias": 0.2, "sensor.lag": 0.3}, x=2.0)
     assert readings == pytest.approx(3.2, abs=1e-12)
-
-
-@pytest.mark.parametrize("delay", [0.1, 0.1234])
-def test_sensor_delay_is_an_exact_shift(delay):
-    times = np.arange(0, 2, 0.02)
-    late = run("pendulum", times, {"sensor.delay": delay}, q=0.8, qd=1.0)
-    shifted = times[times >= delay] - delay
-    prompt = run("pendulum", np.concatenate([[0.0], shifted[shifted > 0]]), q=0.8, qd=1.0)
-    assert late[times < delay] == pytest.approx(
-        np.tile(prompt[0], (int((times < delay).sum()), 1)), abs=0
-    )
-    assert late[times > delay] == pytest.approx(prompt[1:], abs=1e-7)
-
-
-def test_sensor_gain_bias_and_drift_change_one_channel():
-    x, v = slide({"sensor.gain": 0.1, "sensor.bias": 0.2, "sensor.drift": 0.05}, x=1.0, v=3.0)
-    assert x == pytest.approx(1.1 * (1 + 3 * TIMES) + 0.2 + 0.05 * TIMES, abs=1e-9)
-    assert v == pytest.approx(3.0, abs=1e-9)
-
-
-def test_a_skewed_clock_stretches_the_record():
-    skewed = run("pendulum", TIMES, {"clock.skew": 0.04}, q=0.8)
-    stretched = run("pendulum", TIMES * 1.04, q=0.8)
-    assert skewed == pytest.approx(stretched, abs=1e-7)
-    assert np.abs(skewed - run("pendulum", TIMES, q=0.8)).max() > 0.1
-
-
-def test_an_eccentric_encoder_is_off_by_a_sine_of_the_angle():
-    times = np.arange(0, 2, 0.01)
-    initial = {"q": 0.3, "qd": 25.0}
-    inputs = {"u": np.zeros(times.size)}
-    fixed = {"sensor.eccentricity": (0.03, -0.02)}
-    true, rate = run("pendulum", times, {}, [3.3e-3], inputs, **initial).T
-    seen, other = run("pendulum", times, fixed, [3.3e-3], inputs, **initial).T
-    assert np.ptp(true) > np.pi
-    assert seen == pytest.approx(true + 0.03 * np.sin(true) - 0.02 * np.cos(true), abs=1e-12)
-    assert np.array_equal(other, rate)
-
-
-def test_an_encoder_that_slipped_is_off_from_an_instant_of_the_clock_on():
-    times, slip = 5.0 + np.arange(0, 2, 0.01), {"sensor.slip": (0.03, 5.705)}
-    inputs = {"u": np.zeros(times.size)}
-    true, rate = run("pendulum", times, {}, [3.3e-3], inputs, q=0.8).T
-    seen, other = run("pendulum", times, slip, [3.3e-3], inputs, q=0.8).T
-    assert seen == pytest.approx(true + np.where(times > 5.705, 0.03, 0.0), abs=1e-12)
-    assert np.array_equal(other, rate)
-    # An offset a quarter of a sample earlier or later changes only that sample.
-    for late, share in ((0.0025, 0.75), (-0.0025, 0.25)):
-        moved = {"sensor.slip": (0.03, 5.705 + late)}
-        between = run("pendulum", times, moved, [3.3e-3], inputs, q=0.8)[:, 0] - true
-        sample = 71 if late > 0 else 70
-        assert between[sample] == pytest.approx(0.03 * share, abs=1e-9)
-        assert np.delete(between, sample) == pytest.approx(
-            np.delete(np.where(times > 5.705, 0.03, 0.0), sample), abs=1e-12
-        )
 
 
 def test_a_slip_before_the_run_is_a_bias():
