@@ -100,6 +100,7 @@ def _get_environment(is_html: bool = True) -> Environment:
         "frame": format_frame,
         "joined": joined,
         "number": format_number,
+        "one_line": lambda text: " ".join(text.split()),
         "p_value": format_p_value,
         "percent": format_percent,
         "shell": quote_words,

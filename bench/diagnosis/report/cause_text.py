@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,6 @@ from bench.diagnosis.report.effect_and_unit_text import (
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Candidate, Cause
 from bench.figures.robot_figure import PlaceMark
-from sims.extended_simulator import FittedValue
 from sims.robot.fitted_causes import GRAVITY_COMPENSATED
 
 MAX_NAMED_MEMBERS = 6
@@ -112,37 +112,42 @@ def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     )
 
 
-def format_missing_causes(causes: Sequence[Cause]) -> str:
+def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = True) -> str:
     """Format what a simulation lacks and has wrong; causes with alternatives come last.
 
     For example ``lacks wind, and linear drag or Coulomb friction``. Some causes are missing
     effects, others are wrong values of the model file; if the alternatives of a cause are of both
     kinds, the text is ``either lacks ... or has ...``.
+
+    Args:
+        causes: Causes.
+        with_alternatives: Whether to name the alternatives of each cause.
     """
-    missing_texts: list[str] = []
-    wrong_value_texts: list[str] = []
-    mixed_texts: list[str] = []
-    certain_effects = [cause.effect for cause in causes if not cause.alternatives]
+    if not with_alternatives:
+        causes = [replace(cause, alternatives=()) for cause in causes]
+    texts: dict[str, list[str]] = {"lacks": [], "has": [], "either": []}
+    certain = [cause.effect for cause in causes if not cause.alternatives]
     # Causes without alternatives share one list; each other cause has its own "or" list.
-    for is_wrong, parts_list in ((False, missing_texts), (True, wrong_value_texts)):
-        if names := [name for name in certain_effects if is_parameter_error(name) == is_wrong]:
-            parts_list.append(joined([format_effect(name) for name in names]))
+    for verb, is_wrong in (("lacks", False), ("has", True)):
+        if names := [name for name in certain if is_parameter_error(name) == is_wrong]:
+            texts[verb].append(joined([format_effect(name) for name in names]))
     for cause in causes:
-        if not cause.alternatives:
-            continue
-        names = [cause.effect, *cause.alternatives]
-        wrong_names = [name for name in names if is_parameter_error(name)]
-        missing_names = [name for name in names if name not in wrong_names]
-        if wrong_names and missing_names:
-            missing_text = format_effect_set(missing_names)
-            mixed_texts.append(
-                f"either lacks {missing_text} or has {format_effect_set(wrong_names)}"
-            )
-        else:
-            (wrong_value_texts if wrong_names else missing_texts).append(format_effect_set(names))
-    parts = [f"lacks {', and '.join(missing_texts)}"] if missing_texts else []
-    parts += [f"has {', and '.join(wrong_value_texts)}"] if wrong_value_texts else []
-    return ", and ".join([*parts, *mixed_texts])
+        names = [cause.effect, *cause.alternatives] if cause.alternatives else []
+        wrong = format_effect_set([name for name in names if is_parameter_error(name)])
+        missing = format_effect_set([name for name in names if not is_parameter_error(name)])
+        if wrong and missing:
+            texts["either"].append(f"either lacks {missing} or has {wrong}")
+        elif names:
+            texts["has" if wrong else "lacks"].append(wrong or missing)
+    parts = [f"{verb} {', and '.join(texts[verb])}" for verb in ("lacks", "has") if texts[verb]]
+    return ", and ".join([*parts, *texts["either"]])
+
+
+def names_parameter_error(causes: Sequence[Cause]) -> bool:
+    """Return whether a cause, or an alternative of one, is a wrong value of the model file."""
+    return any(
+        is_parameter_error(name) for cause in causes for name in (cause.effect, *cause.alternatives)
+    )
 
 
 def format_causes(causes: Sequence[Cause]) -> str:
@@ -167,12 +172,17 @@ def format_number_error(cause: Cause) -> str:
         return sanitise(cause.says)
     if base in _STEP_ERROR_TEXTS:
         return f"{_STEP_ERROR_TEXTS[base]}: {sanitise(cause.says).rstrip('.')}"
-    format_error = _MODEL_FILE_ERROR_FORMATTERS.get(base)
     values = list(cause.coefficients.values())
-    if format_error is None or not place or place == ALL_PLACES or not values:
+    if base not in _MODEL_FILE_ERRORS or not place or place == ALL_PLACES or not values:
         return ""
-    return format_error(
-        format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(), values
+    first, norm = values[0], float(np.linalg.norm([n.value for n in values]))
+    return _MODEL_FILE_ERRORS[base].format(
+        place=format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(),
+        percent=format_percent(abs(first.value)),
+        size=append_unit(format_number(abs(first.value), 2), first.unit),
+        distance=append_unit(format_number(norm, 2), first.unit),
+        angle=f"{format_number(float(np.rad2deg(norm)), 2)}°",
+        larger="larger" if first.value > 0 else "smaller",
     )
 
 
@@ -183,107 +193,30 @@ def is_overstated(cause: Cause) -> bool:
     return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
 
 
-def _compare(change: float) -> str:
-    """Return ``larger`` for a positive change and ``smaller`` for others."""
-    return "larger" if change > 0 else "smaller"
-
-
-def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
-    """Return a function that says by which percentage a quantity differs from the model file.
-
-    The function takes the place in words and the fitted values; the first value is the relative
-    change.
-    """
-
-    def say(where: str, values: Sequence[FittedValue]) -> str:
-        relative_change = values[0].value
-        percent = format_percent(abs(relative_change))
-        comparison = _compare(relative_change)
-        return f"the {quantity} {where} is {percent} {comparison} than the model file states"
-
-    return say
-
-
-def _make_difference_formatter(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
-    """Return a function that says by how much, in its unit, a quantity differs from the model file.
-
-    The function takes the place in words and the fitted values; the first value is the difference.
-    """
-
-    def say(where: str, values: Sequence[FittedValue]) -> str:
-        size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
-        comparison = _compare(values[0].value)
-        return f"the {quantity} {where} is {size} {comparison} than the model file states"
-
-    return say
-
-
-def _format_displaced_mass_centre(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say how far the centre of mass at `place_text` is from that of the model file.
-
-    `values` has the fitted displacement along each axis.
-    """
-    distance = append_unit(
-        format_number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit
-    )
-    return f"the centre of mass {place_text} is {distance} from where the model file has it"
-
-
-def _format_joint_zero(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say how far the zero of a joint, for command and reading, is from that of the model file.
-
-    Args:
-        place_text: the joint in words, such as ``of joint elbow``.
-        values: fitted values of the effect; the first is the offset, in rad or m.
-    """
-    size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
-    return (
-        f"the zero {place_text}, for commands and readings, is {size} from that of the model file"
-    )
-
-
-def _format_tilted_axis(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say by how many degrees the axis of a joint is tilted.
-
-    Args:
-        place_text: the joint in words, such as ``of joint elbow``.
-        values: fitted angles about the axes of the frame, rad.
-    """
-    angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
-    return (
-        f"the axis {place_text} is tilted by {format_number(float(angle), 2)}° from the model file"
-    )
-
-
-def _format_link_length(place_text: str, values: Sequence[FittedValue]) -> str:
-    """Say by which percentage the length of the link at `place_text` differs from the model file.
-
-    `values[0]` is the relative change of the length.
-    """
-    relative_change = values[0].value
-    percent = format_percent(abs(relative_change))
-    return (
-        f"the distance {place_text} from its parent is {percent} {_compare(relative_change)} "
-        "than the model file states"
-    )
-
-
-_MODEL_FILE_ERROR_FORMATTERS: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
-    "mass.scale": _make_percentage_formatter("mass"),
-    "inertia.scale": _make_percentage_formatter("inertia"),
-    "actuator.stiffness": _make_percentage_formatter("stiffness"),
-    "actuator.damping": _make_percentage_formatter("damping"),
-    "inertia.armature": _make_difference_formatter("armature"),
-    "mass.offset": _format_displaced_mass_centre,
-    "joint.zero": _format_joint_zero,
-    "joint.axis": _format_tilted_axis,
-    "link.length": _format_link_length,
-    "geom.radius": _make_percentage_formatter("radius"),
-    "contact.friction": _make_difference_formatter("friction coefficient"),
-    "contact.softness": _make_percentage_formatter("time constant"),
-    "contact.damping": _make_percentage_formatter("damping ratio"),
+_SHARE = "the {} {{place}} is {{percent}} {{larger}} than the model file states"
+_DIFFERENCE = "the {} {{place}} is {{size}} {{larger}} than the model file states"
+_MODEL_FILE_ERRORS = {
+    "mass.scale": _SHARE.format("mass"),
+    "inertia.scale": _SHARE.format("inertia"),
+    "actuator.stiffness": _SHARE.format("stiffness"),
+    "actuator.damping": _SHARE.format("damping"),
+    "inertia.armature": _DIFFERENCE.format("armature"),
+    "mass.offset": "the centre of mass {place} is {distance} from where the model file has it",
+    "joint.zero": "the zero {place}, for commands and readings, is {size} from that of the model "
+    "file",
+    "joint.axis": "the axis {place} is tilted by {angle} from the model file",
+    "link.length": "the distance {place} from its parent is {percent} {larger} than the model file "
+    "states",
+    "geom.radius": _SHARE.format("radius"),
+    "contact.friction": _DIFFERENCE.format("friction coefficient"),
+    "contact.softness": _SHARE.format("time constant"),
+    "contact.damping": _SHARE.format("damping ratio"),
 }
-"""Functions that format how wrong a value of the model file is, by effect."""
+"""Clause on how wrong a value of the model file is, by effect.
+
+Its fields are the place; the first coefficient in per cent or with its unit; the length of all
+coefficients as a vector, with their unit or as an angle; and ``larger`` or ``smaller``.
+"""
 _STEP_ERROR_TEXTS = {
     "numerics.step": "the time step of the model file is too long",
     "numerics.integrator": "the integrator of the model file does not reproduce the recording",
@@ -404,7 +337,7 @@ def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
     if len(at_place) != 1:
         return ""
     fitted = at_place[0]
-    if split_effect_name(effect)[0] in _MODEL_FILE_ERROR_FORMATTERS and fitted.unit == "1":
+    if split_effect_name(effect)[0] in _MODEL_FILE_ERRORS and fitted.unit == "1":
         sign = "+" if fitted.value > 0 else ""
         return f": {sign}{format_percent(fitted.value)}"
     return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
