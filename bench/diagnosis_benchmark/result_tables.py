@@ -9,7 +9,7 @@ together by Holm's method (Scand. J. Stat. 6, 65, 1979).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -462,101 +462,59 @@ def build_failure_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFram
     return failure_table.reset_index(drop=True)
 
 
-def _declare_text_column(name: str) -> ColumnSpec:
-    """Declare a text column whose cells may be empty."""
-    return ColumnSpec(name, str, empty=EmptyCellRule.MAY)
+def _declare(names: str, kind: type, **limits: Any) -> dict[str, ColumnSpec]:
+    """Declare columns of one kind; `limits` are further attributes of `ColumnSpec`."""
+    return {name: ColumnSpec(name, kind, **limits) for name in names.split()}
 
 
-def _declare_count_column(name: str) -> ColumnSpec:
-    """Declare a column of counts, at least 0."""
-    return ColumnSpec(name, int, low=0)
-
-
-def _declare_size_column(name: str) -> ColumnSpec:
-    """Declare a column of numbers of at least 0, whose cells may be empty."""
-    return ColumnSpec(name, float, low=0.0, empty=EmptyCellRule.MAY)
-
-
-def _declare_fraction_column(name: str) -> ColumnSpec:
-    """Declare a column of fractions from 0 to 1, whose cells may be empty."""
-    return ColumnSpec(name, float, low=0.0, high=1.0, empty=EmptyCellRule.MAY)
-
-
-_COUNT_COLUMNS = (
-    _declare_count_column("count"),
-    _declare_count_column("of"),
-    *(_declare_fraction_column(name) for name in ("share", "low", "high")),
-)
-_KIND_COLUMN = ColumnSpec("kind", str, words=CASE_KINDS)
-_ITEM_COLUMNS: Columns = (
-    *(ColumnSpec(name, str) for name in ("question", "diagnoser")),
-    _KIND_COLUMN,
-    ColumnSpec("system", str),
-    _declare_text_column("hidden"),
-    ColumnSpec("noise", str),
-    ColumnSpec("stated", bool),
-    _declare_count_column("rate"),
-    _declare_count_column("runs"),
-    ColumnSpec("source", str),
-    ColumnSpec("driven", bool),
-    *(_declare_size_column(name) for name in ("size", "beyond", "run_seconds")),
-    *(_declare_text_column(name) for name in ("channels", "status", "reason", "verdict", "named")),
-    ColumnSpec("outcome", str),
-    *(_declare_count_column(name) for name in ("set_size", "class_size", "largest_set")),
-    *(ColumnSpec(name, bool) for name in ("found", "found_class", "alarm")),
-    _declare_fraction_column("p_value"),
-    *(_declare_count_column(name) for name in ("intervals", "holding", "simulations")),
-    *(_declare_size_column(name) for name in ("seconds", "processor_seconds")),
-    ColumnSpec("trusted", bool),
-)
-_BY_NAME = {column.name: column for column in _ITEM_COLUMNS} | {
-    "right_by": ColumnSpec("right_by", str)
+_COLUMNS = {
+    **_declare("question diagnoser system noise source outcome metric by value said", str),
+    **_declare("right_by", str),
+    **_declare("kind", str, words=CASE_KINDS),
+    **_declare("hidden channels status reason verdict named", str, empty=EmptyCellRule.MAY),
+    **_declare("stated driven found found_class alarm trusted", bool),
+    **_declare(
+        "rate runs set_size class_size largest_set intervals holding simulations count of answers "
+        "training_simulations questions only_simgap only_other",
+        int,
+        low=0,
+    ),
+    **_declare(
+        "size beyond run_seconds seconds processor_seconds training_seconds simulations_median "
+        "simulations_p95 processor_seconds_median processor_seconds_p95 seconds_median seconds_p95",
+        float,
+        low=0.0,
+        empty=EmptyCellRule.MAY,
+    ),
+    **_declare(
+        "share low high p_value p_holm level", float, low=0.0, high=1.0, empty=EmptyCellRule.MAY
+    ),
 }
-_QUANTILE_COLUMNS = [
-    f"{what}_{part}"
-    for what in ("simulations", "processor_seconds", "seconds")
-    for part in ("median", "p95")
-]
-
-TABLE_COLUMNS: Mapping[str, Columns] = {
-    "table": (ColumnSpec("diagnoser", str), ColumnSpec("metric", str), *_COUNT_COLUMNS),
-    "failures": tuple(_BY_NAME[name] for name in FAILURE_COLUMNS),
-    "groups": (
-        *(ColumnSpec(name, str) for name in ("diagnoser", "metric", "by", "value")),
-        *_COUNT_COLUMNS,
-    ),
-    "power": (
-        ColumnSpec("diagnoser", str),
-        _declare_size_column("size"),
-        ColumnSpec("metric", str),
-        *_COUNT_COLUMNS,
-    ),
-    "confusion": (
-        *(ColumnSpec(name, str) for name in ("diagnoser", "hidden", "said")),
-        _declare_count_column("count"),
-    ),
-    "calibration": (
-        ColumnSpec("diagnoser", str),
-        _declare_fraction_column("level"),
-        *_COUNT_COLUMNS,
-    ),
-    "sets": (ColumnSpec("diagnoser", str), ColumnSpec("largest_set", str), *_COUNT_COLUMNS),
-    "costs": (
-        ColumnSpec("diagnoser", str),
-        _declare_count_column("answers"),
-        *(_declare_size_column(name) for name in _QUANTILE_COLUMNS),
-        _declare_count_column("training_simulations"),
-        _declare_size_column("training_seconds"),
-    ),
-    "pairs": (
-        ColumnSpec("metric", str),
-        ColumnSpec("diagnoser", str),
-        *(_declare_count_column(name) for name in ("questions", "only_simgap", "only_other")),
-        *(_declare_fraction_column(name) for name in ("p_value", "p_holm")),
-    ),
-    "items": _ITEM_COLUMNS,
+"""Columns of all tables by name."""
+TABLE_COLUMNS: dict[str, Columns] = {
+    table: tuple(_COLUMNS[name] for name in names.split())
+    for table, names in {
+        "table": "diagnoser metric count of share low high",
+        "failures": " ".join(FAILURE_COLUMNS),
+        "groups": "diagnoser metric by value count of share low high",
+        "power": "diagnoser size metric count of share low high",
+        "confusion": "diagnoser hidden said count",
+        "calibration": "diagnoser level count of share low high",
+        "sets": "diagnoser largest_set count of share low high",
+        "costs": "diagnoser answers simulations_median simulations_p95 processor_seconds_median "
+        "processor_seconds_p95 seconds_median seconds_p95 training_simulations training_seconds",
+        "pairs": "metric diagnoser questions only_simgap only_other p_value p_holm",
+        "items": "question diagnoser kind system hidden noise stated rate runs source driven size "
+        "beyond run_seconds channels status reason verdict named outcome set_size class_size "
+        "largest_set found found_class alarm p_value intervals holding simulations seconds "
+        "processor_seconds trusted",
+    }.items()
 }
-"""Columns of each table, by the name of its file."""
+# In this table, the size of the largest set is a range in words.
+TABLE_COLUMNS["sets"] = tuple(
+    ColumnSpec("largest_set", str) if column.name == "largest_set" else column
+    for column in TABLE_COLUMNS["sets"]
+)
 STATUS_COLUMNS = ("question", "diagnoser", "status", "reason", "simulations", "seconds")
 """Columns of items.csv that describe how an answer was produced."""
 
