@@ -82,36 +82,6 @@ def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[objec
     ]
 
 
-def format_result_table(lines: pd.DataFrame) -> str:
-    """Format the table for the terminal: hits by ball, hit rate with interval, prediction error.
-
-    Args:
-        lines: table of `build_result_table`.
-
-    Returns:
-        A header line and one line per method.
-    """
-    balls = [ball for ball in lines["ball"].unique() if ball != ALL_BALLS]
-    width = max(len(m) for m in lines["method"])
-    head = (
-        f"{'hits of shots':{width}}  "
-        + "  ".join(f"{b:>12}" for b in balls)
-        + "   all (95 %, Wilson)   path off by"
-    )
-    text_lines = [head]
-    for method, part in lines.groupby("method", sort=False):
-        by_ball = part.set_index("ball")
-        cells = [f"{f'{by_ball.hits[b]}/{by_ball.shots[b]}':>12}" for b in balls]
-        total = by_ball.loc[ALL_BALLS]
-        share = f"{total.rate:6.1%} ({total.low:.0%}–{total.high:.0%})"
-        text_lines.append(
-            f"{method:{width}}  "
-            + "  ".join(cells)
-            + f"   {share:18}   {by_ball.prediction_error_mean[ALL_BALLS]:.3f} m"
-        )
-    return "\n".join(text_lines)
-
-
 def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
     """Make the panel of the hit rate of each method by ball, with its table.
 

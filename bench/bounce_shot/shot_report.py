@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -16,7 +17,6 @@ from bench.bounce_shot.hit_rate_table import (
     ALL_BALLS,
     NO_SHOT_STATUSES,
     build_result_table,
-    format_result_table,
     make_success_panel,
 )
 from bench.bounce_shot.shot_animation import write_animation
@@ -27,9 +27,11 @@ from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.figures import figure_output
 from bench.figures.figure_output import FigureFiles
 from bench.pages.html_page import HtmlPage
+from bench.pages.template import render_text
 from sims.core.files import write_atomically
 
 _TEMPLATE = Path(__file__).with_name("shots.html")
+_SUMMARY_TEMPLATE = Path(__file__).with_name("shots.txt")
 
 
 def render_page(
@@ -138,30 +140,25 @@ def write_report(
     journal = folder / SEGMENTS_FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
-    print_line("\n" + format_result_table(result_lines))
     failed = shot_rows[shot_rows["status"].isin(NO_SHOT_STATUSES)]
-    _print_failures(failed, skipped_tuners, print_line)
-    print_line(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
-    for figure in figures:
-        print_line(f"figure  {figure}")
-    print_line(f"report  {folder / REPORT_FILE}")
+    rows_by_method: dict[str, dict[str, Any]] = {}
+    for row in result_lines.to_dict("records"):
+        rows_by_method.setdefault(row["method"], {})[row["ball"]] = row
+    lines = render_text(
+        _SUMMARY_TEMPLATE,
+        methods=rows_by_method,
+        balls=[ball for ball in result_lines["ball"].unique() if ball != ALL_BALLS],
+        ALL_BALLS=ALL_BALLS,
+        width=max(map(len, rows_by_method)),
+        skipped=skipped_tuners,
+        failed=[(*key, part["reason"]) for key, part in failed.groupby(["method", "status"])],
+        folder=folder,
+        figures=figures,
+        report_file=REPORT_FILE,
+    )
+    for line in lines:
+        print_line(line)
     return int(failed["status"].isin(_FAILED_STATUSES).sum())
-
-
-def _print_failures(
-    failed: pd.DataFrame, skipped: Mapping[str, str], print_line: Callable[[str], None]
-) -> None:
-    """Print why tuners were skipped, and each failure of a method with its count and one reason.
-
-    Args:
-        failed: rows of shots.csv whose method failed or found no plan.
-        skipped: reasons why tuners cannot be used here, by label.
-        print_line: prints a line.
-    """
-    for label, reason in skipped.items():
-        print_line(f"skipped {label}: {reason}")
-    for (method, status), part in failed.groupby(["method", "status"]):
-        print_line(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
 
 
 def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
