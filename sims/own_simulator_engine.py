@@ -76,15 +76,10 @@ class OwnSimulatorEngine:
     """Engine that steps a user-defined simulator, one batch element after another."""
 
     name = "own"
-    requires: tuple[str, ...] = ()
 
     def __init__(self, world: SteppableSimulator, step: float) -> None:
         self.world = world
         self.largest_step = float(step)
-
-    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
-        """Return an empty text, because every system is supported."""
-        return ""
 
     def close(self) -> None:
         """Do nothing, because there are no resources."""

@@ -95,20 +95,26 @@ def check_positive(name: str, value: Any, expected: str = "a positive number of 
     return float(value)
 
 
+def make_unsupported_error(engine: str, system: type[System], reason: str) -> InputError:
+    """Make the error for a system that an engine cannot integrate.
+
+    Args:
+        engine: Name of the engine.
+        system: The system.
+        reason: Property of the system, as the end of the message.
+    """
+    return InputError(f"engine {engine} cannot simulate system {system.name}: {reason}")
+
+
 class Engine(Protocol):
     """Integrator of batches of simulations."""
 
     name: str
-    requires: tuple[str, ...]
     largest_step: float
     """Maximum step in seconds, to which sampling intervals are divided."""
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate every batch element over its steps."""
-        ...
-
-    def find_unsupported_reason(self, system: type[System]) -> str:
-        """Return why this engine cannot integrate the system; empty if it can."""
         ...
 
     def close(self) -> None:

@@ -9,7 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.core.engine import IntegrationBatch, Trajectories, check_positive
+from sims.core.engine import (
+    IntegrationBatch,
+    Trajectories,
+    check_positive,
+    make_unsupported_error,
+)
 from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
@@ -39,7 +44,6 @@ class BatchEngine:
     """
 
     name = "batch"
-    requires = REQUIRED_PACKAGES
 
     def __init__(
         self,
@@ -85,19 +89,12 @@ class BatchEngine:
                 values[failed] = np.nan
         return trajectories
 
-    def find_unsupported_reason(self, system: type[System]) -> str:
-        """Return why the engine cannot integrate a system; empty if it can."""
-        count = len(system.coordinates)
-        if count > MAX_COORDINATES:
-            return f"it has {count} coordinates, and the engine at most {MAX_COORDINATES}"
-        return ""
-
     def close(self) -> None:
         """Do nothing: the engine holds no resources."""
 
 
 def make_engine(
-    system: type[System],  # noqa: ARG001
+    system: type[System],
     *,
     time_step: float = DEFAULT_TIME_STEP,
     turn: float = MAX_PHASE_PER_STEP,
@@ -115,5 +112,12 @@ def make_engine(
 
     Returns:
         The engine; see `BatchEngine`.
+
+    Raises:
+        InputError: a setting is not valid, or the system has too many coordinates.
     """
+    count = len(system.coordinates)
+    if count > MAX_COORDINATES:
+        reason = f"it has {count} coordinates, and the engine at most {MAX_COORDINATES}"
+        raise make_unsupported_error("batch", system, reason)
     return BatchEngine(time_step, turn, patience, jobs)

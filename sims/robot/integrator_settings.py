@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from sims.core.engine import IntegrationBatch, Trajectories
-from sims.core.system import System
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
@@ -142,7 +141,6 @@ class RobotEngine:
     """MuJoCo at the time step of the model; `RobotSimulator` does the simulation."""
 
     name = "mujoco"
-    requires: tuple[str, ...] = ("mujoco",)
 
     def __init__(self, numerics: IntegratorSettings) -> None:
         self.numerics = numerics
@@ -151,10 +149,6 @@ class RobotEngine:
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Raise an error: robots are simulated by `RobotSimulator`, not through this interface."""
         raise NotImplementedError
-
-    def find_unsupported_reason(self, system: type[System]) -> str:
-        """Return why this engine cannot simulate a system; empty if it can."""
-        return "" if system.has_model else "it has no model file"
 
     def close(self) -> None:
         """Do nothing, since the engine holds no resources."""

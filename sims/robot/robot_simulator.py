@@ -176,6 +176,12 @@ class RobotSimulator(SystemSimulator):
             cls.numerics._replace(timestep=0.5 * cls.numerics.timestep)
         )
 
+    @cached_property
+    def _model_options(self) -> dict[str, float]:
+        """Options of the model with the settings of the engine."""
+        assert isinstance(self.engine, RobotEngine)
+        return self.engine.numerics.to_model_options()
+
     @property
     def time_step(self) -> float:
         """Step length in seconds."""
@@ -484,9 +490,7 @@ class RobotSimulator(SystemSimulator):
         Returns:
             (n, S + 1) activations at the beginnings of steps, and at the end.
         """
-        engine = self.engine
-        assert isinstance(engine, RobotEngine)
-        is_rk4 = engine.numerics.to_model_options()["integrator"] == RK4_INTEGRATOR_ID
+        is_rk4 = self._model_options["integrator"] == RK4_INTEGRATOR_ID
         return activation_filter.compute_activations(
             controls, initial_activations, self.time_step, is_rk4
         )
@@ -511,10 +515,7 @@ class RobotSimulator(SystemSimulator):
     def make_half_step_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch of `make_linearisation_batch` with half the time step."""
         (added,) = group_by_added_elements(acting, 1)
-        engine = self.engine
-        assert isinstance(engine, RobotEngine)
-        settings = dict(engine.numerics.to_model_options())
-        settings["timestep"] *= 0.5
+        settings = self._model_options | {"timestep": 0.5 * self.time_step}
         return get_batch_cache(self.robot).get_batch(
             added, True, LINEARISATION_BATCH_SIZE, settings
         )
@@ -622,10 +623,8 @@ class RobotSimulator(SystemSimulator):
             count: number of batch elements.
             added: elements that effects add to the model.
         """
-        engine = self.engine
-        assert isinstance(engine, RobotEngine)
-        settings = engine.numerics.to_model_options()
-        return get_batch_cache(self.robot).get_batch(added, derived, count, settings)
+        cache = get_batch_cache(self.robot)
+        return cache.get_batch(added, derived, count, self._model_options)
 
     def _compute_observations(
         self, result_of_batch: BatchResult, batch: RobotRunBatch, times: Array, steps: int

@@ -26,7 +26,7 @@ from sims.engines.external.external_engine import (
 from sims.engines.external.world_interface import (
     BulletBallWorldModule,
     BulletWorldModule,
-    find_unsupported_joint_reason,
+    check_one_coordinate,
     find_world_module,
 )
 
@@ -106,7 +106,6 @@ class BulletEngine:
     """
 
     name: str = "pybullet"
-    requires: tuple[str, ...] = REQUIRED_PACKAGES
 
     def __init__(
         self,
@@ -118,12 +117,15 @@ class BulletEngine:
 
         With `native_settings`, Bullet's own contact and air damping move a ball. Otherwise
         a system that bounces gets impacts at their exact times, and any other system is a
-        body on a joint. If Bullet cannot simulate the system, only the reason is stored.
+        body on a joint.
+
+        Raises:
+            InputError: Bullet cannot simulate the system.
         """
         self.largest_step = largest_step
-        self._rollout: RolloutFunction | None = None
+        self._rollout: RolloutFunction
         if not system.bounces:
-            self._reason = find_unsupported_joint_reason(system)
+            check_one_coordinate(self.name, system)
             is_hinge = system.kind == "rotary"
             kind = "JOINT_REVOLUTE" if is_hinge else "JOINT_PRISMATIC"
             self._world = bullet_world.PersistentBulletWorld(
@@ -133,9 +135,7 @@ class BulletEngine:
             self._rollout = partial(joint_integration.integrate_joint, joint)
             return
         protocol = BulletWorldModule if native_settings is None else BulletBallWorldModule
-        module, self._reason = find_world_module(system, "bullet_world", protocol)
-        if module is None:
-            return
+        module = find_world_module(self.name, system, "bullet_world", protocol)
         if native_settings is None:
             self._world = bullet_world.PersistentBulletWorld(cast(BulletWorldModule, module).build)
             self._rollout = partial(ball_integration.integrate_ball, BulletBall(self._world))
@@ -149,17 +149,11 @@ class BulletEngine:
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
-        assert self._rollout is not None, "a system that the engine refuses"
         return integrate_batch(batch, [self._rollout], self._world.invalidate)
-
-    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
-        """Return why the engine cannot integrate the system; see `Engine`."""
-        return self._reason
 
     def close(self) -> None:
         """Close the Bullet world; the next integration opens a new one."""
-        if self._rollout is not None:
-            self._world.close()
+        self._world.close()
 
 
 class _BulletMover:

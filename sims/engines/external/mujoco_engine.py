@@ -32,7 +32,7 @@ from sims.engines.external.mujoco_bodies import (
 )
 from sims.engines.external.world_interface import (
     MujocoWorldModule,
-    find_unsupported_joint_reason,
+    check_one_coordinate,
     find_world_module,
 )
 
@@ -105,7 +105,6 @@ class MujocoEngine:
     """
 
     name: str = "mujoco"
-    requires: tuple[str, ...] = REQUIRED_PACKAGES
 
     def __init__(
         self,
@@ -118,21 +117,21 @@ class MujocoEngine:
 
         With `stiffness`, MuJoCo's own soft contact moves a ball. Otherwise a system that
         bounces gets impacts at their exact times, and any other system is a body on a
-        joint. If MuJoCo cannot simulate the system, only the reason is stored.
+        joint.
+
+        Raises:
+            InputError: MuJoCo cannot simulate the system.
         """
         self.largest_step = largest_step
-        self._worlds: list[CompiledWorld] = []
         self._rollouts: list[RolloutFunction] = []
-        self._reason = find_unsupported_joint_reason(system)
-        write_model: Callable[[Mapping[str, float]], str] = partial(
-            write_joint_model, "hinge" if system.kind == "rotary" else "slide"
-        )
+        write_model: Callable[[Mapping[str, float]], str]
         if system.bounces:
-            module, self._reason = find_world_module(system, "mujoco_world", MujocoWorldModule)
-            if module is not None:
-                write_model = cast(MujocoWorldModule, module).model
-        if self._reason:
-            return
+            module = find_world_module(self.name, system, "mujoco_world", MujocoWorldModule)
+            write_model = cast(MujocoWorldModule, module).model
+        else:
+            check_one_coordinate(self.name, system)
+            joint_type = "hinge" if system.kind == "rotary" else "slide"
+            write_model = partial(write_joint_model, joint_type)
         self._worlds = [CompiledWorld(write_model) for _ in range(threads)]
         for world in self._worlds:
             rollout: RolloutFunction
@@ -147,13 +146,8 @@ class MujocoEngine:
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
-        assert self._rollouts, "a system that the engine refuses"
         with _suppress_warnings():
             return integrate_batch(batch, self._rollouts, self.close)
-
-    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
-        """Return why the engine cannot integrate the system; see `Engine`."""
-        return self._reason
 
     def close(self) -> None:
         """Release the MuJoCo worlds; the next integration makes new ones."""

@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import Any, Generic, Protocol
 
+from sims.core.engine import make_unsupported_error
 from sims.core.system import System
 
 Constants = Mapping[str, float]
@@ -60,27 +61,36 @@ class MujocoWorldModule(Protocol):
         ...
 
 
-def find_unsupported_joint_reason(system: type[System]) -> str:
-    """Return why a system cannot be a body on one hinge or guide; empty if it can."""
+def check_one_coordinate(engine: str, system: type[System]) -> None:
+    """Check that a system can be a body on one hinge or guide.
+
+    Args:
+        engine: name of the engine, for the message.
+        system: the system.
+
+    Raises:
+        InputError: it has several coordinates.
+    """
     count = len(system.coordinates)
-    return "" if count == 1 else f"it has {count} coordinates, expected one (a hinge or guide)"
+    if count != 1:
+        reason = f"it has {count} coordinates, expected one (a hinge or guide)"
+        raise make_unsupported_error(engine, system, reason)
 
 
-def find_world_module(
-    system: type[System], name: str, protocol: type
-) -> tuple[ModuleType | None, str]:
+def find_world_module(engine: str, system: type[System], name: str, protocol: type) -> ModuleType:
     """Find the world module of a bouncing system and check its interface.
 
     A world module builds the system as bodies of an external physics engine, such as MuJoCo or
     Bullet. It is in the package of the system.
 
     Args:
+        engine: name of the engine, for the message.
         system: system whose world is needed.
         name: name of the module in the package of the system's own module.
         protocol: protocol that the module must fulfil.
 
-    Returns:
-        The module and an empty text, or None and the reason why there is no usable module.
+    Raises:
+        InputError: there is no usable module.
     """
     package = system.__module__.rpartition(".")[0]
     # Several systems of one package have a world module each.
@@ -88,11 +98,12 @@ def find_world_module(
         if package and find_spec(path) is not None:
             break
     else:
-        return None, f"no module {name} next to {system.__module__} builds it"
+        reason = f"no module {name} next to {system.__module__} builds it"
+        raise make_unsupported_error(engine, system, reason)
     module = import_module(path)
-    if reason := describe_missing_members(module, protocol):
-        return None, f"module {path} {reason}"
-    return module, ""
+    if missing := describe_missing_members(module, protocol):
+        raise make_unsupported_error(engine, system, f"module {path} {missing}")
+    return module
 
 
 def describe_missing_members(module: ModuleType, protocol: type) -> str:

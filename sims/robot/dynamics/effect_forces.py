@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -217,6 +218,44 @@ def is_evaluated_per_step(effect: Effect) -> bool:
     if effect.hook not in ("force", "hidden"):
         return False
     return not is_model_field_effect(effect) and effect.of not in TIME_DEPENDENT_EFFECTS
+
+
+class StepEffects(NamedTuple):
+    """Effects whose forces are evaluated in every step, with their coefficients (K, L, 1).
+
+    Attributes:
+        forces: effects with a force.
+        frictions: effects with dry friction.
+        hidden: effects with hidden states.
+    """
+
+    forces: tuple[tuple[Force, Array], ...]
+    frictions: tuple[tuple[Friction, Array], ...]
+    hidden: tuple[tuple[HiddenStateEffect, Array], ...]
+
+    @classmethod
+    def from_active(cls, acting: ActiveEffects) -> StepEffects:
+        """Select and sort effects at one place each; see `is_evaluated_per_step`."""
+        own = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
+        return cls(
+            tuple((e, c) for e, c in own if isinstance(e, Force)),
+            tuple((e, c) for e, c in own if isinstance(e, Friction)),
+            tuple((e, c) for e, c in own if isinstance(e, HiddenStateEffect)),
+        )
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients (K, L) of all effects, one after the other."""
+        return np.concatenate([c[:, :, 0] for group in self for _, c in group])
+
+    def with_coefficients(self, rows: Any) -> StepEffects:
+        """Return the effects with other coefficients (L, K), in the order of `coefficients`."""
+        ends = np.cumsum([len(effect.coefficients) for group in self for effect, _ in group])
+        parts = iter(np.split(rows, ends[:-1], axis=1))
+        groups: Any = (
+            tuple((effect, next(parts).T[:, :, None]) for effect, _ in group) for group in self
+        )
+        return StepEffects(*groups)
 
 
 def find_active_elements(

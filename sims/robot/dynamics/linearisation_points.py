@@ -18,8 +18,11 @@ from sims.core.simulator import Array
 from sims.robot.dynamics.drive_limits import ForceRanges, Mask, find_working_servos
 from sims.robot.dynamics.effect_forces import (
     LOAD_DEPENDENT_EFFECTS,
+    StepEffects,
     compute_drive_effect_forces,
-    is_evaluated_per_step,
+    compute_effect_forces,
+    compute_friction_limits,
+    compute_hidden_state_forces,
     is_in_drive,
     make_snapshot,
     select_model_field_effects,
@@ -93,8 +96,8 @@ class LinearisationPoints:
         point_of_step: (S,) index of the point that applies to each step.
         point_spacing: number of steps between two points while no command changes.
         placed_count: number of batch elements that have been placed so far.
-        hidden_state_effects: numbers of the effects with hidden states, in the order of their
-            state columns.
+        hidden_state_effects: numbers of the hidden states of effects, in the order of their
+            columns in a state.
     """
 
     def __init__(
@@ -111,8 +114,8 @@ class LinearisationPoints:
         """Choose the points of the motion, and prepare the batch (fields, effects, state).
 
         Also integrate the hidden states of the effects along the motion, since each point
-        needs them. `self._stepwise_effects` are the effects whose forces are evaluated here,
-        because no model field represents them, and `self._drive_effect_forces` (n, D) are the
+        needs them. `self._step_effects` are the effects whose forces are evaluated here, because
+        no model field represents them, and `self._drive_effect_forces` (n, D) are the
         forces that they exert in drives, which a sensor of drive forces shows.
 
         Shapes: D joints, K coefficients.
@@ -143,20 +146,18 @@ class LinearisationPoints:
         # the next call.
         self._bind_fields(mujoco_batch)
         self.placed_count = 0
-        self._stepwise_effects = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
-        if self._stepwise_effects:
+        self._step_effects = StepEffects.from_active(acting)
+        if any(self._step_effects):
             # The loads are computed with the same batch, so they must be known before it is used.
             _ = motion.carried
         mujoco_batch.write_effects(_repeat_coefficients(acting, mujoco_batch.count))
         self._stiffness = mujoco_batch.get_servo_stiffness(joints)[:1]
         self._is_servo_on = find_working_servos(mujoco_batch.robot, joints.velocities, motion.off)
         self._hidden_states = [
-            self.integrate_hidden_state(effect, c) for effect, c in self._stepwise_effects
+            self.integrate_hidden_state(effect, c) for effect, c in self._step_effects.hidden
         ]
-        self.hidden_state_effects = [
-            k for k, (e, _) in enumerate(self._stepwise_effects) if isinstance(e, HiddenStateEffect)
-        ]
-        self._next_hidden_states: dict[int, HiddenState] = {}
+        self.hidden_state_effects = range(len(self._hidden_states))
+        self._next_hidden_states: list[HiddenState] = []
         mujoco_batch.batch.reset(stage=0)
         self._reset_state = mujoco_batch.batch.state.copy()
 
@@ -226,7 +227,7 @@ class LinearisationPoints:
             ]
             if self.motion.act.shape[1]:
                 state_columns.append(bind("act")[:point_count])
-            state_columns += [state.v for state in self._next_hidden_states.values()]
+            state_columns += [state.v for state in self._next_hidden_states]
             if floating:
                 unperturbed = self.motion.floating_state.pose[
                     self.point_steps[begin : begin + point_count] + 1
@@ -376,17 +377,16 @@ class LinearisationPoints:
         Args:
             steps: steps of the points.
             n: number of batch elements in use.
-            state_changes: perturbations of hidden states, by number of the effect.
+            state_changes: perturbations of hidden states, by their numbers.
         """
-        if not self._stepwise_effects:
+        effects = self._step_effects
+        if not any(effects):
             return
         bind, joints = self._mujoco_batch.batch.bind, self._joints
         motion = self.motion
         x = bind("qpos")[:n, joints.positions]
         v = bind("qvel")[:n, joints.velocities]
-        inputs = {name: u[steps][:, None] for name, u in motion.inputs.items()}
-        t: Array = motion.step * steps[:, None].astype(np.float64)
-        if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._stepwise_effects):
+        if any(e.of in LOAD_DEPENDENT_EFFECTS for group in effects for e, _ in group):
             # As in the simulation, a servo's force must follow the perturbed state.
             self._mujoco_batch.batch.forward(self._mujoco_batch.get_element_ids(n))
             carried = np.stack(
@@ -394,37 +394,43 @@ class LinearisationPoints:
             )
         else:
             carried = motion.carried[:, steps]
-        snapshot = make_snapshot(
-            self._system, t, x, v, inputs, carried, self.get_servo_stiffness(steps)
-        )
-        self._drive_effect_forces = np.zeros_like(x)
-        limits: dict[int, Array] = {}
-        for k, (effect, c) in enumerate(self._stepwise_effects):
-            coefficients = np.repeat(c, n, axis=1)
-            if isinstance(effect, HiddenStateEffect):
-                hidden = self._hidden_states[k]
-                state = HiddenState(hidden.x[steps], hidden.v[steps] + state_changes.get(k, 0.0))
-                midpoint_state = advance_state(
-                    effect, coefficients, snapshot, state, 0.5 * motion.step
-                )
-                self._next_hidden_states[k] = advance_state(
-                    effect, coefficients, snapshot, state, motion.step
-                )
-                force, _ = effect.act(coefficients, snapshot, midpoint_state)
-                bind("qfrc_applied")[:n, joints.velocities] += force
-            elif isinstance(effect, Friction):
-                assert effect.coordinate is not None
-                limit = effect.limit(coefficients, snapshot)[:, 0]
-                limits[effect.coordinate] = limits.get(effect.coordinate, 0.0) + limit
-            elif isinstance(effect, Force):
-                force = effect.force(coefficients, snapshot)
-                bind("qfrc_applied")[:n, joints.velocities] += force
-                if is_in_drive(effect):
-                    self._drive_effect_forces += force
-        for joint, limit in limits.items():
-            self._mujoco_batch.set_dry_friction(
-                n, int(joints.velocities[joint]), np.maximum(limit, 0.0)
-            )
+        snapshot = self._make_snapshot(steps, x, v, carried)
+        acting = effects.with_coefficients(np.repeat(effects.coefficients.T, n, axis=0))
+        self._drive_effect_forces = compute_drive_effect_forces(acting.forces, snapshot)
+        others = [pair for pair in acting.forces if not is_in_drive(pair[0])]
+        force = self._drive_effect_forces + compute_effect_forces(others, snapshot)
+        states = [
+            HiddenState(hidden.x[steps], hidden.v[steps] + state_changes.get(k, 0.0))
+            for k, hidden in enumerate(self._hidden_states)
+        ]
+        # Hidden states act with their values at the middle of the step.
+        force += compute_hidden_state_forces(
+            acting.hidden, (snapshot, snapshot), states, 0.5 * motion.step
+        )[0]
+        self._next_hidden_states = [
+            advance_state(effect, c, snapshot, state, motion.step)
+            for (effect, c), state in zip(acting.hidden, states, strict=True)
+        ]
+        bind("qfrc_applied")[:n, joints.velocities] += force
+        limits = np.maximum(compute_friction_limits(acting.frictions, snapshot), 0.0)
+        for joint in {effect.coordinate for effect, _ in acting.frictions}:
+            self._mujoco_batch.set_dry_friction(n, int(joints.velocities[joint]), limits[:, joint])
+
+    def _make_snapshot(
+        self, steps: IndexArray, x: Array, v: Array, carried: Array
+    ) -> RobotSnapshot:
+        """Return the snapshot at the beginning of each of n steps.
+
+        Args:
+            steps: (n,) the steps.
+            x: (n, D) positions.
+            v: (n, D) velocities.
+            carried: (2, n, D) forces on both sides of the transmissions.
+        """
+        t: Array = self.motion.step * steps[:, None].astype(np.float64)
+        inputs = {name: u[steps, None] for name, u in self.motion.inputs.items()}
+        stiffness = self.get_servo_stiffness(steps)
+        return make_snapshot(self._system, t, x, v, inputs, carried, stiffness)
 
     def get_servo_stiffness(self, steps: IndexArray) -> Array:
         """Return the stiffness (n, D) of the position servos in the given n steps."""
@@ -519,10 +525,7 @@ class LinearisationPoints:
         # midpoint forces.
         carried = motion.carried[:, steps].copy()
         carried[0][:, joint_of_output[is_drive]] = readings[:, is_drive]
-        inputs = {name: u[steps, None] for name, u in motion.inputs.items()}
-        t: Array = motion.step * steps[:, None].astype(np.float64)
-        x, v, stiff = motion.x[steps], motion.v[steps], self.get_servo_stiffness(steps)
-        snapshot = make_snapshot(self._system, t, x, v, inputs, carried, stiff)
+        snapshot = self._make_snapshot(steps, motion.x[steps], motion.v[steps], carried)
         force = compute_drive_effect_forces(((effect, np.repeat(c, steps.size, axis=1)),), snapshot)
         result: Array = np.where(is_drive, force[:, joint_of_output], 0.0)
         return result

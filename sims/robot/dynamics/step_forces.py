@@ -14,14 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.core.effect import (
-    ActiveEffects,
-    Effect,
-    Force,
-    Friction,
-    HiddenState,
-    HiddenStateEffect,
-)
+from sims.core.effect import ActiveEffects, Effect, HiddenState
 from sims.core.simulator import Array
 from sims.engines.compiled.array_programs import (
     ArrayFunction,
@@ -34,7 +27,7 @@ from sims.engines.compiled.array_programs import (
 from sims.engines.compiled.traced_array import PER_ELEMENT, PER_EVALUATION
 from sims.robot.dynamics.effect_forces import (
     LOAD_DEPENDENT_EFFECTS,
-    TIME_DEPENDENT_EFFECTS,
+    StepEffects,
     compute_effect_forces,
     compute_friction_limits,
     compute_hidden_state_forces,
@@ -42,46 +35,12 @@ from sims.robot.dynamics.effect_forces import (
 )
 from sims.robot.dynamics.midpoint_state import JointStates, Mask, predict_midpoint
 from sims.robot.dynamics.mujoco_batch import JointAddresses
-from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.robot_system import RobotSystem
 
 TESTED_STATES = 16
 """Number of random states at which a program is compared with NumPy."""
 TEST_STATE_SIZES = (0.01, 1.0, 10.0)
 """Standard deviations of these states, SI units."""
-
-
-class _StepEffects(NamedTuple):
-    """Effects with a force, with dry friction and with hidden states, and their coefficients.
-
-    Left out are effects that a batch handles otherwise: those written into model fields, those
-    whose force depends only on time (precomputed), and those in series with joints.
-    """
-
-    forces: ActiveEffects
-    frictions: ActiveEffects
-    hidden: ActiveEffects
-
-    @classmethod
-    def from_active(cls, acting: ActiveEffects) -> _StepEffects:
-        """Sort effects at one place each, with coefficients (K, L, 1)."""
-        left_out = TIME_DEPENDENT_EFFECTS | MODEL_FIELD_EFFECTS.keys()
-        own = [(e, c) for e, c in acting if e.hook == "force" and e.of not in left_out]
-        return cls(
-            tuple(pair for pair in own if isinstance(pair[0], Force)),
-            tuple(pair for pair in own if isinstance(pair[0], Friction)),
-            tuple(
-                (e, c)
-                for e, c in acting
-                if isinstance(e, HiddenStateEffect) and not is_series_effect(e)
-            ),
-        )
-
-    @property
-    def coefficients(self) -> Array:
-        """Coefficients (K, L) of all effects, one after the other."""
-        return np.concatenate([c[:, :, 0] for group in self for _, c in group])
 
 
 class CallbackLayout(NamedTuple):
@@ -141,14 +100,14 @@ class StepForces:
         self.depends_on_switches = working is not None
         self._system, self._applied_inputs = system, applied_inputs
         self._stiffness, self._working = stiffness, working
-        effects = _StepEffects.from_active(acting)
+        effects = StepEffects.from_active(acting)
         self._hidden = effects.hidden
         self.has_dry_friction: Mask = np.zeros(stiffness.shape, dtype=bool)
         for effect, c in effects.frictions:
             self.has_dry_friction[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
         self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
-        for effect, c in acting:
-            if effect.of in LOAD_DEPENDENT_EFFECTS:
+        for loading, c in acting:
+            if loading.of in LOAD_DEPENDENT_EFFECTS:
                 self.loaded |= (c != 0).any(axis=0)[:, 0]
         inputs = tuple(applied_inputs)
         function = _make_function(system, inputs, effects)
@@ -180,7 +139,7 @@ class StepForces:
             effect: effect in the batch.
             c: (K, L, 1) its coefficients.
         """
-        effects = _StepEffects.from_active(((effect, c),))
+        effects = StepEffects.from_active(((effect, c),))
         function = _make_function(self._system, tuple(self._applied_inputs), effects)
         groups = [slice(*ends) for ends in pairwise(function.input_ends.tolist())]
 
@@ -227,7 +186,7 @@ class StepForces:
             np.stack(joint_states.transmission_loads),
             self.registers[self._stiffness_group].T,
         )
-        states = [e.begin(c, snapshot) for e, c in self._hidden if isinstance(e, HiddenStateEffect)]
+        states = [effect.begin(c, snapshot) for effect, c in self._hidden]
         parts = [part for state in states for part in (state.x, state.v)]
         self.registers[self._states] = np.concatenate(parts, axis=1).T
 
@@ -262,7 +221,7 @@ class StepForces:
 
 
 def _make_function(
-    system: RobotSystem, input_names: Sequence[str], effects: _StepEffects
+    system: RobotSystem, input_names: Sequence[str], effects: StepEffects
 ) -> ArrayFunction:
     """Return the array function of effects on a robot.
 
@@ -277,17 +236,13 @@ def _make_function(
         effects: the effects.
     """
     joints, states = len(system.coordinates), 2 * len(effects.hidden)
-    counts = [len(effect.coefficients) for group in effects for effect, _ in group]
 
     def bind(t: Any, middle: Any, step: Any, interval: Any, *values: Any) -> tuple[Evaluator]:
         """Return the function that evaluates all effects; see `ArrayFunction.bind`."""
         *motion, u, stiffness, coefficients, hidden_states = values
         at = JointStates(*motion)
         inputs = {name: u[:, i, None] for i, name in enumerate(input_names)}
-        parts = iter(np.split(coefficients, np.cumsum(counts), axis=1))
-        forces, frictions, hidden = (
-            [(effect, next(parts).T[:, :, None]) for effect, _ in group] for group in effects
-        )
+        acting = effects.with_coefficients(coefficients)
 
         def evaluate() -> tuple[Any, Any, Any]:
             """Return forces, limits of dry friction, and later hidden states."""
@@ -295,27 +250,24 @@ def _make_function(
             midpoint = make_snapshot(
                 system, middle, x, v, inputs, np.stack(at.at_midpoint), stiffness
             )
-            force = compute_effect_forces(forces, midpoint)  # type: ignore[arg-type]
+            force = compute_effect_forces(acting.forces, midpoint)
             later_states = np.zeros((1, 0))
-            if hidden:
+            if acting.hidden:
                 loads = np.stack(at.transmission_loads)
                 start = make_snapshot(system, t, at.x, at.v, inputs, loads, stiffness)
                 columns = [hidden_states[:, i, None] for i in range(states)]
                 earlier = [HiddenState(*columns[i : i + 2]) for i in range(0, states, 2)]
                 added, later = compute_hidden_state_forces(
-                    hidden,  # type: ignore[arg-type]
-                    (start, midpoint),
-                    earlier,
-                    interval,
+                    acting.hidden, (start, midpoint), earlier, interval
                 )
                 force = force + added
                 later_states = np.concatenate([p for s in later for p in (s.x, s.v)], axis=1)
-            limit = compute_friction_limits(frictions, midpoint)  # type: ignore[arg-type]
+            limit = compute_friction_limits(acting.frictions, midpoint)
             return force, limit, later_states
 
         return (evaluate,)
 
     sizes = [1] * 4 + [joints] * len(JointStates._fields) + [len(input_names), joints]
     groups = [(size, PER_EVALUATION) for size in sizes]
-    groups += [(sum(counts), PER_ELEMENT), (states, PER_EVALUATION)]
+    groups += [(len(effects.coefficients), PER_ELEMENT), (states, PER_EVALUATION)]
     return ArrayFunction(groups, ((joints, joints, states),), bind)
