@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 
+from sims.robot.export.round_trip_check import check_written_files
+from sims.robot.export.write_model_file import write_model_files
 from sims.robot.robot_model import RobotModel
 
 ARM = """
@@ -37,8 +37,15 @@ ARM = """
 """
 
 
-def robot(folder: Path, text: str = ARM) -> RobotModel:
+def robot(folder, text=ARM):
     """Write an MJCF text to a file and return its robot."""
     path = folder / "arm.xml"
     path.write_text(text)
     return RobotModel(path, "mjcf", mujoco.MjSpec.from_file(str(path)))
+
+
+def write_and_check(robot, causes, log="log.csv"):
+    """Write causes into the file of a robot, check its motion, and return what was written."""
+    done = write_model_files(robot, causes, log)
+    check_written_files(robot, causes, done)
+    return done

@@ -1,7 +1,5 @@
 """Tests of effects at contacts: the numbers of MuJoCo's contacts, and the files that state them."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,10 +8,9 @@ from bench.logs.quality.pose_check import find_recorded_contacts
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.robot.contact_pairs import add_contact_pairs
-from sims.robot.export.round_trip_check import check_written_files
-from sims.robot.export.write_model_file import write_model_files
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
+from tests.sims.robot.sample_arms import write_and_check
 from tests.sims.robot.test_model_changes import one
 
 SLIDER = """
@@ -38,13 +35,13 @@ SCENARIO = Scenario(
 )
 
 
-def slider(folder: Path, **changes):
+def slider(folder, **changes):
     path = folder / f"slider{len(list(folder.iterdir()))}.xml"
     path.write_text(SLIDER.format(**DEFAULTS | changes))
     return make_robot_simulator(read_robot(path))
 
 
-def motion(kind, effect: str = "", *c: float) -> np.ndarray:
+def motion(kind, effect="", *c):
     effects = [effect] if effect else []
     return kind(observe=["q.x", "q.z"], effects=effects).simulate(np.array([c]), SCENARIO)
 
@@ -76,7 +73,7 @@ def motion(kind, effect: str = "", *c: float) -> np.ndarray:
         ),
     ],
 )
-def test_an_effect_is_another_number_of_the_file(effect, c, stated, other, tmp_path: Path) -> None:
+def test_an_effect_is_another_number_of_the_file(effect, c, stated, other, tmp_path):
     """The motion is that of a model file with the other number."""
     found = motion(slider(tmp_path, **stated), f"{effect}@floor/box", c)
     wanted, without = motion(slider(tmp_path, **other)), motion(slider(tmp_path, **stated))
@@ -96,7 +93,7 @@ CONTACTS = {
 
 
 @pytest.mark.parametrize("case", CONTACTS)
-def test_a_pair_has_the_parameters_of_the_contact(case, tmp_path: Path) -> None:
+def test_a_pair_has_the_parameters_of_the_contact(case, tmp_path):
     """An element `<pair>` has the parameters that MuJoCo combines from both geoms."""
     robot = slider(tmp_path, **CONTACTS[case]).robot
     contacts = []
@@ -110,7 +107,7 @@ def test_a_pair_has_the_parameters_of_the_contact(case, tmp_path: Path) -> None:
         np.testing.assert_allclose(getattr(own, name), getattr(paired, name), atol=1e-15)
 
 
-def test_contacts_of_a_recording_are_candidates(tmp_path: Path) -> None:
+def test_contacts_of_a_recording_are_candidates(tmp_path):
     """Candidates are offered only where geoms touch in the recorded poses."""
     kind = slider(tmp_path)
     for height, contacts in ((-1e-4, ("floor/box",)), (0.01, ())):
@@ -144,9 +141,7 @@ ARM_NEXT_TO_BLOCK = """<mujoco model="arm"><worldbody>
     ],
     ids=["far", "near and low", "touched"],
 )
-def test_contacts_that_act_on_no_recorded_joint_are_left_out(
-    tmp_path: Path, place: float, height: float, contacts: tuple[str, ...]
-) -> None:
+def test_contacts_that_act_on_no_recorded_joint_are_left_out(tmp_path, place, height, contacts):
     """A block on the table matters only if the arm touches it."""
     path = tmp_path / "arm.xml"
     path.write_text(ARM_NEXT_TO_BLOCK.format(place, height - 1e-4, height))
@@ -156,7 +151,7 @@ def test_contacts_that_act_on_no_recorded_joint_are_left_out(
     assert sorted("/".join(sorted(pair.split("/"))) for pair in found) == list(contacts)
 
 
-def test_limits_follow_from_the_file(tmp_path: Path) -> None:
+def test_limits_follow_from_the_file(tmp_path):
     """Friction is not negative, and no time constant is less than two steps."""
     system = slider(tmp_path).system
     (friction,) = system.effect("contact.friction@floor/box").coefficients
@@ -165,7 +160,7 @@ def test_limits_follow_from_the_file(tmp_path: Path) -> None:
     assert (friction.unit("rotary"), softness.most) == ("1", None)
 
 
-def test_an_unknown_geom_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_geom_is_refused(tmp_path):
     """The message names the geoms of the file."""
     with pytest.raises(InputError, match=r"geom of .*'bos'.*box"):
         slider(tmp_path).system.effect("contact.friction@floor/bos")
@@ -177,11 +172,10 @@ CAUSES = {"contact.friction@floor/box": one(-0.4), "contact.softness@floor/box":
 @pytest.mark.parametrize(
     "stated", [{}, {"contact": '<contact><pair geom1="box" geom2="floor"/></contact>'}]
 )
-def test_a_file_states_the_contact(stated, tmp_path: Path) -> None:
+def test_a_file_states_the_contact(stated, tmp_path):
     """The author's text gets an element `<pair>`, or other numbers in the one that it has."""
     robot = slider(tmp_path, **stated).robot
-    done = write_model_files(robot, CAUSES, "log.csv")
-    check_written_files(robot, CAUSES, done)
+    done = write_and_check(robot, CAUSES)
     model = mujoco.MjModel.from_xml_string(done.xml)
     assert model.npair == 1
     friction = 1.0 if stated else 0.8
@@ -191,11 +185,10 @@ def test_a_file_states_the_contact(stated, tmp_path: Path) -> None:
     assert "fitted to log.csv" in done.xml
 
 
-def test_unnamed_geoms_get_a_name_in_the_file(tmp_path: Path) -> None:
+def test_unnamed_geoms_get_a_name_in_the_file(tmp_path):
     """MuJoCo writes the file, since its text has no names for the pair."""
     robot = slider(tmp_path, name="").robot
     causes = {"contact.friction@floor/geom1": one(-0.4)}
-    done = write_model_files(robot, causes)
-    check_written_files(robot, causes, done)
+    done = write_and_check(robot, causes)
     assert mujoco.MjModel.from_xml_string(done.xml).pair_friction[0, 0] == pytest.approx(0.4)
     assert any("has no name in its text" in note for note in done.notes)

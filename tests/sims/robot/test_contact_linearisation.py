@@ -1,7 +1,5 @@
 """Tests of linear responses of a robot in contact, against differences of simulated runs."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -39,9 +37,7 @@ START = (np.array([0.0, -2e-4, 0.0]), np.zeros(3))
         ("drag.linear@spin", 1e-5),
     ],
 )
-def test_the_reaction_of_the_floor_is_part_of_a_response(
-    effect: str, c: float, tmp_path: Path
-) -> None:
+def test_the_reaction_of_the_floor_is_part_of_a_response(effect, c, tmp_path):
     """A changed number of the model changes the motion as in a simulation with this number."""
     (tmp_path / "roller.xml").write_text(ROLLER)
     kind = make_robot_simulator(read_robot(tmp_path / "roller.xml")).with_contacts(("floor/rim",))
@@ -55,7 +51,7 @@ def test_the_reaction_of_the_floor_is_part_of_a_response(
     np.testing.assert_allclose(responses[0], wanted, atol=0.05 * np.abs(wanted).max())
 
 
-def test_the_response_to_a_radius_does_not_depend_on_its_size(tmp_path: Path) -> None:
+def test_the_response_to_a_radius_does_not_depend_on_its_size(tmp_path):
     """A wheel that is larger by 2 % would be pressed 2 mm into the floor.
 
     The response of 2 % is 2,000 times that of a simulated radius that is larger by 0.001 %.

@@ -1,7 +1,5 @@
 """Tests of first states with settled contacts, against MuJoCo's contact law in closed form."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,7 +38,7 @@ SIGMA = np.full(3, 1e-3), np.full(3, 0.1)
 
 
 @pytest.fixture
-def simulator(tmp_path: Path):
+def simulator(tmp_path):
     (tmp_path / "wheel.xml").write_text(WHEEL)
     kind = make_robot_simulator(read_robot(tmp_path / "wheel.xml")).with_contacts(("floor/rim",))
     return kind(observe=["q.x", "q.z", "q.spin"])
@@ -51,7 +49,7 @@ def settle(simulator, scenario, measured, **options):
     return settle_contacts(model, scenario, measured, SIGMA, **options)
 
 
-def make_scenario(torque: float = 0.0):
+def make_scenario(torque=0.0):
     times = np.arange(21) / 100.0
     return Scenario(times, {}, {"u.drive": np.full(times.size, torque)})
 

@@ -1,7 +1,5 @@
 """Tests of causes applied to a model: numbers of model-field effects and of commands."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -16,12 +14,12 @@ from tests.sims.robot.sample_arms import ARM, robot
 from tests.sims.robot.test_model_field_effects import STATED
 
 
-def number(value: float, unit: str = "1") -> FittedValue:
+def number(value, unit="1"):
     """Return a fitted value with an interval of 10 % to either side."""
     return FittedValue(value, unit, 0.9 * value, 1.1 * value)
 
 
-def one(value: float) -> dict[str, FittedValue]:
+def one(value):
     """Return the numbers of an effect with one coefficient."""
     return {"coefficient": number(value)}
 
@@ -30,9 +28,7 @@ def one(value: float) -> dict[str, FittedValue]:
 @pytest.mark.parametrize(
     ("effect", "place", "c"), [one for one in STATED if one[0] != COUPLING_PLACEHOLDER[1]]
 )
-def test_a_cause_is_the_same_in_a_batch_element(
-    effect: str, place: str, c: tuple[float, ...], tmp_path: Path
-) -> None:
+def test_a_cause_is_the_same_in_a_batch_element(effect, place, c, tmp_path):
     """The compiled model of a cause has the same fields as a batch element with the effect."""
     arm = robot(tmp_path)
     names = [coefficient.name for coefficient in get_effect(effect).coefficients]
@@ -50,7 +46,7 @@ DRIVEN = ARM.replace('name="m_elbow"', 'name="m_elbow" ctrllimited="true" ctrlra
 
 
 @pytest.mark.parametrize("control", [-2.5, -0.4, 0.3, 0.9, 4.0])
-def test_a_command_passes_gain_bias_and_limit(control: float, tmp_path: Path) -> None:
+def test_a_command_passes_gain_bias_and_limit(control, tmp_path):
     """The force is that of the erroneous command, within the control range."""
     arm = robot(tmp_path, DRIVEN)
     causes = {
@@ -64,7 +60,7 @@ def test_a_command_passes_gain_bias_and_limit(control: float, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("place", ["m_shoulder", "m_spin"])
-def test_a_servo_is_given_another_set_point(place: str, tmp_path: Path) -> None:
+def test_a_servo_is_given_another_set_point(place, tmp_path):
     """A gain and a bias of the set point keep the servo's own gains."""
     arm = robot(tmp_path)
     causes = {
@@ -82,7 +78,7 @@ def test_a_servo_is_given_another_set_point(place: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(_forces(model, commanded), _forces(plain, meant), atol=1e-12)
 
 
-def _forces(model: mujoco.MjModel, control: object) -> np.ndarray:
+def _forces(model, control):
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = 0.1, 0.2, control
     mujoco.mj_forward(model, data)
@@ -90,7 +86,7 @@ def _forces(model: mujoco.MjModel, control: object) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("place", "force"), [("elbow", 0.7), ("spin", 0.02), ("shoulder", 0.7)])
-def test_a_constant_force_is_a_spring_or_a_bias(place: str, force: float, tmp_path: Path) -> None:
+def test_a_constant_force_is_a_spring_or_a_bias(place, force, tmp_path):
     """The acceleration is that of the force."""
     arm = robot(tmp_path)
     model = apply_causes(arm, {f"force.bias@{place}": one(force)}).model
@@ -113,7 +109,7 @@ def test_a_constant_force_is_a_spring_or_a_bias(place: str, force: float, tmp_pa
         ("input.gain@m_spin", "a factor of zero or less"),
     ],
 )
-def test_what_a_file_cannot_say_is_said(name: str, why: str, tmp_path: Path) -> None:
+def test_what_a_file_cannot_say_is_said(name, why, tmp_path):
     """One line each with the number; the model is unchanged."""
     arm = robot(tmp_path)
     applied = apply_causes(arm, {name: one(-2.0)}, "log.csv")
@@ -135,7 +131,7 @@ MOVING = """
 """
 
 
-def test_what_a_mass_would_move_along_stays(tmp_path: Path) -> None:
+def test_what_a_mass_would_move_along_stays(tmp_path):
     """Gains and dampings that the compiler derives from masses keep their values."""
     arm = robot(tmp_path, MOVING)
     model, before = apply_causes(arm, {"mass.scale@b": one(0.2)}).model, arm.compiled
@@ -144,7 +140,7 @@ def test_what_a_mass_would_move_along_stays(tmp_path: Path) -> None:
         np.testing.assert_allclose(getattr(model, name), getattr(before, name), rtol=1e-12)
 
 
-def test_the_robot_stays_as_it_is(tmp_path: Path) -> None:
+def test_the_robot_stays_as_it_is(tmp_path):
     """Applying causes does not change the robot that was read."""
     arm = robot(tmp_path)
     before = arm.spec.to_xml()
@@ -152,7 +148,7 @@ def test_the_robot_stays_as_it_is(tmp_path: Path) -> None:
     assert arm.spec.to_xml() == before
 
 
-def test_numerics_are_options(tmp_path: Path) -> None:
+def test_numerics_are_options(tmp_path):
     """The step and the integrator that repair a model are in its options."""
     causes = {"numerics.step": {"coefficient": number(5e-4, "s")}, "numerics.integrator": one(1.0)}
     options = {"cone": 1.0, "impratio": 20.0, "noslip": 5.0, "solver": 0.0, "iterations": 30.0}

@@ -2,9 +2,6 @@
 values.
 """
 
-from pathlib import Path
-from typing import Any
-
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +11,6 @@ from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
 from sims.robot.dynamics.mujoco_batch import make_batch_spec
 from sims.robot.dynamics.series_joints import add_elements
-from sims.robot.robot_model import RobotModel
 from tests.sims.robot.sample_arms import ARM, robot
 
 ELBOW = 'damping="0.1" frictionloss="0.05" stiffness="0.5"'
@@ -89,7 +85,7 @@ STATED |= {
 CONTROL = (0.7, 1.8, 6.0)
 
 
-def simulate_pair(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> Any:
+def simulate_pair(robot, effect, place, c):
     """Return (2, nq) positions after 0.4 s: an element without the effect, and one with it."""
     of = model_field_effects.MODEL_FIELD_EFFECTS[effect]
     if effect == COUPLING_PLACEHOLDER[1]:
@@ -102,7 +98,7 @@ def simulate_pair(robot: RobotModel, effect: str, place: str, c: tuple[float, ..
     return moved(batch)
 
 
-def moved(batch: Batch) -> Any:
+def moved(batch):
     """Return the positions after 0.4 s of motion."""
     batch.bind("qpos")[:] = (0.3, -0.5, 0.1)
     batch.bind("ctrl")[:] = CONTROL
@@ -111,9 +107,7 @@ def moved(batch: Batch) -> Any:
 
 
 @pytest.mark.parametrize(("effect", "place", "c"), STATED)
-def test_an_element_moves_as_the_file_that_states_it(
-    effect: str, place: str, c: tuple[float, ...], tmp_path: Path
-) -> None:
+def test_an_element_moves_as_the_file_that_states_it(effect, place, c, tmp_path):
     """An element with a coefficient moves as a model whose file has the value; the element next to
     it still moves as the original file.
     """
@@ -128,7 +122,7 @@ def test_an_element_moves_as_the_file_that_states_it(
     assert np.abs(stated[0] - plain[0]).max() > 1e-5
 
 
-def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path: Path) -> None:
+def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path):
     """With friction in the file, an element with a zero coefficient moves as the file, although
     another element has more friction.
     """
@@ -142,7 +136,7 @@ def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path: Path) -
     assert np.abs(found[1] - found[0]).max() > 1e-7
 
 
-def test_every_native_effect_is_compared() -> None:
+def test_every_native_effect_is_compared():
     """The table above contains every model-field effect, except for those at contacts.
 
     These are compared in `test_contact_effects` and `test_wheel_radius`.
@@ -152,7 +146,7 @@ def test_every_native_effect_is_compared() -> None:
     assert {effect for effect, _, _ in STATED} == written - at_contacts
 
 
-def test_no_mass_becomes_negative(tmp_path: Path) -> None:
+def test_no_mass_becomes_negative(tmp_path):
     """A coefficient of -3 leaves a positive mass."""
     arm = robot(tmp_path)
     fields = {name: np.array(getattr(arm.compiled, name))[None] for name in ("body_mass",)}

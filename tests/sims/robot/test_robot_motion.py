@@ -159,32 +159,6 @@ def test_stribeck_friction_without_its_extra_is_coulombs():
     assert np.abs(more - coulomb).max() > 1e-4
 
 
-LIFT = """
-<mujoco>
-  <option timestep="0.001" integrator="RK4"/>
-  <worldbody><body><joint name="lift" type="slide" axis="0 0 1"/><geom size="0.1" mass="2"/></body>
-  </worldbody><actuator><motor name="motor" joint="lift"/></actuator>
-</mujoco>
-"""
-
-
-@pytest.mark.parametrize("speed", [3.0, -3.0])
-def test_friction_grows_with_what_the_transmission_carries(speed):
-    """A mass is driven against its weight: friction is c times the sum of both forces."""
-    force, weight, c = 30.0, 2 * 9.81, 0.1
-    run = Scenario(TIMES, {"qd.lift": speed}, {"u.motor": np.full(TIMES.size, force)})
-    seen = one(kind_of(LIFT), run, ["q.lift"], friction__load_at_lift=c)[:, 0]
-    slowed = -np.sign(speed) * c * (force + weight)
-    acceleration = (force - weight + slowed) / 2.0
-    there = np.sign(speed + acceleration * TIMES) == np.sign(speed)
-    assert there.sum() > 20
-    expected = speed * TIMES + acceleration * TIMES**2 / 2
-    # Tolerance for the solver's softness, and for the first step, which has no previous forces.
-    np.testing.assert_allclose(seen[there], expected[there], rtol=0, atol=0.02 * np.abs(seen).max())
-    free = speed * TIMES + (force - weight) / 4.0 * TIMES**2
-    assert np.abs(seen - free)[there].max() > 0.1
-
-
 PUSHED = {"u.motor": np.full(TIMES.size, 0.3)}
 PUSH = 2 * 0.3 / INERTIA
 """rad/s^2."""

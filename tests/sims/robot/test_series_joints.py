@@ -13,11 +13,10 @@ from sims.core.simulator import Scenario
 from sims.extended_simulator import FittedValue
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.export.apply_causes import apply_causes
-from sims.robot.export.round_trip_check import check_written_files
 from sims.robot.export.write_model_file import write_model_files
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator
-from tests.sims.robot.sample_arms import ARM
+from tests.sims.robot.sample_arms import ARM, write_and_check
 from tests.sims.robot.sample_arms import robot as arm
 
 DRIVE, LINK = 0.02, 0.08  # kg m^2
@@ -51,46 +50,6 @@ def moved(kind, effects, coefficients, scenario, observe=("q.axle",)):
 
 def pushed(torque, times=TIMES):
     return Scenario(times, {}, {"u.m_axle": np.full(times.size, torque)})
-
-
-def test_a_drive_on_a_spring_swings_as_two_masses_do():
-    """x = u t^2 / 2 (J + M) + u M (1 - cos w t) / J (J + M) w^2, w^2 = k (1 / J + 1 / M)."""
-    seen = moved(make_simulator(WHEEL), ["joint.flexibility@axle"], [1 / STIFF, 0.0], pushed(0.5))
-    both, w = DRIVE + LINK, np.sqrt(STIFF * (1 / DRIVE + 1 / LINK))
-    swing = 0.5 * LINK / (DRIVE * both * w**2) * (1 - np.cos(w * TIMES))
-    np.testing.assert_allclose(seen[:, 0], 0.25 / both * TIMES**2 + swing, atol=2e-7)
-    assert swing.max() > 5e-3
-
-
-def test_a_drive_goes_alone_through_its_gap_and_then_takes_the_link_along():
-    """In the gap x'' = u / J; after an impact without rebound (J + M) x'' = u."""
-    gap, torque = 0.05, 0.1
-    seen = moved(make_simulator(WHEEL), ["joint.backlash@axle"], [gap], pushed(torque))[:, 0]
-    meets = np.sqrt(2 * DRIVE * gap / 2 / torque)
-    alone = meets > TIMES
-    np.testing.assert_allclose(seen[alone], 0.5 * torque / DRIVE * TIMES[alone] ** 2, atol=1e-9)
-    together, later = DRIVE + LINK, np.maximum(TIMES - meets, 0.0)
-    speed = torque * meets / together
-    after = gap / 2 + speed * later + 0.5 * torque / together * later**2
-    # The impact takes some milliseconds, in which the flank yields slightly.
-    late = meets + 0.03 < TIMES
-    np.testing.assert_allclose(seen[late], after[late], atol=2e-4)
-    assert alone.sum() > 8
-
-
-def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
-    """From rest, without a reversal: (J + M) v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
-    torque, dry, way = 0.3, 0.2, 0.05
-    q, v = moved(
-        make_simulator(WHEEL),
-        ["friction.hysteresis@axle"],
-        [dry, way],
-        pushed(torque),
-        ("q.axle", "qd.axle"),
-    ).T
-    work = torque * q - dry * (q - way * (1 - np.exp(-q / way)))
-    np.testing.assert_allclose(0.5 * (DRIVE + LINK) * v**2, work, atol=2e-6)
-    assert q[-1] > 5 * way
 
 
 def test_the_drive_that_a_file_does_not_state_is_a_number():
@@ -292,8 +251,7 @@ WITH_BACKLASH = {**CAUSES, "joint.backlash@elbow": {"gap": number(0.02), "rotor"
 
 def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path):
     robot = arm(tmp_path)
-    done = write_model_files(robot, CAUSES, "log.csv")
-    check_written_files(robot, CAUSES, done)
+    done = write_and_check(robot, CAUSES)
     assert "the elbow is the one that wears" in done.xml, "it stays its author's"
     assert done.xml.count("fitted to log.csv") == 4
     model = mujoco.MjSpec.from_string(done.xml).compile()
@@ -303,8 +261,7 @@ def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path)
 
 def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
     robot = arm(tmp_path)
-    done = write_model_files(robot, WITH_BACKLASH, "log.csv")
-    check_written_files(robot, WITH_BACKLASH, done)
+    done = write_and_check(robot, WITH_BACKLASH)
     model = mujoco.MjSpec.from_string(done.xml).compile()
     joint = model.joint("elbow_transmission")
     assert joint.range == pytest.approx([-0.01, 0.01])

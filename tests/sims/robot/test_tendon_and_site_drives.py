@@ -1,16 +1,13 @@
 """Tests of actuators on tendons and sites: units, effects and their numbers in the file."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sims import effects
 from sims.core.simulator import Scenario
-from sims.robot.export.round_trip_check import check_written_files
-from sims.robot.export.write_model_file import write_model_files
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
+from tests.sims.robot.sample_arms import write_and_check
 from tests.sims.robot.test_model_changes import number, one
 
 GRIPPER = """<mujoco>
@@ -46,20 +43,20 @@ GRIPPER = """<mujoco>
 
 
 @pytest.fixture
-def gripper(tmp_path: Path):
+def gripper(tmp_path):
     path = tmp_path / "gripper.xml"
     path.write_text(GRIPPER)
     return make_robot_simulator(read_robot(path))
 
 
-def test_commands_have_the_unit_of_what_they_move(gripper) -> None:
+def test_commands_have_the_unit_of_what_they_move(gripper):
     units = {c.name: c.unit for c in gripper.system.inputs}
     assert [units[f"u.{name}"] for name in ("grip", "thrust", "twist", "blend")] == [
         "m", "N", "N*m", "1",
     ]  # fmt: skip
 
 
-def test_effects_of_the_command_and_of_the_actuator_act_there(gripper) -> None:
+def test_effects_of_the_command_and_of_the_actuator_act_there(gripper):
     found = effects.list_effects_for(gripper.system)
     places = {name.partition("@")[2] for name in found if name.startswith("input.delay@")}
     assert places == {"grip", "thrust", "twist", "*"}
@@ -78,9 +75,7 @@ def test_effects_of_the_command_and_of_the_actuator_act_there(gripper) -> None:
         ("input.gain@twist", -0.5, 'gear="0 0 0 0 1 0"', 'gear="0 0 0 0 0.5 0"'),
     ],
 )
-def test_the_robot_moves_as_the_file_that_states_it(
-    effect: str, c: float, before: str, after: str, gripper, tmp_path: Path
-) -> None:
+def test_the_robot_moves_as_the_file_that_states_it(effect, c, before, after, gripper, tmp_path):
     """MuJoCo's own numbers give the same motion as the coefficient."""
     assert GRIPPER.count(before) == 1
     path = tmp_path / "other.xml"
@@ -97,8 +92,7 @@ def test_the_robot_moves_as_the_file_that_states_it(
     assert np.abs(stated - plain).max() > 1e-4
 
 
-def test_the_file_states_them(gripper) -> None:
+def test_the_file_states_them(gripper):
     causes = {"actuator.damping@grip": one(0.5), "input.bias@thrust": {"coefficient": number(2.0)}}
-    done = write_model_files(gripper.robot, causes)
-    check_written_files(gripper.robot, causes, done)
+    done = write_and_check(gripper.robot, causes)
     assert not done.notes

@@ -1,16 +1,14 @@
 """Tests of the radius of wheels and feet, against rolling without slip and other model files."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
 from sims.core.simulator import InputError, Scenario
-from sims.robot.export.round_trip_check import check_written_files
 from sims.robot.export.write_model_file import write_model_files
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
+from tests.sims.robot.sample_arms import write_and_check
 from tests.sims.robot.test_model_changes import one
 
 ROLLER = """
@@ -38,20 +36,20 @@ SCENARIO = Scenario(TIMES, {"q.z": 0.02}, {"u.drive": np.full(101, 3.0)})
 CHANNELS = ["q.x", "q.z", "q.spin"]
 
 
-def roller(folder: Path, shape: str):
+def roller(folder, shape):
     path = folder / f"roller{len(list(folder.iterdir()))}.xml"
     path.write_text(ROLLER.format(shape=shape))
     return make_robot_simulator(read_robot(path))
 
 
-def motion(kind, *c: float):
+def motion(kind, *c):
     effects = ["geom.radius@rim"] if c else []
     return kind(observe=CHANNELS, effects=effects).simulate(np.array([c]), SCENARIO)[0]
 
 
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("c", [-0.2, 0.15])
-def test_a_wheel_rolls_by_its_radius_times_its_angle(name: str, c: float, tmp_path: Path) -> None:
+def test_a_wheel_rolls_by_its_radius_times_its_angle(name, c, tmp_path):
     """Without slip, v = r omega; at rest, the axle is as high as the radius."""
     shape, radius = SHAPES[name]
     moved = motion(roller(tmp_path, shape.format(radius)), c)
@@ -62,11 +60,10 @@ def test_a_wheel_rolls_by_its_radius_times_its_angle(name: str, c: float, tmp_pa
     assert moved[-1, 1] + 0.1 == pytest.approx(radius * (1 + c), abs=2e-4)
 
 
-def test_nothing_else_changes(tmp_path: Path) -> None:
+def test_nothing_else_changes(tmp_path):
     """Mass and inertia of the body are those of the file, in the simulation and in the file."""
     kind = roller(tmp_path, SHAPES["cylinder"][0].format(0.1))
-    done = write_model_files(kind.robot, {"geom.radius@rim": one(0.25)}, "a log")
-    check_written_files(kind.robot, {"geom.radius@rim": one(0.25)}, done)
+    done = write_and_check(kind.robot, {"geom.radius@rim": one(0.25)}, "a log")
     model, file_model = mujoco.MjModel.from_xml_string(done.xml), kind.robot.compiled
     np.testing.assert_allclose(model.geom("rim").size, (0.125, 0.02, 0.0), atol=1e-15)
     np.testing.assert_allclose(model.body_inertia, file_model.body_inertia, rtol=1e-12)
@@ -77,14 +74,14 @@ def test_nothing_else_changes(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion(kind, 0.25), motion(written), atol=1e-9)
 
 
-def test_the_half_axes_of_an_ellipsoid_grow_together(tmp_path: Path) -> None:
+def test_the_half_axes_of_an_ellipsoid_grow_together(tmp_path):
     kind = roller(tmp_path, 'type="ellipsoid" size="0.1 0.05 0.08"')
     done = write_model_files(kind.robot, {"geom.radius@rim": one(0.1)})
     model = mujoco.MjModel.from_xml_string(done.xml)
     np.testing.assert_allclose(model.geom("rim").size, (0.11, 0.055, 0.088), rtol=1e-12)
 
 
-def test_a_larger_wheel_still_collides_where_many_geoms_do(tmp_path: Path) -> None:
+def test_a_larger_wheel_still_collides_where_many_geoms_do(tmp_path):
     """The volumes that bound geoms grow with the wheel: without them, contacts are missed."""
     many = '<geom type="sphere" size="0.005" pos="0 0 {}" mass="0.001"/>'
     text = ROLLER.format(shape=SHAPES["cylinder"][0].format(0.1))
@@ -100,7 +97,7 @@ def test_a_larger_wheel_still_collides_where_many_geoms_do(tmp_path: Path) -> No
     assert moved[-1, 1] + 0.1 == pytest.approx(0.15, abs=2e-3)
 
 
-def test_only_round_geoms_have_a_radius(tmp_path: Path) -> None:
+def test_only_round_geoms_have_a_radius(tmp_path):
     """Candidates are round geoms of moving bodies that touch; others may be named."""
     from sims.effects import get_effect
 

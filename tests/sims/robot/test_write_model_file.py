@@ -4,7 +4,6 @@ right.
 
 import difflib
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,12 +11,12 @@ import pytest
 
 from sims.extended_simulator import FittedValue
 from sims.robot.export.round_trip_check import check_written_files, simulate_test_motion
-from sims.robot.export.write_model_file import CauseCoefficients, write_model_files
+from sims.robot.export.write_model_file import write_model_files
 from sims.robot.parsing.read_model_file import read_robot
-from tests.sims.robot.sample_arms import ARM, robot
+from tests.sims.robot.sample_arms import ARM, robot, write_and_check
 from tests.sims.robot.test_model_changes import MOVING, number, one
 
-CAUSES: CauseCoefficients = {
+CAUSES = {
     "friction.coulomb@*": {
         "coefficient@elbow": number(0.3, "N*m"),
         "coefficient@shoulder": number(0.1, "N*m"),
@@ -32,11 +31,10 @@ CAUSES: CauseCoefficients = {
 }
 
 
-def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
+def test_an_mjcf_stays_its_authors(tmp_path):
     """Only lines with other values change; each change has a comment before it."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES, "log.csv")
-    assert done.xml is not None
     before, after = ARM.splitlines(), done.xml.splitlines()
     changes = [line for line in difflib.ndiff(before, after) if line[0] in "-+"]
     gone = [line[2:].strip() for line in changes if line[0] == "-"]
@@ -55,7 +53,7 @@ def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
     check_written_files(arm, CAUSES, done)
 
 
-def test_nothing_found_leaves_the_file(tmp_path: Path) -> None:
+def test_nothing_found_leaves_the_file(tmp_path):
     """Without causes the text is unchanged, except for a line about its origin."""
     arm = robot(tmp_path)
     text = write_model_files(arm, {}, "log.csv").xml
@@ -64,11 +62,10 @@ def test_nothing_found_leaves_the_file(tmp_path: Path) -> None:
     assert lines == ARM.splitlines()
 
 
-def test_what_one_writes_a_rollout_moves(tmp_path: Path) -> None:
+def test_what_one_writes_a_rollout_moves(tmp_path):
     """The written file moves with the causes, not as the original file."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES)
-    assert done.xml is not None
     path = tmp_path / "elsewhere" / "extended.xml"
     path.parent.mkdir()
     path.write_text(done.xml)
@@ -112,7 +109,7 @@ PARTS = {
 }
 
 
-def test_files_of_a_file_are_found_from_anywhere(tmp_path: Path) -> None:
+def test_files_of_a_file_are_found_from_anywhere(tmp_path):
     """Unchanged includes stay includes, meshes are found, line ends are kept, and classes and
     unnamed elements are supported.
     """
@@ -122,15 +119,13 @@ def test_files_of_a_file_are_found_from_anywhere(tmp_path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(text.replace("\n", "\r\n").encode())
     arm = read_robot(home / "main.xml")
-    causes: CauseCoefficients = {
+    causes = {
         "drag.quadratic@e": one(0.05),
         "inertia.armature@joint0": one(0.01),
         "mass.scale@a": one(0.2),
         "input.bias@actuator0": one(0.02),
     }
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
-    assert done.xml is not None
+    done = write_and_check(arm, causes)
     assert not done.notes
     assert 'file="defaults.xml"' not in done.xml
     assert str(home / "defaults.xml") in done.xml
@@ -147,25 +142,21 @@ REPEATED = """
 """
 
 
-def test_where_elements_are_repeated_mujoco_writes(tmp_path: Path) -> None:
+def test_where_elements_are_repeated_mujoco_writes(tmp_path):
     """Only one of the elements that a repeated element stands for changes, with its comment."""
     arm = robot(tmp_path, REPEATED)
     causes = {"drag.linear@j1": one(0.123456789012345)}
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
-    assert done.xml is not None
+    done = write_and_check(arm, causes)
     (line,) = done.notes
     assert "<replicate>" in line
     before, _, _ = done.xml.partition('name="j1"')
     assert "drag.linear@j1" in before.splitlines()[-2]
 
 
-def test_what_moves_along_is_stated(tmp_path: Path) -> None:
+def test_what_moves_along_is_stated(tmp_path):
     """A damping ratio becomes the damping that it gave before, with a comment."""
     arm = robot(tmp_path, MOVING)
-    done = write_model_files(arm, {"mass.scale@b": one(0.2)})
-    check_written_files(arm, {"mass.scale@b": one(0.2)}, done)
-    assert done.xml is not None
+    done = write_and_check(arm, {"mass.scale@b": one(0.2)})
     assert not done.notes
     assert "dampratio" not in done.xml
     assert 'springdamper="0 0"' in done.xml
@@ -173,21 +164,19 @@ def test_what_moves_along_is_stated(tmp_path: Path) -> None:
     assert done.xml.count("unchanged: without this line") == 3
 
 
-def test_another_motion_is_a_fault_of_the_program(tmp_path: Path) -> None:
+def test_another_motion_is_a_fault_of_the_program(tmp_path):
     """A file that does not match the model is not written; the error names the field."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES)
-    assert done.xml is not None
     wrong = replace(done, xml=done.xml.replace('frictionloss="0.35"', 'frictionloss="0.35001"'))
     with pytest.raises(RuntimeError, match="dof_frictionloss"):
         check_written_files(arm, CAUSES, wrong)
 
 
-def test_two_hyphens_end_no_comment(tmp_path: Path) -> None:
+def test_two_hyphens_end_no_comment(tmp_path):
     """A recording may have any name."""
     arm = robot(tmp_path)
-    done = write_model_files(arm, {"drag.linear@elbow": one(0.1)}, "a--b-->-")
-    check_written_files(arm, {"drag.linear@elbow": one(0.1)}, done)
+    write_and_check(arm, {"drag.linear@elbow": one(0.1)}, "a--b-->-")
 
 
 URDF = """<robot name="arm">
@@ -212,14 +201,14 @@ URDF = """<robot name="arm">
 """
 
 
-def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
+def test_a_urdf_says_what_it_can(tmp_path):
     """Links on fixed joints change with their body; other causes are noted and are in the MJCF
     only.
     """
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
     arm = read_robot(path)
-    causes: CauseCoefficients = {
+    causes = {
         "drag.linear@elbow": one(0.1),
         "friction.coulomb@elbow": one(0.05),
         "mass.scale@fore": one(0.2),
@@ -227,9 +216,7 @@ def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
         "inertia.armature@elbow": one(0.01),
         "inertia.scale@fore": one(0.1),
     }
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
-    assert done.urdf is not None
+    done = write_and_check(arm, causes)
     assert '<dynamics damping="0.30000000000000004" friction="0.05"/>' in done.urdf
     assert "<!-- the elbow -->" in done.urdf
     unsaid = {line.partition(":")[0] for line in done.notes if "not in the URDF" in line}
@@ -237,10 +224,8 @@ def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
     stiff = "a URDF cannot state that dry friction is stiff"
     assert stiff in done.urdf
     soft = write_model_files(arm.with_friction_form("soft"), causes, "log.csv")
-    assert soft.urdf is not None
     assert 'friction="0.05"' in soft.urdf
     assert stiff not in soft.urdf
-    assert done.xml is not None
     assert "inertia.armature@elbow" in done.xml
     wrong = replace(done, urdf=done.urdf.replace('friction="0.05"', 'friction="0.06"'))
     with pytest.raises(RuntimeError, match="dof_frictionloss"):
@@ -270,39 +255,36 @@ MASSLESS = """<robot name="arm">
 
 
 @pytest.mark.parametrize("inertial", ["/>", '><inertial><mass value="0"/></inertial></link>'])
-def test_a_urdf_says_what_massless_links_carry(tmp_path: Path, inertial: str) -> None:
+def test_a_urdf_says_what_massless_links_carry(tmp_path, inertial):
     """If the mass of a body is on a link behind fixed joints, that link is changed."""
     path = tmp_path / "arm.urdf"
     path.write_text(MASSLESS.replace("INERTIAL", inertial))
     arm = read_robot(path)
-    causes: CauseCoefficients = {
+    causes = {
         "mass.scale@fore": one(0.2),
         "mass.offset@fore": {"x": number(0.01, "m"), "z": number(0.02, "m")},
         "inertia.scale@fore": one(0.1),
     }
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
-    assert done.urdf is not None
+    done = write_and_check(arm, causes)
     assert not [line for line in done.notes if "not in the URDF" in line]
     assert '<mass value="0.36"/>' in done.urdf
     changed = done.urdf.partition('<link name="tool">')[2].partition("</link>")[0]
     assert changed.count("fitted to log.csv") == done.urdf.count("fitted to log.csv") == 3
 
 
-def test_a_urdf_body_without_any_inertial_is_said(tmp_path: Path) -> None:
+def test_a_urdf_body_without_any_inertial_is_said(tmp_path):
     """A mass computed from shapes has no number in the file."""
     shape = '><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
     path = tmp_path / "arm.urdf"
     path.write_text(MASSLESS.replace("INERTIAL", shape))
     arm = read_robot(path)
-    causes: CauseCoefficients = {"mass.scale@fore": one(0.2)}
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
+    causes = {"mass.scale@fore": one(0.2)}
+    done = write_and_check(arm, causes)
     (line,) = [line for line in done.notes if "not in the URDF" in line]
     assert "states no inertial" in line
 
 
-def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
+def test_a_delay_is_that_of_the_simulator(tmp_path):
     """In both, a control delayed by a fraction of a step is the mean over the step."""
     from sims.core.simulator import Scenario
     from sims.robot.robot_simulator import make_robot_simulator
@@ -314,7 +296,6 @@ def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
     scenario = Scenario(times=times, inputs={"u.m_elbow": command})
     (shown,) = simulator.simulate_batch(np.array([[0.0123]]), [scenario])
     done = write_model_files(arm, {"input.delay@m_elbow": {"coefficient": number(0.0123, "s")}})
-    assert done.xml is not None
     model = mujoco.MjModel.from_xml_string(done.xml)
     data = mujoco.MjData(model)
     elbow = []
@@ -341,17 +322,13 @@ NAMELESS = """<mujoco>
 """
 
 
-def test_an_actuator_without_a_name_keeps_none(tmp_path: Path) -> None:
+def test_an_actuator_without_a_name_keeps_none(tmp_path):
     """An unnamed actuator, read under the name of its joint, stays unnamed in the file."""
     path = tmp_path / "leg.xml"
     path.write_text(NAMELESS)
     arm = read_robot(path)
-    causes: CauseCoefficients = {
-        f"input.lag@{arm.actuators[0].name}": {"coefficient": number(0.05, "s")}
-    }
-    done = write_model_files(arm, causes)
-    check_written_files(arm, causes, done)
-    assert done.xml is not None
+    causes = {f"input.lag@{arm.actuators[0].name}": {"coefficient": number(0.05, "s")}}
+    done = write_and_check(arm, causes)
     (line,) = done.notes
     assert line.startswith("input.lag")
     (actuator,) = [line for line in done.xml.splitlines() if "<general" in line]
@@ -360,7 +337,7 @@ def test_an_actuator_without_a_name_keeps_none(tmp_path: Path) -> None:
     assert 'gear="3" ctrllimited="true" ctrlrange="-1 1"' in actuator
 
 
-def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: Path) -> None:
+def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path):
     """If MuJoCo's filter begins at the first command, the motion is close to the simulator's."""
     from sims.core.simulator import Scenario
     from sims.robot.robot_simulator import make_robot_simulator
@@ -372,7 +349,6 @@ def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: P
     scenario = Scenario(times=times, inputs={"u.m_elbow": command})
     shown, direct = simulator.simulate_batch(np.array([[0.05], [0.0]]), [scenario] * 2)
     done = write_model_files(arm, {"input.lag@m_elbow": {"coefficient": number(0.05, "s")}})
-    assert done.xml is not None
     model = mujoco.MjModel.from_xml_string(done.xml)
     data = mujoco.MjData(model)
     data.act[:] = command[0]
@@ -387,17 +363,15 @@ def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: P
     assert abs(data.qpos[1] - shown[-1, place]) < 0.02 * effect
 
 
-def test_actuators_of_a_recording_are_written_into_the_file(tmp_path: Path) -> None:
+def test_actuators_of_a_recording_are_written_into_the_file(tmp_path):
     """The author's text has no element for them, so MuJoCo writes the model."""
     path = tmp_path / "leg.xml"
     actuator = NAMELESS[NAMELESS.index("  <actuator>") : NAMELESS.index("</mujoco>")]
     path.write_text(NAMELESS.replace(actuator, ""))
     added = {"m_hip": {"joint": "hip", "kind": "position", "kp": 4.0, "kv": 0.5}}
     leg = read_robot(path, actuators=added)
-    causes: CauseCoefficients = {"actuator.stiffness@m_hip": one(0.5)}
-    done = write_model_files(leg, causes)
-    check_written_files(leg, causes, done)
-    assert done.xml is not None
+    causes = {"actuator.stiffness@m_hip": one(0.5)}
+    done = write_and_check(leg, causes)
     model = mujoco.MjModel.from_xml_string(done.xml)
     assert model.actuator_gainprm[0, 0] == pytest.approx(6.0)
     assert any("its actuators are the recording's" in line for line in done.notes)
@@ -406,8 +380,7 @@ def test_actuators_of_a_recording_are_written_into_the_file(tmp_path: Path) -> N
 def test_compensated_gravity_is_written_as_such(tmp_path):
     arm = robot(tmp_path)
     causes = {"gravity.scale": {"coefficient": FittedValue(-0.999, "1", -1.001, -0.997)}}
-    done = write_model_files(arm, causes, "log.csv")
-    check_written_files(arm, causes, done)
+    done = write_and_check(arm, causes)
     assert done.xml.count('gravcomp="1"') == 3
     model = mujoco.MjModel.from_xml_string(done.xml)
     assert model.opt.gravity.tolist() == [0.0, 0.0, -9.81]
