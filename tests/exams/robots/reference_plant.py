@@ -194,13 +194,6 @@ class Plant:
 
         return pinocchio.rnea(self.model, self.data, q, v, a).copy()
 
-    def energy(self, q, v):
-        """Return the sum of kinetic and potential energy, J."""
-        import pinocchio
-
-        kinetic = pinocchio.computeKineticEnergy(self.model, self.data, q, v)
-        return kinetic + pinocchio.computePotentialEnergy(self.model, self.data, q)
-
 
 @dataclass
 class FloatingPlant(Plant):
@@ -229,9 +222,6 @@ class FloatingPlant(Plant):
 
     def torque(self, q, v, a):
         return self._padded(super().torque(*self._reordered(q, v, a)))
-
-    def energy(self, q, v):
-        return super().energy(*self._reordered(q, v))
 
     def _pose(self, q):
         """Return positions in Pinocchio's order."""
