@@ -1,5 +1,3 @@
-import json
-
 import pytest
 
 import simgap
@@ -36,7 +34,7 @@ def test_a_single_run_in_memory_is_divided_as_one_that_is_read():
     assert len(recording.runs) == 1
     found = simgap.explain(recording)
     assert found.verdict == "adequate"
-    assert "held" in json.dumps(found.extended.title) or found.story.held_out is not None
+    assert found.story.held_out is not None
 
 
 def test_what_a_cell_shows_is_one_line(swing):

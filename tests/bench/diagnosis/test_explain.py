@@ -1,8 +1,6 @@
 """Tests of anomalous recordings: a verdict or a one-line error, no traceback, no wrong cause."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -298,15 +296,6 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     drag = again.causes[0].coefficients["coefficient"]
     first = found.causes[0].coefficients["coefficient"]
     assert drag.low < first.value < drag.high
-
-
-def test_what_only_tables_need_is_not_loaded():
-    code = (
-        "import sys, bench.diagnosis.explain; "
-        "print('pandas' in sys.modules, 'scipy' in sys.modules)"
-    )
-    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert printed.stdout.split() == ["False", "False"], printed.stderr
 
 
 def test_a_mass_beyond_its_declared_range_is_fitted_and_reported(tmp_path):

@@ -78,14 +78,6 @@ def test_faults_are_one_line_that_names_file_and_entry(change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_experiment_lists_those_there_are():
-    with pytest.raises(
-        InputError,
-        match=r"unknown experiment 'ball'; did you mean .*ball-drop",
-    ):
-        load_experiment("ball")
-
-
 def test_seeds_on_the_command_line_never_exceed_an_entry_that_asks_for_fewer():
     experiment = spring_experiment(tuners={"random": {"seeds": 1}, "cma_es": {}}).with_seeds(3)
     assert experiment.seeds == 3

@@ -144,6 +144,7 @@ def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path
     assert read_damaged(cell("loss", 1, -2.0)) == (
         f"/runs.parquet, row 1: loss: expected a number of at least 0, found -2.0{remedy}"
     )
+    assert read_damaged(DONE["truncated"]).startswith("/runs.parquet: not a complete comparison: ")
     assert read_damaged(cell("k", 5, 3)).startswith(
         "/runs.parquet, row 5: k: expected 1, the next of ran"
     )
