@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from unittest.mock import patch
 
 import jsonschema
 import mujoco
@@ -226,6 +227,14 @@ def test_files_are_written_together(everything, tmp_path, monkeypatch):
     assert not [path for path in without if path.name.startswith("ranges")]
 
 
+def execute(code, stubs):
+    """Run a generated file with stub modules; return its definitions."""
+    space = {}
+    with patch.dict(sys.modules, stubs):
+        exec(compile(code, "ranges.py", "exec"), space)
+    return space
+
+
 # -- code for MuJoCo Playground, run with NumPy instead of JAX
 
 
@@ -284,17 +293,7 @@ def randomized(code, model):
     mjx.Model = _Model
     mjx.name2id = lambda model, kind, name: mujoco.mj_name2id(model._model, kind, name)
     stubs = {"jax": jax, "jax.numpy": jax.numpy, "mujoco.mjx": mjx}
-    before = {name: sys.modules.get(name) for name in stubs}
-    sys.modules.update(stubs)
-    mujoco.mjx = mjx
-    try:
-        space = {}
-        exec(compile(code, "ranges_mujoco_playground.py", "exec"), space)
-        return space["domain_randomize"](_Model(model), [0, 1])
-    finally:
-        del mujoco.mjx
-        for name, module in before.items():
-            sys.modules.pop(name) if module is None else sys.modules.update({name: module})
+    return execute(code, stubs)["domain_randomize"](_Model(model), [0, 1])
 
 
 def test_the_function_for_mujoco_playground_sets_the_fields(arm, everything):
@@ -351,22 +350,11 @@ def events(code):
         "isaaclab.utils",
     )
     stubs = {name: ModuleType(name) for name in names}
-    for name, module in stubs.items():
-        above, _, own = name.rpartition(".")
-        if above:
-            setattr(stubs[above], own, module)
     stubs["isaaclab.envs.mdp"].__getattr__ = lambda name: name
     stubs["isaaclab.managers"].EventTermCfg = lambda **given: given
     stubs["isaaclab.managers"].SceneEntityCfg = lambda name, **given: (name, given)
     stubs["isaaclab.utils"].configclass = lambda decorated: decorated
-    sys.modules.update(stubs)
-    try:
-        space = {}
-        exec(compile(code, "ranges_isaac_lab.py", "exec"), space)
-    finally:
-        for name in names:
-            del sys.modules[name]
-    own = vars(space["SimgapEventCfg"])
+    own = vars(execute(code, stubs)["SimgapEventCfg"])
     return {name: term for name, term in own.items() if isinstance(term, dict)}
 
 
