@@ -11,7 +11,13 @@ import zipfile
 
 import pytest
 
-from tests.packaging.wheel_in_environment import PACKAGES, build, environment, find_wheel_errors
+from tests.packaging.wheel_in_environment import (
+    PACKAGES,
+    build,
+    environment,
+    find_wheel_errors,
+    run_simgap,
+)
 
 EXTRA_TUNERS = {
     *("npe", "turbo", "snpe", "mujoco_sysid"),
@@ -70,11 +76,7 @@ def test_the_wheel_works_outside_the_checkout(wheel, tmp_path):
     (packages / "others.pth").write_text("\n".join(site.getsitepackages()) + "\n")
 
     def simgap(*arguments):
-        code = "import sys, simgap; sys.exit(simgap.main(sys.argv[1:]))"
-        return subprocess.run(
-            [str(python), "-c", code, *arguments],
-            cwd=tmp_path, capture_output=True, text=True, check=True,
-        ).stdout  # fmt: skip
+        return run_simgap(python, tmp_path, *arguments).stdout
 
     assert simgap("--version") == "simgap 0.1.0\n"
     found = json.loads(simgap("list", "--json"))

@@ -6,6 +6,8 @@ import shutil
 import site
 import subprocess
 import sys
+import zipfile
+from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.packaging.explain_requirements import FILE, LOCK, ROOT, WITHOUT, direct, pins
-from tests.packaging.wheel_in_environment import build, environment
+from tests.packaging.wheel_in_environment import build, environment, run_simgap
 
 ABSENT = re.compile(r"(torch|functorch|torchgen|pybullet)", re.I)
 """Pattern of the names that the two packages install."""
@@ -37,16 +39,13 @@ def on(python):
 
 
 @pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
-def test_pins_without_large_packages_agree_with_the_lock(python):
-    explain, lock = on(python)(FILE), on(python)(LOCK)
+def test_pins_agree_with_each_other_and_with_the_project(python):
+    explain, lock = (
+        {canonicalize_name(name): v for name, v in on(python)(path).items()}
+        for path in (FILE, LOCK)
+    )
     assert not set(WITHOUT) & set(explain)
     assert {name: lock.get(name) for name in explain} == explain
-
-
-@pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
-def test_every_pin_is_allowed_by_the_project(python):
-    lock = {canonicalize_name(name): v for name, v in on(python)(LOCK).items()}
-    explain = {canonicalize_name(name): v for name, v in on(python)(FILE).items()}
     for line in direct():
         wanted = Requirement(line)
         if wanted.marker is None or wanted.marker.evaluate({"python_version": python}):
@@ -96,6 +95,9 @@ def test_no_page_or_message_advises_to_install_simgap_from_an_index():
     assert wrong == []
 
 
+needs_make = pytest.mark.skipif(not shutil.which("make"), reason="no make")
+
+
 def run_make(*words, code=0, **kept):
     """Run make and return its output; it needs no environment to print or refuse a target."""
     done = subprocess.run(
@@ -106,7 +108,7 @@ def run_make(*words, code=0, **kept):
     return done.stdout + done.stderr
 
 
-@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+@needs_make
 @pytest.mark.parametrize(
     ("without", "installed", "absent"),
     [
@@ -122,7 +124,7 @@ def test_make_installs_all_packages_except_without(tmp_path, without, installed,
     assert f"-r {absent}" not in shown
 
 
-@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+@needs_make
 def test_make_refuses_to_omit_packages_that_explain_needs(tmp_path):
     folder = tmp_path / "env"
     said = run_make(
@@ -132,7 +134,7 @@ def test_make_refuses_to_omit_packages_that_explain_needs(tmp_path):
     assert not folder.exists()
 
 
-@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+@needs_make
 @pytest.mark.parametrize(
     ("last", "now", "again"),
     [
@@ -164,23 +166,14 @@ def python(tmp_path_factory):
             ours = ours or each.suffix == ".pth"  # path files would add this checkout
             if not ABSENT.match(each.name) and not ours and each.name != "__pycache__":
                 (packages / each.name).symlink_to(each)
-    build(folder)
-    (wheel,) = folder.glob("*.whl")
-    subprocess.run([sys.executable, "-m", "zipfile", "-e", str(wheel), str(packages)], check=True)
+    with zipfile.ZipFile(build(folder)) as wheel:
+        wheel.extractall(packages)
     return found
 
 
 @pytest.mark.slow
 def test_explain_works_and_lists_report_absent_packages(python, tmp_path):
-    def simgap(*arguments, code=0):
-        run = "import sys, simgap; sys.exit(simgap.main(sys.argv[1:]))"
-        done = subprocess.run(
-            [str(python), "-c", run, *map(str, arguments)],
-            cwd=tmp_path, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.returncode == code, done.stderr
-        return done
-
+    simgap = partial(run_simgap, python, tmp_path)
     listed = json.loads(simgap("list", "--json").stdout)
     tuners = {each["name"]: each["skipped"] for each in listed["tuners"]}
     assert tuners["tunenet"] == "needs torch, not installed (pip install torch)"

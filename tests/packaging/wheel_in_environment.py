@@ -51,14 +51,12 @@ def find_wheel_errors(wheel):
     """Return the faults in a wheel's content."""
     with zipfile.ZipFile(wheel) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
-        (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
-        metadata = packed.read(about).decode()
         licences = [name for name in packed.namelist() if "dist-info/licenses/" in name]
     found = [f"missing: {name}" for name in sorted(wanted() - names)]
     spare = {name for name in names - wanted() if not name.startswith("bench/reference/")}
     found += [f"nobody asked for: {name}" for name in sorted(spare)]
     project = read_toml(ROOT / "pyproject.toml")["project"]
-    extras = set(re.findall(r"^Provides-Extra: (\S+)", metadata, re.M))
+    extras = set(read_metadata(wheel, "Provides-Extra"))
     if extras != set(project["optional-dependencies"]):
         found.append(f"extras: {sorted(extras)}")
     if not licences:
@@ -77,11 +75,23 @@ def environment(folder, python=sys.executable):
     return folder / "bin" / "python"
 
 
-def requirements(wheel, without):
-    """Return the requirements in the wheel's metadata without extras and without some packages."""
+def read_metadata(wheel, field):
+    """Return the values of a field of the wheel's metadata."""
     with zipfile.ZipFile(wheel) as packed:
         (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
-        metadata = packed.read(about).decode()
-    lines = re.findall(r"^Requires-Dist: (.*)$", metadata, re.M)
-    named = [line for line in lines if "extra ==" not in line]
+        return re.findall(rf"^{field}: (.*)$", packed.read(about).decode(), re.M)
+
+
+def requirements(wheel, without):
+    """Return the requirements in the wheel's metadata without extras and without some packages."""
+    named = [line for line in read_metadata(wheel, "Requires-Dist") if "extra ==" not in line]
     return [line for line in named if re.split(r"[^\w.-]", line)[0] not in without]
+
+
+def run_simgap(python, folder, *arguments, code=0):
+    """Run a command of the simgap of an environment in a folder; return the finished process."""
+    run = "import sys, simgap; sys.exit(simgap.main(sys.argv[1:]))"
+    command = [str(python), "-c", run, *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    return done
