@@ -16,7 +16,6 @@ from scipy.io import savemat
 
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
 from bench.benchmark.problem.missing_requirements import availability
-from bench.cli.main import main
 from bench.datasets import dataset_catalogue
 from bench.datasets.dataset_catalogue import SourceFile
 from sims.recording.recording import read_recording
@@ -119,9 +118,8 @@ def served(repository):
         server.server_close()
 
 
-def refused(capsys, *words):
+def refused(*words):
     """Return the one-line error of `simgap download`, and check that no file has been written."""
-    capsys.readouterr()
     said = run_command("download", "pendulum_free_swing", *words, code=2)
     assert said.out == ""
     assert len(said.err.splitlines()) == 1, said.err
@@ -130,11 +128,10 @@ def refused(capsys, *words):
     return said.err
 
 
-def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path, capsys):
+def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path):
     address = served()
-    assert main(["download", "pendulum_free_swing", "--from", address]) == 0
+    said = run_command("download", "pendulum_free_swing", "--from", address).out.splitlines()
     folder = tmp_path / "xdg" / "simgap" / "pendulum_free_swing"
-    said = capsys.readouterr().out.splitlines()
     assert said == [f"pendulum_free_swing: {folder}", "needed by: simgap compare pendulum-real"]
     names = {"recording.csv", "recording.toml", "LICENSE", "SOURCE.txt"}
     assert {path.name for path in folder.iterdir()} == names
@@ -166,7 +163,7 @@ def test_runs_from_the_seventh_on_are_held_out():
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat, capsys):
+def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat):
     folder = repository
     if flat:
         folder = tmp_path / "flat"
@@ -174,10 +171,9 @@ def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat, c
         for path in (MAT, "LICENSE"):
             (folder / Path(path).name).write_bytes((repository / path).read_bytes())
     out = tmp_path / "mine"
-    words = ["download", "pendulum_free_swing", "--from", str(folder), "--out", str(out)]
-    assert main(words) == 0
+    said = run_command("download", "pendulum_free_swing", "--from", folder, "--out", out).out
     assert (out / "pendulum_free_swing" / "recording.csv").is_file()
-    assert f"experiments find it with SIMGAP_DATA={out}" in capsys.readouterr().out
+    assert f"experiments find it with SIMGAP_DATA={out}" in said
 
 
 def test_what_is_here_is_not_downloaded_again(repository):
@@ -195,74 +191,68 @@ def test_an_experiment_finds_what_was_downloaded(repository):
     assert availability(load_experiment("pendulum-real")).data_set is None
 
 
-def test_an_address_that_lacks_the_file(served, repository, capsys):
+def test_an_address_that_lacks_the_file(served, repository):
     (repository / MAT).unlink()
-    said = refused(capsys, "--from", served())
+    said = refused("--from", served())
     assert "404" in said
     assert MAT in said
     assert "--from FOLDER" in said
 
 
-def test_a_connection_that_is_cut_off(served, capsys):
-    said = refused(capsys, "--from", served(CutOff))
+def test_a_connection_that_is_cut_off(served):
+    said = refused("--from", served(CutOff))
     assert "expected" in said or "cannot be downloaded" in said
     assert "100" in said
 
 
-def test_a_server_that_does_not_stop_sending(served, capsys):
-    said = refused(capsys, "--from", served(Endless))
+def test_a_server_that_does_not_stop_sending(served):
+    said = refused("--from", served(Endless))
     assert "found more" in said
     assert Endless.sent < 2**24, "no more is read than was published"
 
 
-def test_no_network(capsys, repository, monkeypatch):
+def test_no_network(repository, monkeypatch):
     import urllib.request
 
     def unreachable(*_, **__):
         raise urllib.error.URLError(OSError(-2, "Name or service not known"))
 
     monkeypatch.setattr(urllib.request, "urlopen", unreachable)
-    said = refused(capsys)
+    said = refused()
     assert "cannot be downloaded" in said
     assert "Name or service not known" in said
     assert f"{dataset_catalogue.get('pendulum_free_swing').base_url}/{MAT}" in said
 
 
-def test_nobody_answers(repository, capsys):
-    assert "cannot be downloaded" in refused(capsys, "--from", "http://127.0.0.1:9")
-
-
-def test_a_file_that_was_changed(repository, capsys):
-    content = bytearray((repository / MAT).read_bytes())
-    content[-1] ^= 1
-    (repository / MAT).write_bytes(content)
-    said = refused(capsys, "--from", repository)
-    assert "expected SHA-256" in said
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (MAT, lambda data: data[:-1] + bytes([data[-1] ^ 1]), "expected SHA-256"),
+        (MAT, lambda data: b"", "found 0"),
+        (MAT, lambda data: data[:50], "found 50"),
+        ("LICENSE", lambda data: b"Nobody may use this..\n", "LICENSE: expected SHA-256"),
+    ],
+    ids=["one bit", "empty", "not whole", "licence"],
+)
+def test_a_file_that_was_changed(repository, name, change, message):
+    file = repository / name
+    file.write_bytes(change(file.read_bytes()))
+    said = refused("--from", repository)
+    assert message in said
     assert "nothing is written" in said
-
-
-@pytest.mark.parametrize(("kept", "message"), [(0, "found 0"), (50, "found 50")])
-def test_a_file_that_is_not_whole(repository, capsys, kept, message):
-    content = (repository / MAT).read_bytes()[:kept]
-    (repository / MAT).write_bytes(content)
-    assert message in refused(capsys, "--from", repository)
-
-
-def test_a_licence_that_was_changed(repository, capsys):
-    (repository / "LICENSE").write_bytes(b"Nobody may use this..\n")
-    assert "LICENSE: expected SHA-256" in refused(capsys, "--from", repository)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--from", "nowhere"], "--from nowhere: no such folder"),
+        (["--from", "http://127.0.0.1:9"], "cannot be downloaded"),
         (["--from", "ftp://x"], "expected a folder, or an http or https address"),
         (["--from", "."], f"expected {MAT} of commit e99a7e1"),
     ],
 )
-def test_a_source_that_cannot_be(repository, capsys, words, message):
-    assert message in refused(capsys, *words)
+def test_a_source_that_cannot_be(repository, words, message):
+    assert message in refused(*words)
 
 
 def test_an_unknown_name_names_those_that_there_are():
@@ -271,18 +261,18 @@ def test_an_unknown_name_names_those_that_there_are():
     )
 
 
-def test_a_folder_with_other_things_is_left_alone(repository, tmp_path, capsys):
+def test_a_folder_with_other_things_is_left_alone(repository, tmp_path):
     mine = tmp_path / "out" / "pendulum_free_swing"
     mine.mkdir(parents=True)
     (mine / "notes.txt").write_text("mine")
-    said = refused(capsys, "--from", repository, "--out", tmp_path / "out")
+    said = refused("--from", repository, "--out", tmp_path / "out")
     assert "delete it, or choose another folder with --out" in said
     assert [path.name for path in mine.iterdir()] == ["notes.txt"]
 
 
-def test_a_folder_that_cannot_be_written(repository, tmp_path, capsys):
+def test_a_folder_that_cannot_be_written(repository, tmp_path):
     (tmp_path / "file").write_text("")
-    said = refused(capsys, "--from", repository, "--out", tmp_path / "file")
+    said = refused("--from", repository, "--out", tmp_path / "file")
     assert "choose another folder with --out" in said
 
 

@@ -84,6 +84,14 @@ def listed_again(files, top):
     return {**files, f"{top}/manifest.json": json.dumps(manifest).encode()}
 
 
+def verify_changed(archive, tmp_path, change, code=1, is_forged=False):
+    """Return what the verification prints of an archive whose files a function changed."""
+    files = content(archive)
+    change(files)
+    files = listed_again(files, archive.stem) if is_forged else files
+    return verified(packed(tmp_path / "a.zip", files), code)
+
+
 def test_the_folder_is_in_it_whole_and_the_same_folder_gives_the_same_bytes(
     place, compared, tmp_path
 ):
@@ -152,21 +160,20 @@ def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, tmp_pa
 def test_a_file_that_is_changed_added_or_missing_is_named(
     compared, tmp_path, change, file, message
 ):
-    files = content(compared)
-    change(files)
-    found = verified(packed(tmp_path / "a.zip", files), code=1)
+    found = verify_changed(compared, tmp_path, change)
     (doubt,) = found["archive"]["doubts"]
     assert (doubt["file"], message in doubt["says"]) == (file, True)
     assert found["comparisons"] == []
 
 
 def test_a_forged_manifest_is_detected_by_the_rows(compared, tmp_path):
-    files = content(compared)
-    table = files["run/table.csv"].decode().splitlines()
-    cells = table[1].split(",")
-    cells[5] = str(float(cells[5]) / 2)
-    files["run/table.csv"] = "\n".join([table[0], ",".join(cells), *table[2:], ""]).encode()
-    found = verified(packed(tmp_path / "a.zip", listed_again(files, "run")), code=1)
+    def halve(files):
+        table = files["run/table.csv"].decode().splitlines()
+        cells = table[1].split(",")
+        cells[5] = str(float(cells[5]) / 2)
+        files["run/table.csv"] = "\n".join([table[0], ",".join(cells), *table[2:], ""]).encode()
+
+    found = verify_changed(compared, tmp_path, halve, is_forged=True)
     assert found["archive"]["doubts"] == []
     assert found["comparisons"][0]["doubts"][0]["says"].startswith("median: expected")
 
@@ -188,19 +195,21 @@ def word(verdict):
     [(coefficient, "drag.linear coefficient"), (held_out, "recomputed"), (word, "proven")],
 )
 def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, change, message):
-    files = content(explanation_archive)
-    verdict = json.loads(files["told/verdict.json"])
-    change(verdict)
-    files["told/verdict.json"] = json.dumps(verdict).encode()
-    found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), code=1)
+    def improve(files):
+        verdict = json.loads(files["told/verdict.json"])
+        change(verdict)
+        files["told/verdict.json"] = json.dumps(verdict).encode()
+
+    found = verify_changed(explanation_archive, tmp_path, improve, is_forged=True)
     assert any(message in doubt["says"] for doubt in found["explanation"]["doubts"])
 
 
 def test_another_recording_than_the_explained_one_is_detected(explanation_archive, tmp_path):
-    files = content(explanation_archive)
-    rows = files["told/recordings/swing.csv"].decode()
-    files["told/recordings/swing.csv"] = rows.replace("0.0", "0.1", 1).encode()
-    found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), code=1)
+    def exchange(files):
+        rows = files["told/recordings/swing.csv"]
+        files["told/recordings/swing.csv"] = rows.replace(b"0.0", b"0.1", 1)
+
+    found = verify_changed(explanation_archive, tmp_path, exchange, is_forged=True)
     assert "expected the recording that was explained" in found["explanation"]["doubts"][0]["says"]
 
 
@@ -242,8 +251,8 @@ def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
 def test_a_bomb_is_refused_before_it_is_unpacked(compared, tmp_path, monkeypatch, limit, at):
     monkeypatch.setattr(archives, "_MIN_BYTES_FOR_RATIO_CHECK", 1 << 20)
     monkeypatch.setattr(archives, limit, at)
-    files = {**content(compared), "run/zeros": bytes(10 << 20)}
-    found = verified(packed(tmp_path / "a.zip", files), code=2)
+    zeros = {"run/zeros": bytes(10 << 20)}
+    found = verify_changed(compared, tmp_path, lambda files: files.update(zeros), code=2)
     assert "it would unpack from" in found["error"]["message"]
     monkeypatch.setattr(archives, "_MAX_FILES", 3)
     assert "files, at most 3" in verified(compared, 2)["error"]["message"]
@@ -287,18 +296,17 @@ def test_an_archive_with_more_or_less_around_it_is_refused(compared, tmp_path, c
     ],
 )
 def test_an_invalid_manifest_is_refused(compared, tmp_path, change, message):
-    files = content(compared)
-    change(files)
-    found = verified(packed(tmp_path / "a.zip", files), code=2)
+    found = verify_changed(compared, tmp_path, change, code=2)
     assert message in found["error"]["message"]
 
 
 def test_a_file_listed_twice_is_noticed(compared, tmp_path):
-    files = content(compared)
-    manifest = json.loads(files["run/manifest.json"])
-    manifest["files"].append(manifest["files"][0])
-    files["run/manifest.json"] = json.dumps(manifest).encode()
-    found = verified(packed(tmp_path / "a.zip", files), code=1)
+    def list_again(files):
+        manifest = json.loads(files["run/manifest.json"])
+        manifest["files"].append(manifest["files"][0])
+        files["run/manifest.json"] = json.dumps(manifest).encode()
+
+    found = verify_changed(compared, tmp_path, list_again)
     assert "listed twice" in found["archive"]["doubts"][0]["says"]
 
 
