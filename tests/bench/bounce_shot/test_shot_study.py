@@ -28,7 +28,6 @@ from bench.bounce_shot.tuned_shots import (
     select_transferable_effects,
     tune_and_plan,
 )
-from bench.cli import main
 from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
@@ -48,6 +47,15 @@ observe = ["z"]
 targets = 1
 settings = { engine = "batch" }
 tuners = { least_squares = {} }"""
+
+DROPS = """
+budget = 6
+constants = { gravity = 9.81, radius = 0.03 }
+noise = { z = 0.01 }
+initial = { z = [1.4, 1.8] }
+sampling = { rate = 60.0, samples = 100 }
+shot = { balls = ["golf"] }
+"""
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +221,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
 
 @pytest.mark.slow
 @vision
-def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
+def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path):
     """In a film with a height of 16 pixels, a golf ball covers a fifth of a pixel."""
     text = f"""{SMALL}
 budget = 2
@@ -222,15 +230,13 @@ shot = {{ balls = ["golf"], filmed = 16 }}
 """
     (tmp_path / "small.toml").write_text(text)
     out = tmp_path / "out"
-    assert (
-        main.main(["compare", str(tmp_path / "small.toml"), "--jobs", "1", "--out", str(out)]) == 0
-    )
+    said = run_command("compare", tmp_path / "small.toml", "--jobs", 1, "--out", out).out
     rows = pd.read_csv(out / "status.csv")
     assert set(rows["status"]) == {"no recording"}
     assert rows["reason"].str.contains("no ball found").all()
     assert not pd.read_csv(out / "shots.csv")["hit"].any()
     assert pd.read_csv(out / "shots.csv")["seen"].eq(0).all()
-    assert "no recording: least_squares in 1 shots" in capsys.readouterr().out
+    assert "no recording: least_squares in 1 shots" in said
 
 
 def test_methods_get_the_recording_and_the_scene_and_not_the_ball():
@@ -303,15 +309,7 @@ def test_world_that_cannot_be_had_is_skipped_with_its_reason(experiment, tmp_pat
 @pytest.mark.long
 def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path):
     assert "bounce-shot" in list_experiment_names()
-    text = f"""{SMALL}
-budget = 6
-constants = {{ gravity = 9.81, radius = 0.03 }}
-noise = {{ z = 0.01 }}
-initial = {{ z = [1.4, 1.8] }}
-sampling = {{ rate = 60.0, samples = 100 }}
-shot = {{ balls = ["golf"] }}
-"""
-    (tmp_path / "mine.toml").write_text(text)
+    (tmp_path / "mine.toml").write_text(SMALL + DROPS)
     out = tmp_path / "out"
     run_command("compare", tmp_path / "mine.toml", "--jobs", "1", "--out", out)
     lines = pd.read_csv(out / "table.csv").set_index(["method", "ball"])
@@ -339,16 +337,6 @@ shot = {{ balls = ["golf"] }}
     assert "damaged; delete it" in run_command("compare", "--resume", out, code=2).err
 
 
-DROPS = """
-budget = 6
-constants = { gravity = 9.81, radius = 0.03 }
-noise = { z = 0.01 }
-initial = { z = [1.4, 1.8] }
-sampling = { rate = 60.0, samples = 100 }
-shot = { balls = ["golf"] }
-"""
-
-
 def explained(_):
     return TunedModel("explain", 0.5, {}, 0, 0.0, "done"), {}
 
@@ -366,20 +354,16 @@ def crashing(tmp_path, monkeypatch, fresh_registries):
     return [str(path), "--plugin", str(PLUGINS / "awkward.py"), "--jobs", "0"]
 
 
-def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
-    crashing, tmp_path, capsys
-):
+def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(crashing, tmp_path):
     out = tmp_path / "out"
     said = run_command("compare", *crashing, "--out", out, code=1)
     assert "crashed: crashing in 1 shots; RuntimeError: boom" in said.out
     assert said.err.count("RuntimeError: boom") == 2, "as it is and after explain, when it happens"
-    allowed = ["compare", *crashing, "--allow-failures", "--out", str(tmp_path / "allowed")]
-    assert main.main(allowed) == 0
+    run_command("compare", *crashing, "--allow-failures", "--out", tmp_path / "allowed")
     table = (out / "table.csv").read_bytes()
     (out / "table.csv").unlink()
-    assert main.main(["plot", str(out), "--plugin", crashing[2]]) == 0
+    run_command("plot", out, "--plugin", crashing[2])
     assert (out / "table.csv").read_bytes() == table
-    capsys.readouterr()
     said = run_command("status", out, "--runs").out
     assert "mine: 1 of 1 shots made, complete" in said
     assert "  golf  1 made" in said
@@ -392,9 +376,9 @@ def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
     )
 
 
-def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys):
+def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path):
     out = tmp_path / "out"
-    assert main.main(["compare", *crashing, "--out", str(out)]) == 1
+    run_command("compare", *crashing, "--out", out, code=1)
     path = out / "shots" / "golf-000.json"
     sound = path.read_text()
 
@@ -434,14 +418,13 @@ def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys)
         ),
     ):
         path.write_text(text)
-        capsys.readouterr()
         for arguments in (["status"], ["plot"], ["compare", "--resume"]):
             said = run_command(*arguments, out, code=2).err
             assert str(path) in said
             assert says in said
             assert said.count("\n") == 1
     path.write_text(sound)
-    assert main.main(["status", str(out)]) == 0
+    run_command("status", out)
     for name in ("shots", "table", "status"):
         table = out / f"{name}.csv"
         kept = table.read_text()
@@ -457,7 +440,7 @@ def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys)
 
 
 def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refused(
-    crashing, tmp_path, monkeypatch, capsys
+    crashing, tmp_path, monkeypatch
 ):
     out = tmp_path / "out"
     path = tmp_path / "mine.toml"
@@ -478,20 +461,18 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     monkeypatch.setattr(tuned_shots, "tune_and_plan", shoot)
     first = (out / "shots" / "golf-000.json").read_bytes()
 
-    def resumed(*options):
-        return main.main(["compare", "--resume", str(out), "--jobs", "0", *options])
+    def resumed(*options, code=0):
+        return run_command("compare", "--resume", out, "--jobs", 0, *options, code=code).err
 
-    assert resumed("--budget", "5") == 2
-    assert "leave out budget" in capsys.readouterr().err
+    assert "leave out budget" in resumed("--budget", 5, code=2)
     with monkeypatch.context() as patch:
         patch.setattr(
             "bench.benchmark.runner.run_fingerprint.hash_source_folders", lambda *_: "0123456789"
         )
-        assert resumed() == 2
-    assert "its code changed since it was started" in capsys.readouterr().err
+        assert "its code changed since it was started" in resumed(code=2)
     for registry in REGISTRIES:
         registry.restore({})
-    assert resumed("--allow-failures") == 0, "the plugin is known from the folder"
+    resumed("--allow-failures")  # the plugin is known from the folder
     assert (out / "shots" / "golf-000.json").read_bytes() == first
     assert len(pd.read_csv(out / "status.csv")) == 12
 

@@ -1,9 +1,7 @@
 import csv
-import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -20,10 +18,10 @@ from bench.benchmark.runner.tuner_training import (
     load_trained_tuner,
     train_or_load,
 )
-from bench.cli.main import main
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
+from tests.without_drawing import COMMAND
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 PLUGIN = str(PLUGINS / "spring.py")
@@ -62,32 +60,21 @@ def trained_cache(tmp_path_factory, spring):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SIMGAP_CACHE", str(folder / "cache"))
         patch.chdir(folder)
-        assert train_spring(write_experiment(folder)) == 0
+        train_spring(write_experiment(folder))
     return folder / "cache"
 
 
-def train_spring(experiment, *more):
-    return main(
-        [
-            "train",
-            "small",
-            "spring",
-            "--experiment",
-            str(experiment),
-            "--plugin",
-            PLUGIN,
-            *map(str, more),
-        ]
-    )
+def train_spring(experiment, *more, code=0):
+    words = ["train", "small", "spring", "--experiment", experiment, "--plugin", PLUGIN, *more]
+    return run_command(*words, code=code)
 
 
 @pytest.mark.slow
-def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
-    assert train_spring(experiment, "--out", tmp_path / "out") == 0
+def test_trains_what_compare_then_finds(experiment, tmp_path, cache):
+    said = train_spring(experiment, "--out", tmp_path / "out")
     files = sorted(cache.iterdir())
     assert [file.suffix for file in files] == [".npz", ".npz"]
     stamps = [file.stat().st_mtime_ns for file in files]
-    said = capsys.readouterr()
     assert "trained with 56 simulations in" in said.out
     assert "seed 1, noisy: 100%" in said.err
     rows = list(csv.DictReader((tmp_path / "out" / "loss.csv").read_text().splitlines()))
@@ -97,25 +84,10 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
     ]  # fmt: skip
     assert float(rows[3]["training_loss"]) < float(rows[0]["training_loss"])
     assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == {"loss.png"}
-    assert (
-        main(
-            [
-                "compare",
-                str(experiment),
-                "--plugin",
-                PLUGIN,
-                "--budget",
-                "2",
-                "--out",
-                str(tmp_path / "c"),
-            ]
-        )
-        == 0
-    )
+    run_command("compare", experiment, "--plugin", PLUGIN, "--budget", 2, "--out", tmp_path / "c")
     assert sorted(cache.iterdir()) == files
     assert [file.stat().st_mtime_ns for file in files] == stamps
-    assert train_spring(experiment) == 0
-    assert "trained earlier with 56 simulations" in capsys.readouterr().out
+    assert "trained earlier with 56 simulations" in train_spring(experiment).out
 
 
 def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
@@ -158,10 +130,9 @@ def test_looking_on_changes_nothing(experiment):
         assert watch is None or len(watch.rows) > 2
 
 
-def test_budget_and_seeds(experiment, cache, capsys):
-    assert train_spring(experiment, "--budget", 40, "--seeds", 1) == 0
+def test_budget_and_seeds(experiment, cache):
+    said = train_spring(experiment, "--budget", 40, "--seeds", 1).out
     assert len(list(cache.iterdir())) == 1
-    said = capsys.readouterr().out
     assert "trained with 40 simulations" in said
     assert f"simgap compare {experiment} --training-budget 40" in said
 
@@ -215,14 +186,12 @@ BREAKS = [truncated, emptied, flipped, pickled, foreign, another, reshaped, not_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spoil", BREAKS, ids=lambda spoil: spoil.__name__)
-def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cache, capsys, spoil):
+def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cache, spoil):
     shutil.copytree(trained_cache, cache)
     entry = TunerEntry("small", "tunenet", TUNER["options"])
     path = cache / f"{compute_training_key(load_experiment(str(experiment)), entry, 0)}.npz"
     spoil(path)
-    capsys.readouterr()
-    assert train_spring(experiment) == 2
-    said = capsys.readouterr().err.strip()
+    said = train_spring(experiment, code=2).err.strip()
     assert said.startswith(f"simgap: {path}: ")
     assert len(said.splitlines()) == 1
     assert "expected" in said
@@ -230,15 +199,9 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, trained_cac
     with pytest.raises(WeightsError):
         load_trained_tuner(entry, path)
     if spoil is truncated:
-        assert (
-            run_command(
-                "compare", experiment, "--plugin", PLUGIN, "--out", cache.parent / "c", code=2
-            )
-            .err.strip()
-            .splitlines()[-1]
-            == said
-        )
-        assert train_spring(experiment, "--again") == 0
+        words = ["compare", experiment, "--plugin", PLUGIN, "--out", cache.parent / "c"]
+        assert run_command(*words, code=2).err.strip().splitlines()[-1] == said
+        train_spring(experiment, "--again")
 
 
 @pytest.mark.parametrize(
@@ -288,11 +251,8 @@ def test_the_default_experiment_is_printed_and_finds_the_weights(tmp_path):
     assert (tmp_path / "out" / "loss.csv").is_file()
 
 
-def test_a_value_that_cannot_be_is_one_line(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(["train", "tunenet", "slider", "--budget", "0"])
-    error = capsys.readouterr().err
-    assert error == (
+def test_a_value_that_cannot_be_is_one_line():
+    assert run_command("train", "tunenet", "slider", "--budget", 0, code=2).err == (
         "simgap: argument --budget: expected a whole number of at least 1, found '0'; "
         "see simgap train --help\n"
     )
@@ -306,21 +266,11 @@ def test_an_interrupted_training_leaves_nothing(experiment, tmp_path, cache):
         "tuners": {"small": {**TUNER, "options": {"epochs": 100_000}}},
     }
     experiment.write_text(tomli_w.dumps(document))
-    command = [
-        sys.executable,
-        "-m",
-        "bench.cli.main",
-        "train",
-        "small",
-        "spring",
-        "--experiment",
-        str(experiment),
-    ]
+    command = [*COMMAND, "train", "small", "spring", "--experiment", str(experiment)]
     process = subprocess.Popen(
         [*command, "--plugin", PLUGIN],
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ},
         start_new_session=True,
     )
     assert process.stderr.read(1)  # the progress bar has started, so the training is running
