@@ -44,6 +44,14 @@ CASES = {
 }
 
 
+def refusal(case, there, folder):
+    """Return the error message of a case that is refused."""
+    with environment(folder), shortened():
+        heard = tried(case, folder, there)
+    assert heard.code == 2
+    return heard.err
+
+
 def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
     _, there = ready
     film = (there["film"] / "drop.mp4").read_bytes()
@@ -51,10 +59,7 @@ def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
     assert name in film
     files = {"run/drop.mp4": film.replace(name, version)}
     case = Case(("track", "run/drop.mp4", "--out", "track.csv"), files, "film")
-    with environment(tmp_path), shortened():
-        heard = tried(case, tmp_path, there)
-    assert heard.code == 2
-    assert heard.err.startswith("simgap: run/drop.mp4: ")
+    assert refusal(case, there, tmp_path).startswith("simgap: run/drop.mp4: ")
 
 
 @pytest.mark.parametrize(
@@ -72,17 +77,11 @@ def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path, name, flipped, word
     files = {"run/runs.parquet": rows.replace(name, flipped, 1 if b"-" in name else -1)}
     assert files["run/runs.parquet"] != rows
     case = Case(("status", "run"), files, "done")
-    with environment(tmp_path), shortened():
-        heard = tried(case, tmp_path, there)
-    assert heard.code == 2
-    assert words in heard.err
+    assert words in refusal(case, there, tmp_path)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_kept(ready, tmp_path, name):
     _, there = ready
     case, words = CASES[name]
-    with environment(tmp_path), shortened():
-        heard = tried(case, tmp_path, there)
-    assert heard.code == 2
-    assert words in heard.err
+    assert words in refusal(case, there, tmp_path)

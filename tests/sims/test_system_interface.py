@@ -43,23 +43,6 @@ def test_a_usual_recording_names_what_the_system_has(name):
     assert not missing(SYSTEMS[name])
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        DefaultRecording(observe=("q",)),
-        DefaultRecording(initial={"q": (0.0, 1.0)}),
-        DefaultRecording(initial={"x": (1.0, 0.0)}),
-        DefaultRecording(inputs={"torque": "1"}),
-        DefaultRecording(inputs={"u": "triangle:1:1"}),
-    ],
-)
-def test_one_that_names_something_else_is_noticed(wrong):
-    class Wrong(SliderSystem):
-        usual_recording = wrong
-
-    assert len(missing(Wrong)) == 1
-
-
 def test_nobody_writes_into_a_usual_recording():
     usual = SYSTEMS["ball"].usual_recording
     with pytest.raises(TypeError):

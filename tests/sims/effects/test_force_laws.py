@@ -7,54 +7,13 @@ from sims import effects
 from tests.sims.effects.effect_systems import batch_coefficients, moment
 
 ROLL = {"x": [[0.5]], "v": [[-2.0]], "theta": [2.0]}
-STATES = {"ball": {"x": [[1.0, 2.0, 3.0]], "v": [[3.0, 0.0, -4.0]]}, "slider": ROLL}
-
-
-def force(name, now, *c):
-    effect = effects.get_effect(name)
-    return effect().force(
-        batch_coefficients(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now
-    )[0]
 
 
 def limit(name, now, *c):
     return effects.get_effect(name)().limit(batch_coefficients(*c, count=len(now.x)), now)[0, 0]
 
 
-@pytest.mark.parametrize(
-    ("system", "name", "c", "expected"),
-    [
-        ("ball", "drag.linear", [0.1], [-0.3, 0, 0.4]),
-        ("ball", "wind", [0.1, 3.0], [0, 0, 1.6]),  # no motion relative to the air along x
-        ("ball", "force.periodic", [0.7, 0.2, 2.5], [0, 0, 0.7]),  # a quarter of a cycle
-        ("slider", "drag.quadratic", [0.1], [0.4]),
-    ],
-)
-def test_forces_that_no_closed_form_of_a_run_covers(system, name, c, expected):
-    state = moment(system, t=0.1, **STATES[system])
-    assert force(name, state, *c) == pytest.approx(expected, abs=1e-12)
-
-
-def test_gravity_on_a_pendulum():
-    hanging = moment("pendulum", [[0.3]], [[0.0]], mass=2.0, length=0.5, gravity=10.0)
-    assert force("gravity.scale", hanging, 0.1) == pytest.approx([-np.sin(0.3)])
-    assert force("gravity.tilt", hanging, 0.1) == pytest.approx([np.cos(0.3)])
-
-
-def test_lift_does_no_work():
-    now = moment("ball", [[0.0, 0.0, 0.0]], [[1.0, 2.0, 3.0]])
-    assert force("lift.magnus", now, 0.3, -0.8) == pytest.approx(
-        np.cross([0.0, -0.3, -0.8], now.v[0])
-    )
-    assert force("lift.magnus", now, 0.3, -0.8) @ now.v[0] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_stribeck_lies_between_its_levels():
-    def at(speed):
-        return limit("friction.stribeck", moment("slider", [[0.0]], [[speed]]), 1.0, 0.5, 0.1)
-
-    assert (at(0.0), at(10.0)) == (1.5, 1.0)
-    assert at(0.1) == at(-0.1) == pytest.approx(1 + 0.5 * np.exp(-1))
+def test_stribeck_friction_without_a_width_acts_at_standstill_alone():
     still, moving = (moment("slider", [[0.0]], [[v]]) for v in (0.0, 1e6))
     assert limit("friction.stribeck", still, 1.0, 0.5, 0.0) == 1.5
     assert limit("friction.stribeck", moving, 1.0, 0.5, 0.0) == 1.0
@@ -69,21 +28,6 @@ def test_dry_friction_never_drives():
         ("friction.load", [-0.1]),
     ):
         assert limit(name, now, *c) == 0.0
-
-
-def test_load_counts_both_sides_of_the_transmission():
-    assert limit("friction.load", moment("slider", **ROLL, inputs=[-3.0]), 0.1) == pytest.approx(
-        0.3
-    )
-    # At rest the drive carries the weight, so both sides of the gear are loaded.
-    held = moment(
-        "pendulum", [[0.5]], [[0.0]], inputs=[np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0
-    )
-    assert limit("friction.load", held, 0.1) == pytest.approx(0.2 * np.sin(0.5))
-    driven = moment(
-        "pendulum", [[0.5]], [[0.0]], inputs=[-np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0
-    )
-    assert limit("friction.load", driven, 0.1) == 0.0
 
 
 def test_restitution_is_a_power_of_speed_that_makes_no_energy():
