@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
+from bench.pages.template import render_text
 from bench.suite.suite_runs import (
     CURVES_FILE,
     SuiteRuns,
@@ -128,7 +129,7 @@ def build_guide(tables: SuiteTables) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=GUIDE_COLUMNS)
 
 
-def describe_tests(tables: SuiteTables) -> Iterator[str]:
+def describe_tests(tables: SuiteTables) -> list[str]:
     """Describe from which methods the best one differs significantly.
 
     Args:
@@ -137,33 +138,18 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
     Returns:
         One sentence per number of simulations (checkpoint).
     """
-    for simulations in tables.checkpoints:
-        pair_rows = tables.pairs
-        pair_rows = pair_rows[
-            (pair_rows["training"] == FREE) & (pair_rows["simulations"] == simulations)
-        ]
-        if pair_rows.empty:
-            continue
-        best = str(pair_rows["best"].iloc[0])
-        significant = pair_rows[
-            # The best tuner must also win on more than half of the problems.
-            (pair_rows["p_holm"] < _SIGNIFICANCE) & (pair_rows["best_better"] > 0.5)
-        ]
-        undecided_tuners = [
-            str(name) for name in pair_rows["tuner"] if name not in set(significant["tuner"])
-        ]
-        if significant.empty:
-            yield (
-                f"After {simulations}: none of the {len(pair_rows)} differences from {best} is "
-                "significant."
-            )
-            continue
-        count = f"{len(significant)} of {len(pair_rows)}"
-        text = f"After {simulations}: {best} is significantly better than {count} others"
-        yield text + (f"; not decided: {', '.join(undecided_tuners)}." if undecided_tuners else ".")
+    tests = []
+    rows = tables.pairs[tables.pairs["training"] == FREE]
+    for simulations, part in rows.groupby("simulations"):
+        # The best tuner must also win on more than half of the problems.
+        is_significant = (part["p_holm"] < _SIGNIFICANCE) & (part["best_better"] > 0.5)
+        undecided = list(part["tuner"][~is_significant])
+        best = part["best"].iloc[0]
+        tests.append((simulations, best, len(part), int(is_significant.sum()), undecided))
+    return _render_lines("tests.txt", tests=tests)
 
 
-def describe_losses(tables: SuiteTables) -> Iterator[str]:
+def describe_losses(tables: SuiteTables) -> list[str]:
     """Describe where the methods of this project lose, and to which method.
 
     A loss is a cell (problem and range) in which another method has a median error that is smaller
@@ -172,30 +158,20 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
     Args:
         tables: Statistics of the suite.
     """
-    for tuner in REFERENCE_TUNERS:
-        if tuner not in tables.suite.tuners:
-            continue
-        for k in (k for k in LOSS_CHECKPOINTS if k <= tables.suite.budget):
-            losses = tables.find_losses(tuner, k, LOSS_FACTOR)
-            count = len(tables.curves)
-            if losses.empty:
-                yield (
-                    f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in none of {count} cells "
-                    f"after {k} simulations."
-                )
-                continue
-            examples = ", ".join(
-                f"{row.cell} ({row.winner}, {_format_ratio(float(row.ratio))})"  # type: ignore[arg-type]
-                for row in losses.itertuples()
-            )
-            yield (
-                f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in {len(losses)} of {count} "
-                f"cells after {k} simulations: {examples}."
-            )
+    cases = [
+        (tuner, k, tables.find_losses(tuner, k, LOSS_FACTOR).to_dict("records"))
+        for tuner in REFERENCE_TUNERS
+        if tuner in tables.suite.tuners
+        for k in LOSS_CHECKPOINTS
+        if k <= tables.suite.budget
+    ]
+    values = {"factor": LOSS_FACTOR, "max_ratio": MAX_PRINTED_RATIO, "count": len(tables.curves)}
+    return _render_lines("losses.txt", cases=cases, **values)
 
 
-def _format_ratio(ratio: float) -> str:
-    return f"{float(f'{ratio:.2g}'):g}×" if ratio < MAX_PRINTED_RATIO else "more than 10000×"
+def _render_lines(name: str, **values: Any) -> list[str]:
+    """Render a text template of this folder as lines, without empty ones."""
+    return [line for line in render_text(Path(__file__).with_name(name), **values) if line]
 
 
 _TEMPLATE = Path(__file__).with_name("suite_page.html")
@@ -243,8 +219,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         "ranks_common_targets": tables.ranks_over_common_targets,
     }
     shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
-    for name, frame in shown_frames.items():
-        page.add_table(name, frame)
+    page.add_tables(shown_frames)
     order = _order_tuners(tables)
     styles = {name: get_mark_style(place) for place, name in enumerate(order)}
     targets = suite.runs.groupby("cell")["target"].nunique()
@@ -261,10 +236,10 @@ def render_suite_page(tables: SuiteTables) -> str:
         targets=_join_range(targets),
         seeds=f"{_join_range(seed_counts)} seed{'' if seeds == 1 else 's'}",
         headline=build_headline(tables) if ranked else "No method has results in all cells.",
-        tests=list(describe_tests(tables)),
+        tests=describe_tests(tables),
         guide_checkpoints=[k for k in _GUIDE_CHECKPOINTS if k in tables.checkpoints],
         guide=_build_guide_rows(tables) if ranked else [],
-        losses=list(describe_losses(tables)),
+        losses=describe_losses(tables),
         loss_factor=f"{LOSS_FACTOR:g}",
         cells=_build_cells(tables, page, styles),
         rank_blocks=[
@@ -498,30 +473,21 @@ def _print_results(tables: SuiteTables, new_runs: SuiteRuns, print_line: PrintLi
         new_runs: errors of the runs that were added to the suite.
         print_line: prints one line of text.
     """
-    targets = new_runs.runs.groupby("cell")["target"].nunique()
-    stored_tuners = [name for name in tables.suite.tuners if name not in new_runs.tuners]
-    count = (
-        f"{targets.min()} to {targets.max()}" if targets.min() != targets.max() else targets.max()
-    )
-    print_line(f"\n{new_runs.version}: {len(tables.curves)} cells, {count} targets in each")
-    if stored_tuners:
-        print_line(
-            f"stored results of {len(stored_tuners)} other methods on the same targets are included"
-        )
-    for row in tables.suite.skipped.itertuples():
-        print_line(f"skipped: {row.tuner}: {row.reason}")
-    missing = [name for name in tables.suite.tuners if name not in tables.complete_tuners]
-    if missing:
-        print_line(f"not ranked, because results are missing in some cells: {', '.join(missing)}")
-    if not tables.complete_tuners:
-        print_line("no method has results in all cells; there are no mean ranks")
-        return
-    print_line(f"\n{build_headline(tables)}")
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     table = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
-    table = table.sort_values(by=table.columns[-1]).head(_MAX_PRINTED_TUNERS).round(1)
-    print_line("\nmean rank after N simulations (1 is best)")
-    print_line(table.rename_axis(index=None, columns=None).to_string())
-    print_line("")
-    for line in describe_losses(tables):
+    if len(table):
+        table = table.sort_values(by=table.columns[-1]).head(_MAX_PRINTED_TUNERS).round(1)
+    lines = render_text(
+        _TEMPLATE.with_name("suite.txt"),
+        version=new_runs.version,
+        tables=tables,
+        targets=_join_range(new_runs.runs.groupby("cell")["target"].nunique()),
+        stored_tuners=[name for name in tables.suite.tuners if name not in new_runs.tuners],
+        skipped=tables.suite.skipped.to_dict("records"),
+        missing=[name for name in tables.suite.tuners if name not in tables.complete_tuners],
+        headline=build_headline,
+        ranks=table,
+        losses=describe_losses(tables),
+    )
+    for line in lines:
         print_line(line)
