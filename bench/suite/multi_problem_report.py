@@ -18,7 +18,7 @@ import pandas as pd
 from bench.benchmark.comparison_charts import make_simulations_axis
 from bench.benchmark.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
-from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.expected_running_time import (
@@ -37,13 +37,11 @@ from bench.figures.figure_output import FigureFiles, render_all_formats, write_f
 from bench.figures.style import (
     PANEL_TITLES,
     MarkStyle,
-    TunerStyles,
     add_trust_note,
-    finish_figure,
     get_mark_style,
 )
 from bench.pages.chart import Axis, Panel, Series
-from bench.pages.chart_figure import draw_chart
+from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
@@ -258,19 +256,17 @@ class ComparisonCollection:
         """Draw the runtime distribution over all problems.
 
         It is the share of solved targets against the number of simulations. The tuners are ordered
-        by mean rank. An `Experiment` of all tuners is made for their styles only.
+        by mean rank.
         """
-        experiment = Experiment(
-            "all",
-            f"{len(self.mean_ranks)} problems",
-            tuners=tuple(TunerEntry(t, t) for t in self.tuners),
-        )
-        style = TunerStyles(experiment, list(self.styles))
         panel, table = self.make_runtime_panel()
         figure, axes = draw_chart([panel], {panel.table: table})
-        caption = "Mean over problems, each with equal weight."
-        finish_figure(figure, axes, style, experiment, caption)
-        return figure
+        return finish_chart(
+            figure,
+            axes[0],
+            f"{len(self.mean_ranks)} problems",
+            "Mean over problems, each with equal weight. The tuner with the best mean rank is first.",
+            "outside right upper",
+        )
 
     @property
     def styles(self) -> dict[str, MarkStyle]:

@@ -80,23 +80,20 @@ class SheetRow:
 
         Keys without a value are left out.
         """
-        row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
-        row["part"] = self.part
-        if self.number is not None:
-            row |= self.number.to_table()
-        if self.prediction_half_width is not None:
-            row["another"] = self.prediction_half_width
-        if self.stated is not None:
-            row["stated"] = self.stated
-        if self.detection_limit is not None:
-            row |= self.detection_limit.to_document()
-        if self.p_value is not None:
-            row["p_value"] = self.p_value
-        if self.share is not None:
-            row["heldout_gain"] = self.share
-        if self.alternatives:
-            row["alternatives"] = list(self.alternatives)
-        return row
+        row = {
+            "state": self.state,
+            "says": self.says,
+            "unit": self.unit,
+            "part": self.part,
+            **(self.number.to_table() if self.number else {}),
+            "another": self.prediction_half_width,
+            "stated": self.stated,
+            **(self.detection_limit.to_document() if self.detection_limit else {}),
+            "p_value": self.p_value,
+            "heldout_gain": self.share,
+            "alternatives": list(self.alternatives) or None,
+        }
+        return {key: value for key, value in row.items() if value is not None}
 
 
 def build_sheet_rows(

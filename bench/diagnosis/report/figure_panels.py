@@ -232,13 +232,8 @@ def _compute_log_ticks(low: float, high: float) -> list[float]:
         steps = (1, 2, 5)
     elif high / low < 1000:
         steps = (1, 3)
-    ticks = []
-    for exponent in range(-6, 10):
-        for step in steps:
-            tick = step * 10.0**exponent
-            if low <= tick <= high:
-                ticks.append(tick)
-    return ticks
+    ticks = np.outer(10.0 ** np.arange(-6, 10), steps).ravel()
+    return [float(tick) for tick in ticks if low <= tick <= high]
 
 
 def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[ResidualProfile]:
