@@ -6,14 +6,10 @@ incomplete, and the kind of dependence shows which law is missing.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 
 from bench.diagnosis.report.effect_and_unit_text import (
-    append_unit,
-    format_estimate,
-    format_number,
-    format_p_value,
     format_sentence,
     joined,
     sanitise,
@@ -26,7 +22,9 @@ from bench.diagnosis.validation.run_consistency import (
     ParameterConsistency,
 )
 from bench.pages.page_table import IntervalDrawing, draw_intervals
+from bench.pages.template import render_text
 
+_TEMPLATE = Path(__file__).with_name("consistency.txt")
 LAW_PREFIXES: Mapping[str, tuple[str, ...]] = {
     "viscous": ("drag.linear", "friction.direction"),
     "dry": ("friction.",),
@@ -136,46 +134,38 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
     before = {(spread.number, spread.by): spread for spread in report.consistency.before}
     after = report.consistency.after
     effects = [cause.effect for cause in report.verdict.causes]
-    causes = joined([sanitise(effect, 60) for effect in effects])
-    sentences = []
-    reconciled_spreads = [
-        spread
-        for spread in after
-        if spread.is_consistent
-        and (spread_before := before.get((spread.number, spread.by))) is not None
-        and not spread_before.is_consistent
-    ]
-    if reconciled_spreads and causes:
-        names = list(dict.fromkeys(_get_number_name(spread) for spread in reconciled_spreads))
-        sentences.append(
-            f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
-            f"{_pluralise_group(reconciled_spreads[0].by)} by more than the intervals"
-        )
     competitors = [s for s in report.consistency.alternative_effect if not s.is_consistent]
-    for competitor in _select_clearest(competitors)[:1]:
-        trend = ""
-        if _has_trend(competitor):
-            trend = (
-                f", and it {_get_trend_direction(competitor)} with {sanitise(competitor.by, 40)}"
-            )
-        sentences.append(
-            f"with {_get_number_name(competitor)} instead of {causes}, its value would differ "
-            f"between {_pluralise_group(competitor.by)}, {_format_span(competitor)} "
-            f"({format_p_value(competitor.p_value)}){trend}; "
-            f"this difference speaks for {causes}"
-        )
-    inconsistent_spreads = _select_clearest(
-        [spread for spread in after if not spread.is_consistent]
+    logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
+    lines = render_text(
+        _TEMPLATE,
+        reconciled=[
+            spread
+            for spread in after
+            if spread.is_consistent
+            and (spread_before := before.get((spread.number, spread.by))) is not None
+            and not spread_before.is_consistent
+        ],
+        competitor=next(iter(_select_clearest(competitors)), None),
+        inconsistent=_select_clearest([spread for spread in after if not spread.is_consistent]),
+        after=after,
+        logs=logs,
+        # The level is corrected for the number of parameters.
+        drifting=[
+            spread
+            for spread in logs
+            if spread.trend is not None
+            and spread.trend.p_value < SIGNIFICANCE_LEVEL / len(logs)
+            and not spread.is_consistent
+        ],
+        effects=effects,
+        causes=joined([sanitise(effect, 60) for effect in effects]),
+        groups=pluralise_group,
+        has_trend=_has_trend,
+        missing_physics=name_missing_physics,
+        max_named=MAX_NAMED_PARAMETERS,
+        z95=Z95,
     )
-    named_spreads = inconsistent_spreads[:MAX_NAMED_PARAMETERS]
-    sentences += [_format_inconsistency(spread, effects) for spread in named_spreads]
-    if len(inconsistent_spreads) > len(named_spreads):
-        count = len(inconsistent_spreads) - len(named_spreads)
-        sentences.append(f"{count} more numbers differ between their groups")
-    if after and not inconsistent_spreads:
-        groups = _pluralise_group(after[0].by)
-        sentences.append(f"all {groups} agree on every number within its interval")
-    return [format_sentence(text) for text in (*sentences, *_format_drifts(after))]
+    return [format_sentence(line) for line in lines if line]
 
 
 def _select_clearest(spreads: Sequence[ParameterConsistency]) -> list[ParameterConsistency]:
@@ -198,144 +188,31 @@ def _has_trend(spread: ParameterConsistency) -> bool:
     return spread.by != "log" and trend is not None and trend.p_value < SIGNIFICANCE_LEVEL
 
 
-def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) -> str:
-    """Say that a parameter differs between runs, how uncertain it is for a new run, and why.
-
-    If the parameter has a trend with a covariate, such as a load, the sentence names the kind of
-    effect that could explain it.
-
-    Args:
-        spread: estimates of the parameter from each group of runs.
-        effects: names of the effects of the model.
-    """
-    text = (
-        f"{_get_number_name(spread)} differs between {_pluralise_group(spread.by)}, "
-        f"{_format_span(spread)} "
-        f"({format_p_value(spread.p_value)}): for a new run its 95 % interval is "
-        f"±{format_number(Z95 * spread.prediction_sigma)}, not "
-        f"±{format_number(Z95 * spread.error)}"
-    )
-    covariate = spread.trend_covariate
-    if covariate is None:
-        return f"{text}; an effect that changes it is missing"
-    increases = covariate.trend.slope > 0
-    names = (covariate.name, *covariate.indistinguishable_covariates[:2])
-    text += f"; it {'increases' if increases else 'decreases'} with "
-    text += " or ".join(sanitise(name, 40) for name in names)
-    missing = name_missing_physics(
-        spread.number, covariate.kind, sanitise(covariate.name, 40), increases, effects
-    )
-    return f"{text}: {missing} is missing"
-
-
-def _format_span(spread: ParameterConsistency) -> str:
-    values = [part.value for part in spread.group_estimates]
-    return append_unit(f"{format_number(min(values))} to {format_number(max(values))}", spread.unit)
-
-
-def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
-    """Yield sentences on the parameters that increase or decrease from log to log.
-
-    A drift counts if its p-value, corrected for the number of parameters, is significant, and the
-    logs do not agree on the parameter.
-    """
-    logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
-    if not logs:
-        return
-    level = SIGNIFICANCE_LEVEL / len(logs)
-    drifting = [
-        (spread, spread.trend)
-        for spread in logs
-        if spread.trend is not None and spread.trend.p_value < level and not spread.is_consistent
-    ]
-    for spread, trend in drifting[:MAX_NAMED_PARAMETERS]:
-        size = f"{format_number(abs(trend.slope))} ± {format_number(Z95 * trend.error)}"
-        change = append_unit(size, spread.unit)
-        direction = _get_trend_direction(spread)
-        yield f"{_get_number_name(spread)} {direction} from log to log by {change}"
-    if not drifting:
-        count = len(logs[0].group_estimates)
-        yield f"no number changes steadily over the {count} logs, in the order given"
-
-
-def _get_trend_direction(spread: ParameterConsistency) -> str:
-    return "increases" if spread.trend is not None and spread.trend.slope > 0 else "decreases"
-
-
-def _get_number_name(spread: ParameterConsistency) -> str:
-    return sanitise(spread.number, 60)
-
-
-def _pluralise_group(grouping: str) -> str:
+def pluralise_group(grouping: str) -> str:
+    """Return the name of the groups: runs, logs, or values of a constant."""
     return f"{grouping}s" if grouping in ("run", "log") else f"values of {sanitise(grouping, 40)}"
 
 
-class AgreementRow(NamedTuple):
-    """Row of the table of the report: one number, and how well its groups agree.
+def build_agreement_rows(
+    report: DiagnosisReportData,
+) -> list[tuple[ParameterConsistency, IntervalDrawing | None]]:
+    """Build the rows of the table of the page, the least consistent number first.
 
-    Attributes:
-        name: Name of the number.
-        is_consistent: Whether the groups agree within their intervals.
-        fitted: Value of the joint fit with its 95 % interval.
-        predicted: Value in a run or log that is not yet recorded, with its 95 % interval.
-        groups: Number and kind of the groups.
-        p_value: P-value of equal values in all groups.
-        drawing: Intervals of the groups, over the interval of the joint fit.
-    """
-
-    name: str
-    is_consistent: bool
-    fitted: str
-    predicted: str
-    groups: str
-    p_value: float
-    drawing: IntervalDrawing | None
-
-
-def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
-    """Build the rows of the table, the least consistent number first.
-
-    Each row has a parameter, its joint estimate, the interval expected for a further group, and the
-    estimates of all groups drawn on one line.
+    Each row has a parameter, and the estimates of all groups drawn on one line over the interval of
+    the joint fit.
 
     Args:
         report: Data of the report, with the consistency of the extended model.
     """
     rows = []
     for spread in sorted(report.consistency.after, key=lambda spread: spread.p_value):
-        # Value and half of the 95 % interval of each group.
-        estimates = [(part.value, Z95 * part.error) for part in spread.group_estimates]
-        rows.append(
-            AgreementRow(
-                name=spread.number,
-                is_consistent=spread.is_consistent,
-                fitted=_format_interval(spread, spread.error),
-                predicted=_format_interval(spread, spread.prediction_sigma),
-                groups=f"{len(estimates)} {_pluralise_group(spread.by)}",
-                p_value=spread.p_value,
-                drawing=draw_intervals(
-                    [
-                        ("after", value, value - half_width, value + half_width)
-                        for value, half_width in estimates
-                    ],
-                    (spread.value - Z95 * spread.error, spread.value + Z95 * spread.error),
-                    distance=8,
-                ),
-            )
-        )
+        intervals = [
+            ("after", part.value, part.value - Z95 * part.error, part.value + Z95 * part.error)
+            for part in spread.group_estimates
+        ]
+        joint = (spread.value - Z95 * spread.error, spread.value + Z95 * spread.error)
+        rows.append((spread, draw_intervals(intervals, joint, distance=8)))
     return rows
-
-
-def _format_interval(spread: ParameterConsistency, error: float) -> str:
-    """Format the joint estimate of a parameter with a 95 % interval.
-
-    Args:
-        spread: estimate of the parameter, with its unit.
-        error: standard error, in the same unit.
-    """
-    half_width = Z95 * error
-    text = format_estimate(spread.value, spread.value - half_width, spread.value + half_width)
-    return append_unit(text, spread.unit)
 
 
 def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ...]]:

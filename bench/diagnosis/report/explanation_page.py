@@ -23,6 +23,7 @@ from bench.diagnosis.report.consistency_section import (
     MAX_TABLE_ROWS,
     build_agreement_rows,
     format_consistency,
+    pluralise_group,
 )
 from bench.diagnosis.report.effect_and_unit_text import (
     ALL_PLACES,
@@ -51,6 +52,7 @@ from bench.diagnosis.report.report_data import (
     DiagnosisReportData,
     ResidualProfile,
 )
+from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import shorten_name
 from bench.pages.chart import Axis, Panel, Series
@@ -306,6 +308,8 @@ def render_report(
         BEST=BEST,
         MAX_OPEN_CHANGES=MAX_OPEN_CHANGES,
         MAX_TABLE_ROWS=MAX_TABLE_ROWS,
+        Z95=Z95,
+        pluralise_group=pluralise_group,
         causes=cause_text,
         summary=summary_text,
         wording=effect_and_unit_text,
