@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -28,8 +28,16 @@ from bench.benchmark.statistics.training_amortisation import (
     map_break_even_counts,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
-from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles, compute_category_offset
-from bench.pages.chart import Axis, AxisSpan, Panel, ReferenceLine, Series, SeriesKind
+from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles
+from bench.pages.chart import (
+    Axis,
+    AxisSpan,
+    Panel,
+    ReferenceLine,
+    Series,
+    SeriesKind,
+    make_method_series,
+)
 from bench.pages.text_format import format_number
 
 
@@ -97,14 +105,11 @@ class ComparisonView:
         statistics = self.statistics
         return TunerStyles(self.experiment, statistics.order, notes=statistics.notes)
 
-    def get_tuner_styles(self, tuners: Iterable[str]) -> list[tuple[str, MarkStyle]]:
-        """Return the tuners of a column, best first, each with its style."""
+    def get_tuner_styles(self, tuners: Iterable[str]) -> dict[str, MarkStyle]:
+        """Return the styles of the tuners of a column, best first."""
         present_tuners = set(tuners)
-        return [
-            (name, self.style.get_mark_style(name))
-            for name in self.style.order
-            if name in present_tuners
-        ]
+        names = [name for name in self.style.order if name in present_tuners]
+        return {name: self.style.get_mark_style(name) for name in names}
 
     @property
     def levels(self) -> list[float]:
@@ -400,7 +405,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
         tables.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
             winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
-            mark_styles = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
+            mark_styles = view.get_tuner_styles(tuner for _, _, tuner in winners)
             spans = tuple(
                 AxisSpan(low, high, tuner, mark_styles[tuner], foot=True)
                 for low, high, tuner in winners
@@ -447,18 +452,15 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
             tables.append(
                 break_even_rows.assign(row=break_even_rows["search"].map(searching.index))
             )
-            series = tuple(
-                Series(
-                    name,
-                    "targets",
-                    view.style.get_mark_style(name),
-                    {"learned": name, "range": kind, "threshold": str(level)},
-                    "low",
-                    "high",
-                    "points",
-                    compute_category_offset(tuner_index, len(trained)),
-                )
-                for tuner_index, name in enumerate(trained)
+            series = make_method_series(
+                {name: view.style.get_mark_style(name) for name in trained},
+                "learned",
+                "targets",
+                is_shifted=True,
+                where={"range": kind, "threshold": str(level)},
+                low="low",
+                high="high",
+                draw="points",
             )
             panel = _make_panel(view, kind, "even", "row", series, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, rules=rules), view, level))
@@ -574,13 +576,9 @@ def _make_tuner_series(
         high: column of the upper end.
         where: values of further columns, by which the rows are selected.
     """
-    styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
-    # Points of several tuners in one category lie side by side.
-    shifts = {name: view.style.get_category_offset(name) * (draw == "points") for name, _ in styles}
-    return tuple(
-        Series(name, y, mark_style, {"tuner": name, **where}, low, high, draw, shifts[name])
-        for name, mark_style in styles
-    )
+    styles = view.get_tuner_styles(table["tuner"])
+    options: dict[str, Any] = {"low": low, "high": high, "draw": draw, "where": where}
+    return make_method_series(styles, "tuner", y, is_shifted=draw == "points", **options)
 
 
 def _select_panels_with_data(panels: Sequence[Panel]) -> list[Panel]:

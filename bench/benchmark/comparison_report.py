@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -28,7 +28,7 @@ from bench.benchmark.storage.result_folder import (
 )
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
 
@@ -80,7 +80,8 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     pictures = _render_figures(view)
-    figures = _write_figures(folder, pictures)
+    files = {comparison_figures.FIGURE_FILES[name]: pictures[name] for name in pictures}
+    figures = [path for path in write_figures(folder, files) if path.suffix == ".png"]
     results = ComparisonReportData(
         view,
         tables,
@@ -117,21 +118,6 @@ def _render_figures(view: ComparisonView) -> dict[str, FigureFiles]:
         )
         for name in comparison_figures.list_figure_names(view.stored)
     }
-
-
-def _write_figures(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
-    """Write the figures to the folder ``figures``; return the paths of the PNG files.
-
-    Args:
-        folder: result folder.
-        pictures: rendered figures by name.
-    """
-    return [
-        write_figure_files(
-            folder / "figures" / comparison_figures.FIGURE_FILES[name], picture.png, picture.pdf
-        )[0]
-        for name, picture in pictures.items()
-    ]
 
 
 def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:

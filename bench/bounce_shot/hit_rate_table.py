@@ -8,8 +8,8 @@ import pandas as pd
 
 from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.benchmark.storage.run_status import FAILED_STATUSES
-from bench.figures.style import compute_category_offset, get_mark_style
-from bench.pages.chart import Axis, Panel, Series
+from bench.figures.style import get_mark_style
+from bench.pages.chart import Axis, Panel, make_method_series
 
 ALL_BALLS = "all"
 """Value of the column ball for all kinds of balls together."""
@@ -90,20 +90,10 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
     """
     balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
     places = {ball: place for place, ball in enumerate(balls)}
-    methods = list(dict.fromkeys(lines["method"]))
-    # The last number of each series shifts its points sideways, so that they do not overlap.
-    series = tuple(
-        Series(
-            method,
-            "rate",
-            get_mark_style(i),
-            {"method": method},
-            "low",
-            "high",
-            "points",
-            compute_category_offset(i, len(methods)),
-        )
-        for i, method in enumerate(methods)
+    methods = dict.fromkeys(lines["method"])
+    styles = {method: get_mark_style(place) for place, method in enumerate(methods)}
+    series = make_method_series(
+        styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
     )
     counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
     names = []

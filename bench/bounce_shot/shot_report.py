@@ -126,10 +126,8 @@ def write_report(
     for name, frame in (("table", result_lines), ("shots", shot_rows), ("status", statuses)):
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
     pictures = draw_figures(experiment, settings, setups, stored, shot_rows, result_lines)
-    figures = [
-        figure_output.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
-        for name, picture in pictures.items()
-    ]
+    files = figure_output.write_figures(folder, pictures)
+    figures = [path for path in files if path.suffix == ".png"]
     write_atomically(
         folder / REPORT_FILE,
         render_page(experiment, str(folder), result_lines, shot_rows, pictures),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from bench.figures.style import (
     get_mark_style,
     make_mark_style,
 )
-from bench.pages.chart import Axis, Panel, ReferenceLine, Series
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series, make_method_series
 from bench.pages.html_page import HtmlPage
 
 
@@ -88,35 +88,20 @@ class DiagnoserReportData:
         """Number of cases that every diagnoser has answered."""
         return int(self.rows["question"].nunique())
 
-    def get_line_styles(self) -> Iterator[tuple[str, MarkStyle]]:
-        """Yield each diagnoser with its mark style (colour, dash and marker)."""
-        return ((name, get_mark_style(place)) for place, name in enumerate(self.order))
+    @property
+    def styles(self) -> dict[str, MarkStyle]:
+        """Style (colour, dash and marker) of each diagnoser, in their order."""
+        return {name: get_mark_style(place) for place, name in enumerate(self.order)}
 
-    def make_interval_series(self, *, is_shifted: bool = False, **where: str) -> tuple[Series, ...]:
-        """Make one series of points with error bars for each diagnoser.
-
-        A series names the rows and columns that it shows; the chart reads them from its table.
+    def make_interval_series(self, is_shifted: bool = False) -> tuple[Series, ...]:
+        """Make a series of points with error bars for each diagnoser.
 
         Args:
-            is_shifted: whether the points of the diagnosers are shifted sideways, so that they do
-                not overlap on a category axis.
-            **where: values of further columns that select the rows of the series.
+            is_shifted: whether the points lie side by side on a category axis.
         """
-        count = len(self.order)
-        return tuple(
-            Series(
-                name,
-                "share",
-                line_style,
-                {"diagnoser": name, **where},
-                "low",
-                "high",
-                "points",
-                # The diagnosers are spread over 0.7 of a category.
-                (place - (count - 1) / 2) * 0.7 / count if is_shifted else 0.0,
-            )
-            for place, (name, line_style) in enumerate(self.get_line_styles())
-        )
+        options: dict[str, Any] = {"low": "low", "high": "high", "draw": "points"}
+        styles = self.styles
+        return make_method_series(styles, "diagnoser", "share", is_shifted=is_shifted, **options)
 
     def make_line_series(self, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
         """Make one line with error bars for each diagnoser that occurs in a table.
@@ -125,12 +110,9 @@ class DiagnoserReportData:
             frame: the table.
             **where: values of further columns that select the rows of the line.
         """
-        names_in_table = set(frame["diagnoser"])
-        return tuple(
-            Series(name, "share", line_style, {"diagnoser": name, **where}, "low", "high")
-            for name, line_style in self.get_line_styles()
-            if name in names_in_table
-        )
+        names = set(frame["diagnoser"])
+        styles = {name: look for name, look in self.styles.items() if name in names}
+        return make_method_series(styles, "diagnoser", "share", where=where, low="low", high="high")
 
 
 _SHARE_METRICS = {

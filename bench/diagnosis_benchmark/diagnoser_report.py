@@ -36,7 +36,7 @@ from bench.diagnosis_benchmark.result_tables import (
     select_single_effects,
 )
 from bench.figures import style
-from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
 from bench.figures.style import add_trust_note
 from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.template import render_text
@@ -368,8 +368,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
         left_out,
     )
     report_data = replace(report_data, pictures=draw_figures(report_data))
-    for name, picture in report_data.pictures.items():
-        write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
+    write_figures(study.folder, report_data.pictures)
     write_atomically(study.folder / REPORT_FILE, render_page(report_data))
     failed = rows[rows["status"] != "done"]
     lines = render_text(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -221,6 +221,26 @@ def write_figure(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
         InputError: The folder cannot be made or written to.
     """
     return write_figure_files(path, *render_png_and_pdf(figure, dpi))
+
+
+def write_figures(folder: Path, figures: Mapping[str, FigureFiles]) -> list[Path]:
+    """Write figures to the folder ``figures`` of a result folder.
+
+    Args:
+        folder: Result folder.
+        figures: Figures by the name of their files.
+
+    Returns:
+        Paths of the files, for each figure the PNG before the PDF.
+
+    Raises:
+        InputError: The folder cannot be made or written to.
+    """
+    return [
+        path
+        for name, figure in figures.items()
+        for path in write_figure_files(folder / "figures" / name, figure.png, figure.pdf)
+    ]
 
 
 def write_figure_files(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:

@@ -298,10 +298,6 @@ class TunerStyles:
             "zorder": 1.5,
         }
 
-    def get_category_offset(self, tuner: str) -> float:
-        """Return the shift of a tuner's points along a category axis."""
-        return compute_category_offset(self._places[tuner], len(self._places))
-
 
 def compute_category_offset(place: int, count: int) -> float:
     """Compute a small shift along a category axis that places points side by side.

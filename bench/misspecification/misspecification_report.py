@@ -32,7 +32,7 @@ from bench.misspecification.misspecification_scores import (
     PREDICTION,
     StudyScores,
 )
-from bench.pages.chart import Axis, Panel, ReferenceLine, Series
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series, make_method_series
 from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
@@ -165,15 +165,9 @@ def _draw_ranks(
         for study in studies:
             name, tuners = study.experiment.name, study.list_tuners()
             style = TunerStyles(study.experiment, tuners)
-            series = tuple(
-                Series(
-                    tuner,
-                    "rank",
-                    style.get_mark_style(tuner),
-                    {"experiment": name, "metric": metric, "tuner": tuner},
-                )
-                for tuner in tuners
-            )
+            styles = {tuner: style.get_mark_style(tuner) for tuner in tuners}
+            where = {"experiment": name, "metric": metric}
+            series = make_method_series(styles, "tuner", "rank", where=where)
             row = agreement[name, metric]
             title = f"{study.name}\nτ = {row['tau']:.2f}, p = {row['p_value']:.2g}"
             panels.append(Panel(title, "ranks", "place", series, across, up))

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from bench.figures.style import MarkStyle
+from bench.figures.style import MarkStyle, compute_category_offset
 
 Scale = Literal["linear", "log", "symlog"]
 """Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""
@@ -68,6 +68,38 @@ class Series:
     draw: SeriesKind = "line"
     shift: float = 0.0
     under: bool = False
+
+
+def make_method_series(
+    styles: Mapping[str, MarkStyle],
+    column: str,
+    y: str,
+    *,
+    is_shifted: bool = False,
+    where: Mapping[str, str] | None = None,
+    **options: Any,
+) -> tuple[Series, ...]:
+    """Make a series for each of the compared methods.
+
+    Args:
+        styles: Methods in the order of the legend, each with its style.
+        column: Column with the names of the methods.
+        y: Column that is drawn.
+        is_shifted: Whether marks of several methods in one category lie side by side.
+        where: Texts by column that select the rows of all series.
+        **options: Further attributes of `Series`.
+    """
+    return tuple(
+        Series(
+            name,
+            y,
+            look,
+            {column: name, **(where or {})},
+            shift=compute_category_offset(place, len(styles)) if is_shifted else 0.0,
+            **options,
+        )
+        for place, (name, look) in enumerate(styles.items())
+    )
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,14 @@ from bench.benchmark.statistics.tuner_ranking import (
     compute_problem_ranks,
 )
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
 from bench.figures.style import (
     PANEL_TITLES,
     MarkStyle,
     add_trust_note,
     get_mark_style,
 )
-from bench.pages.chart import Axis, Panel, Series
+from bench.pages.chart import Axis, Panel, make_method_series
 from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
@@ -119,10 +119,10 @@ def compare_across_problems(
     pictures = {
         name: render_all_formats(figure) for name, figure in collection.build_figures().items()
     }
-    for name, picture in pictures.items():
-        figure_files = write_figure_files(out / "figures" / name, picture.png, picture.pdf)
-        print_line(f"figure  {figure_files[0]}")
-        files += figure_files
+    for path in write_figures(out, pictures):
+        files.append(path)
+        if path.suffix == ".png":
+            print_line(f"figure  {path}")
     files.append(out / REPORT_FILE)
     command = ["simgap", "plot", *map(str, folders), "--out", str(out)]
     write_atomically(files[-1], render_multi_problem_page(collection, frames, pictures, command))
@@ -333,10 +333,7 @@ def _make_runtime_panel(
         pd.DataFrame({"tuner": name, "hundredths": np.arange(len(share)), "share": share})
         for name, share in shares.items()
     ]
-    series = tuple(
-        Series(name, "share", mark_style, {"tuner": name}, draw="steps")
-        for name, mark_style in styles.items()
-    )
+    series = make_method_series(styles, "tuner", "share", draw="steps")
     x_axis = Axis("simulations used, in hundredths of the problem's budget", scales=("linear",))
     # A margin of 0.02, so that lines at 0 and 1 are visible.
     y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
@@ -369,13 +366,11 @@ def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], p
             # If an experiment is given twice, its curves must not be mixed.
             problem += f", {counts[problem]}" if counts[problem] > 1 else ""
             frames.append(medians.assign(problem=problem, metric=metric))
-            present_tuners = set(medians["tuner"])
-            series = tuple(
-                Series(
-                    name, "median", mark_style, {"tuner": name, "problem": problem}, "low", "high"
-                )
-                for name, mark_style in collection.styles.items()
-                if name in present_tuners
+            names = set(medians["tuner"])
+            styles = {name: look for name, look in collection.styles.items() if name in names}
+            where = {"problem": problem}
+            series = make_method_series(
+                styles, "tuner", "median", where=where, low="low", high="high"
             )
             targets = statistics.target_counts[str(kind)]
             title = f"{experiment.title or experiment.name}. {PANEL_TITLES[str(kind)]} ({targets})"

@@ -19,7 +19,7 @@ from pandas.api.types import is_numeric_dtype
 from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
-from bench.pages.chart import Axis, Panel, Series
+from bench.pages.chart import Axis, Panel, make_method_series
 from bench.pages.html_page import HtmlPage
 from bench.pages.template import render_text
 from bench.suite.suite_runs import (
@@ -364,11 +364,8 @@ def _build_cells(
     cells = []
     for row in tables.suite.cells.itertuples():
         cell = str(row.cell)
-        series = tuple(
-            Series(name, "median", style, {"tuner": name, "cell": cell})
-            for name, style in styles.items()
-            if name in tables.curves[cell]
-        )
+        present = {name: look for name, look in styles.items() if name in tables.curves[cell]}
+        series = make_method_series(present, "tuner", "median", where={"cell": cell})
         unit = "held-out RMSE" if row.range == "real" else "error [training widths]"
         panel = Panel(cell, "curves", "simulations", series, x_axis, Axis(f"{unit}, median", "log"))
         anchor = _make_anchor(cell)
@@ -394,11 +391,8 @@ def _make_rank_panel(tables: SuiteTables, page: HtmlPage, styles: dict[str, Mark
         styles: styles of marks by name of the tuner.
     """
     page.add_table("mean-ranks", tables.ranks[tables.ranks["training"] == FREE], _DIGITS)
-    series = tuple(
-        Series(name, "mean_rank", style, {"tuner": name})
-        for name, style in styles.items()
-        if name in tables.complete_tuners
-    )
+    present = {name: look for name, look in styles.items() if name in tables.complete_tuners}
+    series = make_method_series(present, "tuner", "mean_rank")
     ticks = tuple(float(k) for k in tables.checkpoints)
     x_axis = Axis("simulations used on the target", "log", ("log", "linear"), ticks)
     y_axis = Axis("mean rank, 1 is best", scales=("linear",))
