@@ -61,6 +61,8 @@ _ALLOWED_KEYS = (
 )
 """Keys allowed in the file."""
 
+_NUMBER = "a finite number"
+
 
 @dataclass(frozen=True)
 class FittedValue:
@@ -221,18 +223,33 @@ def read_extended(path: Path) -> ExtendedSimulator:
         expected = f"an extended simulator with format = {FORMAT_VERSION}"
         raise make_error(path, "", expected, document.get("format"))
     check_known_names(f"key of {path}", document, _ALLOWED_KEYS)
-    name = _read_name(path, document.get("name"))
+    name = _check_text(path, "name", document.get("name"))
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):  # it is also used for files
+        raise make_error(path, "name", "letters, digits, '_', '.' and '-'", name)
     robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
     system, engine = (robot.path.stem, None) if robot else _read_system(path, document)
+    expected = "a list of channel names"
+    observe = check_name_list(path, "observe", document.get("observe", []), expected)
+    if not observe:
+        raise make_error(path, "observe", expected, document.get("observe", []))
+    constants = check_table(path, "constants", document.get("constants", {}))
+    effects = check_table(path, "effects", document.get("effects", {}))
     return ExtendedSimulator(
         name=name,
         system=system,
         engine=engine,
         title=str(document.get("title", "")),
         parameters=_read_fitted_values(path, "parameters", document.get("parameters", {})),
-        effects=_read_effects(path, document.get("effects", {})),
-        constants=_read_constants(path, document.get("constants", {})),
-        observe=_read_observed_channels(path, document.get("observe", [])),
+        # The order matters: a signal passes the effects one after another.
+        effects={
+            effect: _read_fitted_values(path, f"effects.{effect}", numbers)
+            for effect, numbers in effects.items()
+        },
+        constants={
+            constant: check_finite(path, f"constants.{constant}", value, _NUMBER)
+            for constant, value in constants.items()
+        },
+        observe=list(observe),
         robot=robot,
     )
 
@@ -249,59 +266,6 @@ def _read_system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | No
             raise InputError(f"{path}: {key} is for a robot; expected model too, found none")
     engine = _check_text(path, "engine", document["engine"]) if "engine" in document else None
     return _check_text(path, "system", document.get("system")), engine
-
-
-def _read_name(path: Path, value: Any) -> str:
-    """Check the name under which the simulator is registered; it is also used for files.
-
-    Args:
-        path: path of the file.
-        value: value of the entry.
-    """
-    name = _check_text(path, "name", value)
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
-        raise make_error(path, "name", "letters, digits, '_', '.' and '-'", name)
-    return name
-
-
-def _read_observed_channels(path: Path, value: Any) -> list[str]:
-    """Check the list of observed channels in the file; it must not be empty.
-
-    Args:
-        path: path of the file.
-        value: value of the entry.
-    """
-    expected = "a list of channel names"
-    observe = check_name_list(path, "observe", value, expected)
-    if not observe:
-        raise make_error(path, "observe", expected, value)
-    return list(observe)
-
-
-def _read_constants(path: Path, value: Any) -> dict[str, float]:
-    """Read the known constants in the file, by name.
-
-    Args:
-        path: path of the file.
-        value: value of the entry.
-    """
-    table = check_table(path, "constants", value)
-    return {name: _read_real(path, f"constants.{name}", number) for name, number in table.items()}
-
-
-def _read_effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
-    """Read the coefficients of all effects in the file, by effect and coefficient.
-
-    Args:
-        path: path of the file.
-        value: value of the entry.
-    """
-    coefficients = {}
-    # The order matters: a signal passes the effects one after another.
-    for name, numbers in check_table(path, "effects", value).items():
-        check_table(path, name, numbers)
-        coefficients[name] = _read_fitted_values(path, f"effects.{name}", numbers)
-    return coefficients
 
 
 def _read_fitted_values(path: Path, key: str, value: Any) -> dict[str, FittedValue]:
@@ -327,9 +291,9 @@ def _read_fitted_value(path: Path, key: str, value: Any) -> FittedValue:
         value: the entry, a table with value and unit.
     """
     table = check_table(path, key, value, "a table with value and unit")
-    fitted = _read_real(path, f"{key}.value", table.get("value"))
+    fitted = check_finite(path, f"{key}.value", table.get("value"), _NUMBER)
     low, high = (
-        _read_real(path, f"{key}.{end}", table[end]) if end in table else None
+        check_finite(path, f"{key}.{end}", table[end], _NUMBER) if end in table else None
         for end in ("low", "high")
     )
     return FittedValue(fitted, _check_text(path, "unit", table.get("unit")), low, high)
@@ -347,17 +311,6 @@ def _check_text(path: Path, key: str, value: Any) -> str:
     if not result:
         raise make_error(path, key, "a text", value)
     return result
-
-
-def _read_real(path: Path, key: str, value: Any) -> float:
-    """Check that an entry is a finite number.
-
-    Args:
-        path: path of the file.
-        key: key of the entry in the file.
-        value: value of the entry.
-    """
-    return check_finite(path, key, value, "a finite number")
 
 
 def make_simulator_class(
