@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from sims.core.simulator import Scenario
-from sims.engines.compiled import array_programs
+from sims.engines.compiled import array_programs, force_program
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -71,15 +71,24 @@ class Noted:
         return motion
 
 
+@contextlib.contextmanager
+def evaluate_with_numpy():
+    """Have NumPy evaluate all forces in a `with` block."""
+    with (
+        mock.patch.object(array_programs.TracedPrograms, "find", return_value=None),
+        mock.patch.dict(force_program._traced_forces, clear=True),
+    ):
+        yield
+
+
 def seconds(cls, effects, batch_size, repeats=REPEATS):
     """Return processor seconds (2, 2): evaluated and traced, each for the engine and the call."""
     simulator, theta, scenarios = work(cls, effects, batch_size)
     simulator.engine = engine = Noted(simulator.engine)
     best = np.full((2, 2), np.inf)
-    evaluated = mock.patch.object(array_programs.TracedPrograms, "find", return_value=None)
     for repeat in range(repeats + 1):
-        for k, way in enumerate((evaluated, contextlib.nullcontext())):
-            with way:
+        for k, way in enumerate((evaluate_with_numpy, contextlib.nullcontext)):
+            with way():
                 engine.seconds = 0.0
                 started = process_time()
                 simulator.simulate_batch(theta, scenarios)

@@ -11,7 +11,7 @@ from sims.core.simulator import InputError, Parameter, Scenario
 from sims.core.system import System
 from sims.effects.friction import CoulombFriction
 from sims.engines.batch import make_engine
-from sims.engines.compiled import array_programs
+from sims.engines.compiled import array_programs, force_program
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -33,6 +33,7 @@ def force_evaluation(request, monkeypatch):
     """Run each test with traced forces, and with forces that NumPy evaluates."""
     if request.param == "evaluated":
         monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+        monkeypatch.setattr(force_program, "_traced_forces", {})
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
-from sims.engines.compiled import array_programs
+from sims.engines.compiled import array_programs, force_program
 from sims.engines.compiled.kernel import make_instruction_runner
 from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
@@ -145,6 +145,7 @@ def test_an_effect_with_many_array_operations_is_traced(monkeypatch, capsys):
     traced = simulate_slider(ManyOperations)
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+    monkeypatch.setattr(force_program, "_traced_forces", {})
     np.testing.assert_allclose(traced, simulate_slider(ManyOperations), rtol=1e-12)
 
 
@@ -218,6 +219,7 @@ def test_damaged_batches_end_in_the_same_state_with_evaluated_forces(system, mon
         batches = list(damaged_batches(batch, np.random.default_rng(11)))
         traced = [engine.integrate(batch) for batch in batches]
         monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+        monkeypatch.setattr(force_program, "_traced_forces", {})
         evaluated = [engine.integrate(batch) for batch in batches]
     for found, expected in zip(evaluated, traced, strict=True):
         np.testing.assert_allclose(found.x, expected.x, rtol=1e-9, atol=1e-10)

@@ -16,7 +16,8 @@ import ctypes
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,10 +70,10 @@ class ArrayFunction:
     outputs: Sequence[Sequence[int]]
     bind: Callable[..., Sequence[Evaluator]]
 
-    @property
-    def input_ends(self) -> IntTable:
+    @cached_property
+    def input_ends(self) -> list[int]:
         """First register of each group, and the register after the last one."""
-        return np.cumsum([0, *(size for size, _ in self.groups)])
+        return [0, *accumulate(size for size, _ in self.groups)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +126,7 @@ class PreparedProgram:
         self._error: BaseException | None = None
         # Evaluators by the number of slots in use, whose inputs are views of the registers.
         self._evaluators: dict[int, Sequence[Evaluator]] = {}
-        self._input_ends = program.function.input_ends.tolist()
-        first = self._input_ends[-1]
+        first = program.function.input_ends[-1]
         self.r[first : first + program.constants.size] = program.constants[:, None]
         if not program.is_traced:
             self._callback = _Callback(self._evaluate_part)
@@ -178,7 +178,8 @@ class PreparedProgram:
             try:
                 with np.errstate(all="ignore"):
                     if width not in self._evaluators:
-                        views = [self.r[a:b, :width].T for a, b in pairwise(self._input_ends)]
+                        ends = self.program.function.input_ends
+                        views = [self.r[a:b, :width].T for a, b in pairwise(ends)]
                         self._evaluators[width] = self.program.function.bind(*views)
                     values = self._evaluators[width][part - 1]()
                 for rows, value in zip(outputs, values, strict=True):

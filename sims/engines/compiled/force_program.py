@@ -22,6 +22,7 @@ from sims.core.engine import IntegrationBatch
 from sims.core.simulator import Array, Indices
 from sims.core.system import StateSnapshot, System
 from sims.engines.compiled.array_programs import (
+    MAX_CACHED_PROGRAMS,
     ArrayFunction,
     Evaluator,
     PreparedProgram,
@@ -38,6 +39,7 @@ _TEST_STATES = ((0.0, 0.0, 0.3), (0.37, 0.1, 2.0))
 _TEST_RESTITUTION, _TEST_FRICTION = 0.6, 0.2
 """Restitution and friction of the ground with which effects are tested."""
 _traced_programs: dict[tuple[type[System], _InputNames], TracedPrograms] = {}
+_traced_forces: dict[tuple[object, ...], ForceProgram] = {}
 _lock = Lock()
 
 
@@ -62,19 +64,20 @@ class ForceProgram(NamedTuple):
 
     Attributes:
         program: the program.
+        rows: see `ProgramArrays`.
         flags: see `ProgramArrays`.
     """
 
     program: Program
+    rows: IntTable
     flags: IntTable
 
     def prepare(self, width: int) -> tuple[PreparedProgram, ProgramArrays]:
         """Allocate registers of `width` slots, and return the layout for the compiled kernel."""
         prepared = PreparedProgram(self.program, width)
-        (force, limit), impact = self.program.outputs
-        rows = [*self.program.function.input_ends[:-1], *np.concatenate([limit, *impact])]
+        force = self.program.outputs[0][0]
         return prepared, ProgramArrays(
-            prepared.code, self.program.ends, np.array(rows, dtype=np.int64), force, self.flags
+            prepared.code, self.program.ends, self.rows, force, self.flags
         )
 
 
@@ -97,8 +100,38 @@ def get_force_program(
         tuple(batch.constants), tuple(batch.inputs), batch.theta.shape[1], batch.x.shape[1]
     )
 
+    key = type(system), names, *map(type, effects)
+    # The lock prevents that a trace in progress in another thread is taken as not traceable.
+    with _lock:
+        if key in _traced_forces:
+            return _traced_forces[key]
+        program = _find_program(batch, elements[:1], names, effects)
+        (_, limit), impact = program.outputs
+        rows = [*program.function.input_ends[:-1], *np.concatenate([limit, *impact])]
+        flags = _make_flags(system, names, effects)
+        found = ForceProgram(program, np.array(rows, dtype=np.int64), flags)
+        if program.is_traced:
+            if len(_traced_forces) == MAX_CACHED_PROGRAMS:
+                _traced_forces.clear()
+            _traced_forces[key] = found
+        return found
+
+
+def _find_program(
+    batch: IntegrationBatch, first: Indices, names: _InputNames, effects: Sequence[Effect]
+) -> Program:
+    """Return the traced program of a system and its effects, or one that NumPy evaluates.
+
+    Args:
+        batch: whole batch.
+        first: (1,) index of an element, at whose initial state programs are compared with NumPy.
+        names: names and sizes of the inputs.
+        effects: effects that act.
+    """
+    system = batch.system
+
     def make_test(*own_effects: Effect) -> tuple[ArrayFunction, list[Array]]:
-        samples = _make_samples(batch, elements[:1], own_effects)
+        samples = _make_samples(batch, first, own_effects)
         return _make_function(system, names, own_effects), samples
 
     sources = [TracedSource(system, f"system {system.name}", make_test)]
@@ -107,12 +140,8 @@ def get_force_program(
         for effect in effects
     ]
     function = _make_function(system, names, effects)
-    # The lock prevents that a trace in progress in another thread is taken as not traceable.
-    with _lock:
-        programs = _traced_programs.setdefault((type(system), names), TracedPrograms())
-        program = programs.find(function, sources)
-    flags = _make_flags(system, names, effects)
-    return ForceProgram(program or make_numpy_program(function), flags)
+    programs = _traced_programs.setdefault((type(system), names), TracedPrograms())
+    return programs.find(function, sources) or make_numpy_program(function)
 
 
 def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]) -> ArrayFunction:

@@ -120,7 +120,7 @@ class StepForces:
         program = programs.find(function, sources) or make_numpy_program(function)
         self.prepared = PreparedProgram(program, len(stiffness))
         self.registers = r = self.prepared.r
-        groups = [slice(*ends) for ends in pairwise(function.input_ends.tolist())]
+        groups = [slice(*ends) for ends in pairwise(function.input_ends)]
         self._t, self._midpoint_time, step_group, self._interval, *self._motion = groups[:-4]
         self._u, self._stiffness_group, coefficient_group, self._states = groups[-4:]
         r[step_group] = step
@@ -141,7 +141,7 @@ class StepForces:
         """
         effects = StepEffects.from_active(((effect, c),))
         function = _make_function(self._system, tuple(self._applied_inputs), effects)
-        groups = [slice(*ends) for ends in pairwise(function.input_ends.tolist())]
+        groups = [slice(*ends) for ends in pairwise(function.input_ends)]
 
         def make_samples() -> Iterator[Array]:
             """Yield values of all inputs, of which step, stiffness and coefficients are known."""
