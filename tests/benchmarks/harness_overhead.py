@@ -91,7 +91,8 @@ def measure(problem, name):
     }
 
 
-def main():
+def make_problems():
+    """Return problems by the name of their simulator: one that only returns data, and a spring."""
     load_plugins([PLUGINS / "spring.py"])
     experiment = spring_experiment(targets=1, sampling={"rate": 60.0, "samples": 400})
     spring, nothing = TuningProblem(experiment), TuningProblem(experiment)
@@ -99,7 +100,11 @@ def main():
         np.full((1, 2), 0.5), spring.draw_targets()[0].blinded.fitting.scenarios
     )
     nothing.simulator.simulate = lambda theta, scenario: fixed
-    for problem, name in ((nothing, "none"), (spring, "spring, 400 samples")):
+    return {"none": nothing, "spring, 400 samples": spring}
+
+
+def main():
+    for name, problem in make_problems().items():
         print(json.dumps(measure(problem, name)))
 
 

@@ -26,7 +26,6 @@ import psutil
 
 from bench.benchmark.isolation.tuner_processes import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
@@ -35,9 +34,7 @@ from bench.core.plugin_registries import load_plugins
 from bench.core.random_streams import make_rng, make_seed_words
 from methods.tuner import Task
 from tests.benchmarks import peer_libraries
-from tests.benchmarks.harness_overhead import bare, harnessed
-from tests.conftest import PLUGINS
-from tests.sample_experiments import spring_experiment
+from tests.benchmarks.harness_overhead import bare, harnessed, make_problems
 
 EVALUATIONS = 3000
 REPEATS = 15
@@ -173,13 +170,9 @@ def print_medians(rows):
 
 
 def main():
-    load_plugins([PLUGINS / "spring.py", Path(__file__).with_name("torch_networks.py")])
-    experiment = spring_experiment(targets=1, sampling={"rate": 60.0, "samples": 400})
-    spring, nothing = TuningProblem(experiment), TuningProblem(experiment)
-    fixed = spring.simulate(
-        np.full((1, 2), 0.5), spring.draw_targets()[0].blinded.fitting.scenarios
-    )
-    nothing.simulator.simulate = lambda theta, scenario: fixed
+    load_plugins([Path(__file__).with_name("torch_networks.py")])
+    problems = make_problems()
+    experiment = problems["none"].experiment
     rounds = []
     with tempfile.TemporaryDirectory() as place:
         python = peer_libraries.environment(Path(place))
@@ -187,8 +180,7 @@ def main():
             # Start a new fork server, because the first run of a worker is measured too.
             tuner_process_reuse.close_isolated_processes()
             rounds.append([
-                evaluation(nothing, "none"),
-                evaluation(spring, "spring, 400 samples"),
+                *(evaluation(problem, name) for name, problem in problems.items()),
                 run(experiment, "random"),
                 run(experiment, "torched"),
             ])  # fmt: skip

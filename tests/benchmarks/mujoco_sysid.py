@@ -24,6 +24,7 @@ from time import perf_counter
 
 import numpy as np
 
+from tests.benchmarks import peer_libraries
 from tests.example_logs import robot_arm
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,16 +126,6 @@ def by_simgap(folder):
     }
 
 
-def environment(folder):
-    """Return the Python that has the toolbox: $PEERS, or a new environment in `folder`."""
-    if os.environ.get("PEERS"):
-        return os.environ["PEERS"]
-    python = str(folder / "venv" / "bin" / "python")
-    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "mujoco[sysid]==4.0.0"], check=True)
-    return python
-
-
 def line(case, name, outcome):
     """Return a row of the table."""
     errors = " / ".join(f"{1e3 * v:.2f}" for v in outcome["heldout_rmse"].values())
@@ -153,7 +144,7 @@ def main():
     print("| case | who | verdict | held-out error, mrad | processor s | wall s | found |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as place:
-        python = environment(Path(place))
+        python = peer_libraries.environment(Path(place), ("mujoco[sysid]==4.0.0",))
         for case in cases:
             folder = prepare(case, Path(place) / case)
             for name, what in FREED.items():

@@ -226,23 +226,6 @@ def test_without_air_bounces_are_exact_at_any_step(engine, step, restitution):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(("friction", "kept"), [(0.25, 1 - 0.25 * 1.6 * 2.0 / 5.0), (3.0, 0.0)])
-def test_friction_takes_what_it_says_and_no_more(engine, friction, kept):
-    # Tangential speed lost: c (1 + e) |vn|, in any direction along the ground; the ball does not
-    # spin.
-    ball = Ball(
-        {"gravity": 0.0}, ["x", "y", "z"], engine=engine, fixed={"contact.friction": friction}
-    )
-    path = ball.simulate(
-        np.array([[0.6]]),
-        Scenario(np.arange(20) / 60, {"z": 0.6, "vx": 3.0, "vy": 4.0, "vz": -2.0}),
-    )
-    velocity = np.diff(path[0], axis=0) * 60
-    np.testing.assert_allclose(velocity[0], [3.0, 4.0, -2.0], atol=1e-9)
-    np.testing.assert_allclose(velocity[-1], [3.0 * kept, 4.0 * kept, 1.2], atol=1e-7)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
 def test_ball_rests_on_the_ground(engine):
     for restitution in (0.0, 0.2, 0.5):
         z, a = (
