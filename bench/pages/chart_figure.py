@@ -134,7 +134,8 @@ def finish_chart(
     """
     handles, labels = axis.get_legend_handles_labels()
     if len(labels) > 1:
-        figure.legend(handles, labels, loc=legend, fontsize=8, frameon=False)
+        # Handles of this length show the dashes of a line.
+        figure.legend(handles, labels, loc=legend, fontsize=8, frameon=False, handlelength=3.2)
     if title:
         figure.suptitle(title, fontsize=11)
     if caption:

@@ -264,7 +264,7 @@ class ComparisonCollection:
             figure,
             axes[0],
             f"{len(self.mean_ranks)} problems",
-            "Mean over problems, each with equal weight. The best mean rank is first.",
+            "Mean over problems, each with equal weight. Legend: the best mean rank first.",
             "outside right upper",
         )
 
