@@ -84,9 +84,6 @@ class RunLinearisation:
         """
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
-        if simulator.robot.is_on_ground:
-            # Contacts change from step to step.
-            self.held = simulator.time_step
         self._clock = float(scenario.times[0])
         self._times = scenario.times - self._clock
         self._steps = simulator.count_steps(self._times)

@@ -15,6 +15,7 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
+from sims.recording.recorded_poses import POSITION_AXES
 from sims.robot.dynamics.drive_limits import ForceRanges, Mask, find_working_servos
 from sims.robot.dynamics.effect_forces import (
     LOAD_DEPENDENT_EFFECTS,
@@ -41,6 +42,10 @@ from sims.robot.state_snapshots import RobotSnapshot
 
 LINEARISATION_INTERVAL_SECONDS = 0.004
 """Interval of the linearisation in seconds; a pose changes little within it."""
+CONTACT_DIFFERENCE = 1e-6
+"""Displacement in m of a floating body, for derivatives that show its contacts."""
+MAX_RELATIVE_CHANGE = 0.1
+"""Maximum change of these derivatives for which one linearisation is used."""
 TRANSMISSION_FORCE_FIELDS = ("qfrc_actuator", "qfrc_bias")
 """Fields of MuJoCo's data with the forces on both sides of a joint's transmission."""
 
@@ -141,7 +146,6 @@ class LinearisationPoints:
         self._floating = mujoco_batch.floating
         self._dofs = np.append(joints.velocities, self._floating.velocities)
         self.point_spacing = max(round(held / motion.step), 1)
-        self.point_steps, self.point_of_step = _choose_points(motion, self.point_spacing)
         # Fields must be bound before MuJoCo's first call, since later ones are not updated before
         # the next call.
         self._bind_fields(mujoco_batch)
@@ -160,6 +164,30 @@ class LinearisationPoints:
         self._next_hidden_states: list[HiddenState] = []
         mujoco_batch.batch.reset(stage=0)
         self._reset_state = mujoco_batch.batch.state.copy()
+        self.point_steps = np.arange(len(motion.controls))
+        changes = self._find_changed_contacts() if mujoco_batch.robot.is_on_ground else None
+        self.point_steps, self.point_of_step = _choose_points(motion, self.point_spacing, changes)
+
+    def _find_changed_contacts(self) -> Mask:
+        """Return at which of S steps the contacts with the ground have changed, as a mask (S,).
+
+        They show in the derivatives of a step by the position of a floating body. The derivatives
+        have changed if they differ from those at the change before by `MAX_RELATIVE_CHANGE`.
+        """
+        unmoved, _ = self.step_displaced({}, self.acting)
+        columns = []
+        for body in self._mujoco_batch.robot.recorded_bases:
+            for axis in POSITION_AXES:
+                joint = self._system.coordinates.index(f"q.{body}.{axis}")
+                moved, _ = self.step_displaced({"q": (joint, CONTACT_DIFFERENCE)}, self.acting)
+                columns.append((moved - unmoved) / CONTACT_DIFFERENCE)
+        derivatives = np.concatenate(columns, axis=1)
+        limit = MAX_RELATIVE_CHANGE * np.median(np.abs(derivatives).max(axis=1))
+        has_changed, reference = np.zeros(len(derivatives), dtype=bool), derivatives[0]
+        for step, derivative in enumerate(derivatives):
+            if not np.abs(derivative - reference).max() <= limit:
+                has_changed[step], reference = True, derivative
+        return has_changed
 
     def _bind_fields(self, mujoco_batch: MujocoBatch) -> None:
         """Bind the fields of MuJoCo's data that are read, before MuJoCo's first call."""
@@ -611,17 +639,20 @@ class LinearisationPoints:
         return make_snapshot(self._system, t[:, None], x, v, inputs, motion.carried, stiffness)
 
 
-def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, IndexArray]:
+def _choose_points(
+    motion: RobotMotion, spacing: int, contact_changes: Mask | None
+) -> tuple[IndexArray, IndexArray]:
     """Choose the steps at which the model is linearised, one after every `spacing` steps.
 
-    The count begins again where a piecewise constant command jumps or an actuator is switched,
-    because a derivative before the jump is not valid after it.
+    The count begins again where a piecewise constant command jumps, an actuator is switched, or a
+    contact changes, because a derivative before the jump is not valid after it.
 
     Shapes: S steps.
 
     Args:
         motion: motion at all steps: states, controls and forces.
         spacing: regular number of steps between two points.
+        contact_changes: steps at which a contact changes, as a mask (S,); None if there are none.
 
     Returns:
         Steps of the points (N,), and for each step the index of the point that applies (S,).
@@ -634,10 +665,15 @@ def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, Index
     if changes.mean() > 1.0 / spacing:
         changes[1:] = False
     changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
+    if contact_changes is not None:
+        changes |= contact_changes
     numbers = np.arange(steps)
     last_change = np.maximum.accumulate(np.where(changes, numbers, 0))
-    is_point = (numbers - last_change) % spacing == 0
-    return np.flatnonzero(is_point), np.cumsum(is_point) - 1
+    is_first = (numbers - last_change) % spacing == 0
+    first_steps = np.flatnonzero(is_first)
+    if contact_changes is not None:
+        first_steps = (first_steps + np.append(first_steps[1:], steps) - 1) // 2
+    return first_steps, np.cumsum(is_first) - 1
 
 
 def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:

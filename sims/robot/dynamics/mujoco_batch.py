@@ -291,11 +291,29 @@ class MujocoBatch:
             write_series_effects(self.fields, self.robot, acting)
             self._changed_fields.update(WRITTEN_FIELDS)
         if needs_constants:
-            self.batch.set_const()
+            self._recompute_constants(all((c == c[:, :1]).all() for _, c in acting))
         if self.robot.series:
             convert_flank_parameters(self.fields, self.robot)
         self._loaded_friction = self.fields["dof_frictionloss"].copy()
         self._written_effects = written_effects
+
+    def _recompute_constants(self, elements_are_equal: bool) -> None:
+        """Let MuJoCo recompute what it derives from the changed fields.
+
+        Args:
+            elements_are_equal: whether all elements have the same effects, so that the constants of
+                one are those of all.
+        """
+        from mujoco.batch import MODEL_FIELDS
+
+        if not elements_are_equal:
+            self.batch.set_const()
+            return
+        self.batch.set_const([0])
+        for name in MODEL_FIELDS:
+            if self.batch.expanded(name) is not None:
+                values = self.batch.expand(name)
+                values[1:] = values[:1]
 
     def _mark_changed(self, field_names: Iterable[str]) -> None:
         """Record that fields are changed after effects were written; the next write resets them."""
