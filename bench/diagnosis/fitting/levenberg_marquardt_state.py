@@ -53,6 +53,8 @@ COARSE_SHARE = 1e-3
 """Convergence threshold as a share of the sum of squares, if the model is far from the data."""
 FAR_MEAN_SQUARE = 2.0
 """Mean squared residual, in units of the noise, above which a model is far from the data."""
+UNRELIABLE_MEAN_SQUARES = (1.05, 10.0)
+"""Mean squared residuals, in units of the noise, that wrong first positions may leave."""
 STAGNANT_RATIO = 0.3
 """Maximum gain ratio (1) of a step that ends a fit far from the data."""
 STAGNANT_SHARE = 5e-3
@@ -229,6 +231,10 @@ class FitState:
         jacobian_renewals: number of times the derivatives were recomputed.
         own_state_jacobian: (R, T, C, s) derivatives by initial states about this model; None to use
             those that all models share.
+        own_state_cost: cost at which these derivatives were computed; infinite if they were not.
+        can_stick: whether effects of the model may hold a joint at rest.
+        has_unreliable_states: whether a step failed, or the fit converged, with derivatives by
+            initial states that may be wrong.
     """
 
     point: FitPoint
@@ -249,20 +255,45 @@ class FitState:
     sample_count: int = 0
     jacobian_renewals: int = 0
     own_state_jacobian: Array | None = None
+    own_state_cost: float = np.inf
+    can_stick: bool = False
+    has_unreliable_states: bool = False
 
     @property
     def needs_own_state_jacobian(self) -> bool:
         """True if the derivatives by initial states that all models share are not good enough.
 
         This is the case if the model is near the data, but its derivatives by parameters had to be
-        recomputed several times.
+        recomputed several times, or if they may be wrong.
         """
         is_slow = (
             self.has_rough_cost
             and self.own_state_jacobian is None
             and self.jacobian_renewals >= SHARED_RENEWALS
         )
-        return is_slow and not self._is_far(self.point.cost)
+        return self.has_unreliable_states or (is_slow and not self._is_far(self.point.cost))
+
+    def _ask_for_own_states(self) -> bool:
+        """Ask for derivatives by initial states of its own if the shared ones may be wrong.
+
+        Where a joint sticks, it keeps an error of its initial position, which the derivatives that
+        all models share let decay. A model that leaves only noise has no such error, and one that
+        is very far from the data has larger ones.
+
+        Returns:
+            Whether the derivatives are recomputed before the next step.
+        """
+        low, high = UNRELIABLE_MEAN_SQUARES
+        is_unreliable = low < self.point.cost / max(self.sample_count, 1) < high
+        has_moved = self.point.cost < self.own_state_cost - self.get_tolerance(self.point.cost)
+        self.has_unreliable_states = self.can_stick and is_unreliable and has_moved
+        if self.has_unreliable_states:
+            self.is_jacobian_stale = True
+        return self.has_unreliable_states
+
+    def end(self) -> None:
+        """End the fit, unless derivatives by initial states of its own may improve it."""
+        self.is_finished = not self._ask_for_own_states()
 
     def get_tolerance(self, cost: float) -> float:
         """Return the decrease of the cost by a step below which the fit has converged.
@@ -361,7 +392,7 @@ class FitState:
         Otherwise the derivatives must be recomputed first.
         """
         if self.has_own_jacobian:
-            self.is_finished = True
+            self.end()
         else:
             self.is_jacobian_stale = self.is_waiting = True
 
@@ -391,7 +422,7 @@ class FitState:
         is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
         largest = max(decrease, self.predicted_decrease)
         if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
-            self.is_finished = True
+            self.end()
         # With derivatives of the present point the fit has converged; with others it may have.
         if decrease < self.get_tolerance(cost):
             self.mark_converged()
@@ -406,6 +437,8 @@ class FitState:
         """
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True
+            return
+        if self._ask_for_own_states():
             return
         if self._is_rough_at(self.predicted_decrease):
             self.is_finished = True

@@ -32,6 +32,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_step import (
     compute_gauss_newton_step,
     is_finite_response,
 )
+from sims.core.effect import Friction, members_of
 from sims.core.simulator import Array
 
 MIN_ITERATIONS_BEFORE_ELIMINATION = 4
@@ -389,13 +390,37 @@ class TrajectoryFitter:
                     compute_initial_state_derivatives,
                 )
 
+                if fit_state.has_unreliable_states:
+                    self._replace_first_states(fit_state, sample_mask)
                 start = fit_state.point.start
                 fit_state.own_state_jacobian = compute_initial_state_derivatives(
                     self.evaluator, start.theta, start.initial_states
                 )
+                fit_state.own_state_cost = fit_state.point.cost
+                fit_state.has_unreliable_states = False
         points = self._simulate_points([(p, p.point.start) for p in stale_states], sample_mask)
         for fit_state, point in zip(stale_states, points, strict=True):
             self._move_to_point(fit_state, point)
+
+    def _replace_first_states(self, fit_state: FitState, sample_mask: Mask) -> None:
+        """Replace the first states of runs that the guessed ones explain better.
+
+        Steps with wrong derivatives may have moved a joint to where it slides at first, and then
+        sticks in the same place from wherever it began.
+
+        Args:
+            fit_state: state of the fit, whose point is changed in place.
+            sample_mask: (R, T, C) samples that count in the cost.
+        """
+        point, guesses = fit_state.point, self.evaluator.initial_state_guesses
+        start = point.start
+        (simulated,) = self.evaluator.simulate_all_runs(
+            start.theta[None], guesses[None], self.share
+        )
+        costs = self._compute_run_costs(point.simulated, start.initial_states, sample_mask)
+        is_better = self._compute_run_costs(simulated, guesses, sample_mask) < costs
+        states = np.where(is_better[:, None], guesses, start.initial_states)
+        fit_state.point = replace(point, start=replace(start, initial_states=states))
 
     def _create_fit_state(self, start: FitStart) -> FitState:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps.
@@ -434,6 +459,7 @@ class TrajectoryFitter:
             has_rough_cost=evaluator.has_linearisation,
             sample_count=int(evaluator.get_sample_mask(self.share).sum()),
             own_state_jacobian=start.state_jacobian,
+            can_stick=evaluator.has_linearisation and _can_stick(evaluator, start.effects),
         )
 
     def _simulate_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
@@ -637,13 +663,17 @@ class TrajectoryFitter:
             states: (R, s) initial states.
             sample_mask: (R, T, C) mask of the samples that count.
         """
+        return float(self._compute_run_costs(simulated, states, sample_mask).sum())
+
+    def _compute_run_costs(self, simulated: Array, states: Array, sample_mask: Mask) -> Array:
+        """Return the part of each run (R,) in the cost; arguments as those of `_compute_cost`."""
         residual = self._compute_residual(simulated, sample_mask)
-        # An abandoned batch element is NaN, which cannot be compared.
-        if not np.isfinite(residual).all():
-            return np.inf
         whitened = whiten(residual, sample_mask, self.noise)
         deviation = self._compute_state_deviation(states)
-        return float((whitened * whitened).sum() + (deviation * deviation).sum())
+        squares = np.square(whitened).sum(axis=(1, 2)) + np.square(deviation).sum(axis=1)
+        # An abandoned batch element is NaN, which cannot be compared.
+        costs: Array = np.where(np.isfinite(squares), squares, np.inf)
+        return costs
 
     def _propose_trials(
         self, fit_states: Sequence[FitState], sample_mask: Mask
@@ -738,6 +768,17 @@ class TrajectoryFitter:
             fit_state.accept_step(decrease, point.cost, is_own_jacobian)
         else:
             fit_state.reject_step()
+
+
+def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:
+    """Return whether one of some effects is, or contains, dry friction that can hold a joint."""
+    available = evaluator.available_effects
+    parts = {part for name in names for part in (name, *available[name].contains)}
+    return any(
+        isinstance(member, Friction)
+        for part in parts & available.keys()
+        for member in members_of(available[part])
+    )
 
 
 def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:

@@ -36,7 +36,10 @@ from bench.diagnosis.kalman.filter_and_smoother import (
     filter_runs,
     fit_process_noise,
 )
-from bench.diagnosis.kalman.measured_states import estimate_measured_states
+from bench.diagnosis.kalman.measured_states import (
+    estimate_measured_states,
+    estimate_resting_position,
+)
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.contact_states import ContactModel, KnownJacobians, settle_contacts
@@ -713,12 +716,14 @@ class FollowedRuns:
         """Return positions and velocities of the joints at the first samples (R, 2 D).
 
         For recorded joints they are estimated from the readings alone, because a stiff servo hides
-        the first velocity from a linear model; for other joints they are smoothed states, and for
-        robots on the ground these with settled contacts.
+        the first velocity from a linear model; a joint that rests may stick, so that its position
+        is a mean. For other joints they are smoothed states, and for robots on the ground these
+        with settled contacts.
         """
         if self.is_on_ground:
             return self._settled_first_states
         first_states = []
+        coordinates = self.evaluator.simulator.system.coordinates
         for run, trajectory in enumerate(self.trajectories):
             first_step = int(self.linear[run].knots[0])
             x, v = trajectory.x[first_step].copy(), trajectory.v[first_step].copy()
@@ -726,6 +731,13 @@ class FollowedRuns:
                 self.evaluator, self.noise.sigma, run
             ).items():
                 x[joint], v[joint] = states[0, :2]
+                channel = self.evaluator.channels.index(coordinates[joint])
+                resting = estimate_resting_position(
+                    self.evaluator.prepared_runs[run].observed[:, channel],
+                    float(self.noise.sigma[channel]),
+                )
+                if resting is not None:
+                    x[joint], v[joint] = resting, 0.0
             first_states.append(np.concatenate([x, v]))
         return np.array(first_states)
 

@@ -34,6 +34,10 @@ PRIOR_WIDTHS = (10.0, 10.0, 100.0)
 
 They are in ranges of the position, per second and second squared.
 """
+MIN_RESTING_READINGS = 10
+"""Minimum number of readings whose mean is the position of a joint that rests."""
+MAX_RESTING_DEVIATION = 3.0
+"""Maximum excess of the scatter of readings at rest, in its standard deviations."""
 DEFAULT_SIGMA = 1e-6
 """Noise of a channel whose noise is neither stated nor visible, in rad or m (and per second)."""
 
@@ -90,6 +94,34 @@ def _compute_measured_states(
         return {}
     states = track_joints(times, readings)
     return dict(zip(joints, states, strict=True))
+
+
+def estimate_resting_position(readings: Array, sigma: float) -> float | None:
+    """Estimate the position of a joint that rests at the beginning of a run.
+
+    It rests as long as the readings scatter about their mean no more than the noise does. Only the
+    first half of these readings counts, since a slow beginning of motion shows late.
+
+    Args:
+        readings: (T,) recorded positions; NaN where there are none.
+        sigma: standard deviation of their noise.
+
+    Returns:
+        The mean of the readings at rest; None if the joint does not rest for more than `2 *
+        MIN_RESTING_READINGS` readings.
+    """
+    present = readings[np.isfinite(readings)]
+    counts = np.arange(1, present.size + 1)
+    scaled = (present - present[:1]) / sigma
+    # Sums of squares about the mean of the first 1, 2, ... readings are chi-squared at rest.
+    squares = np.cumsum(scaled**2) - np.cumsum(scaled) ** 2 / counts
+    moves = squares > counts - 1 + MAX_RESTING_DEVIATION * np.sqrt(2.0 * counts)
+    # One wrong reading is no motion.
+    moves[: 2 * MIN_RESTING_READINGS] = False
+    resting = int(np.argmax(moves)) if moves.any() else present.size
+    if resting <= 2 * MIN_RESTING_READINGS:
+        return None
+    return float(present[: resting // 2].mean())
 
 
 def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
