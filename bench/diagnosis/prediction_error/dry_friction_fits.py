@@ -52,39 +52,45 @@ class SoftFrictionError(Exception):
         self.start, self.is_preliminary = start, is_preliminary
 
 
-def check_selection(context: SearchContext, selected: Selected) -> None:
-    """Raise `SoftFrictionError` if soft dry friction explains the runs better than a selection.
+def compare_friction_forms(context: SearchContext, selected: Selected) -> FittedModel | None:
+    """Return stiff dry friction if it explains the runs, or raise an error if soft friction does.
 
     MuJoCo simulates dry friction with a compliant constraint ("soft form"), so that joints creep;
     the other form ("stiff") lets them stick. The form decides about the simulator of the whole
-    search, so it is tested before anything but dry friction is fitted. Log-likelihoods of filters
-    are compared. Nothing is raised if stiff friction explains the runs, or if another effect at the
-    joint promises more.
+    search, so it is tested before anything but dry friction is fitted. Stiff friction is simulated:
+    that of the selection, and that at the joint where soft friction would act. Otherwise,
+    log-likelihoods of filters are compared. Soft friction is not considered if another effect at
+    the joint promises more.
 
     Args:
         context: search, filters and regressions of the recording.
         selected: the selection.
+
+    Returns:
+        Stiff dry friction that explains the runs; None if it does not, or need not be tested.
 
     Raises:
         SoftFrictionError: soft friction is likelier than the selection.
     """
     filters = context.filters
     if filters.is_soft or not filters.base.has_missing_force:
-        return
-    stiff_friction = make_dry_friction_start(context, selected)
-    # Stiff friction that explains the runs needs no comparison.
-    if stiff_friction.effects and is_explained(
-        context, context.search.fit_one(stiff_friction, FIRST_ITERATIONS)
-    ):
-        return
+        return None
+    selected_friction = make_dry_friction_start(context, selected)
+    stiff_friction = _fit_if_explains(context, selected_friction)
+    if stiff_friction is not None:
+        return stiff_friction
     soft_start = _find_soft_friction(context)
     if soft_start is None:
-        return
+        return None
     soft_log_likelihood = filters.log_likelihood(soft_start.theta, is_soft=True)
     gain = soft_log_likelihood - filters.base.log_likelihood
     # Another effect at the joint that promises more is fitted first.
     if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
-        return
+        return None
+    if soft_start.effects != selected_friction.effects:
+        stiff_friction = _fit_if_explains(context, soft_start)
+        if stiff_friction is not None:
+            return stiff_friction
     if _is_far_less_likely(context, selected, soft_log_likelihood):
         raise SoftFrictionError(soft_start, is_preliminary=True)
     useful_selection = drop_surplus_effects(context, selected)
@@ -92,6 +98,15 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
         context.columns.start(useful_selection.groups, useful_selection.coefficients).theta
     )
     check_filter(context, log_likelihood, is_preliminary=True)
+    return None
+
+
+def _fit_if_explains(context: SearchContext, friction: FitStart) -> FittedModel | None:
+    """Return dry friction fitted in the stiff form if it explains the runs, else None."""
+    if not friction.effects:
+        return None
+    fitted = context.search.fit_one(friction, FIRST_ITERATIONS)
+    return remove_idle_effects(context, fitted) if is_explained(context, fitted) else None
 
 
 def _find_soft_friction(context: SearchContext) -> FitStart | None:

@@ -49,8 +49,8 @@ from bench.diagnosis.prediction_error.competing_models import (
 )
 from bench.diagnosis.prediction_error.dry_friction_fits import (
     check_fit,
-    check_selection,
     check_simple_friction,
+    compare_friction_forms,
     fit_dry_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
@@ -198,7 +198,7 @@ class PredictionErrorSearch(EffectSearch):
         (elastic or slack transmissions). If no effect was accepted, the selected set is fitted
         whole.
 
-        The functions named ``check_`` return nothing; they end the search by raising
+        The functions named ``check_``, and `compare_friction_forms`, end the search by raising
         `SoftFrictionError` if dry friction is likelier in MuJoCo's soft form.
 
         Raises:
@@ -212,8 +212,7 @@ class PredictionErrorSearch(EffectSearch):
             if is_explained(context, best_single):
                 return best_single
         selected = context.columns.select()
-        if not self.is_form_given:
-            check_selection(context, selected)
+        stiff_friction = None if self.is_form_given else compare_friction_forms(context, selected)
         # The linear model jumps where servos reach their limits, so the selection is not reliable.
         has_jumps = bool(context.filters.base.runs.jumps.any())
         if has_jumps and not best_single.effects:
@@ -223,7 +222,7 @@ class PredictionErrorSearch(EffectSearch):
         self.identified = self._identify_servos(selected)
         if self.identified is not None:
             return self.identified.model
-        friction = fit_dry_friction(context, selected)
+        friction = stiff_friction or fit_dry_friction(context, selected)
         best = friction
         if not is_explained(context, best):
             # Friction of the wrong form leaves a small residual, which many effects would imitate.
