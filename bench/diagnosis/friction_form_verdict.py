@@ -93,7 +93,14 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
 
 
 def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> bool:
-    """Return whether a robot model with dry friction is likelier with MuJoCo's soft form.
+    """Return whether `refit_if_likelier_soft` finds a likelier model; arguments as there."""
+    return refit_if_likelier_soft(models, model, margin) is not None
+
+
+def refit_if_likelier_soft(
+    models: ModelSet, model: FittedModel, margin: float
+) -> FittedModel | None:
+    """Refit a robot model in MuJoCo's soft form of dry friction, and return it if it is likelier.
 
     The dry friction may be an effect or a free number.
 
@@ -101,12 +108,15 @@ def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> boo
         models: Models with stiff friction, with their noise and frozen parameters.
         model: One of these models, fitted.
         margin: Minimum gain in twice the log-likelihood.
+
+    Returns:
+        The model with soft friction; None if stiff friction is kept.
     """
     if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
-        return False
+        return None
     soft_evaluator = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
     try:
-        return choose_friction_form(models, model, soft_evaluator, margin) is not None
+        return choose_friction_form(models, model, soft_evaluator, margin)
     finally:
         soft_evaluator.close()
 

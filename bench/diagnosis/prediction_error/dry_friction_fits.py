@@ -13,6 +13,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
     is_likelier_soft,
+    refit_if_likelier_soft,
     replace_by_stateless_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
@@ -32,6 +33,8 @@ FIRST_ITERATIONS = 5
 """Maximum number of steps of the first fit of dry friction."""
 
 
+MIN_LEAD = 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+"""Minimum lead in log-likelihood of soft dry friction over another model, both by filters."""
 MIN_LEAD_SHARE = 0.1
 """Minimum lead in log-likelihood of soft dry friction over a model that does not explain the runs.
 
@@ -43,8 +46,8 @@ class SoftFrictionError(Exception):
     """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
 
     Attributes:
-        start: the model whose filter shows this; None if a simulation does.
-        is_preliminary: whether only filters show this, before any fit.
+        start: the model that shows this; None if it is the present one.
+        is_preliminary: whether this is found before other effects than friction are fitted.
     """
 
     def __init__(self, start: FitStart | None = None, is_preliminary: bool = False) -> None:
@@ -58,8 +61,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
     MuJoCo simulates dry friction with a compliant constraint ("soft form"), so that joints creep;
     the other form ("stiff") lets them stick. The form decides about the simulator of the whole
     search, so it is tested before anything but dry friction is fitted. Stiff friction is simulated:
-    that of the selection, and that at the joint where soft friction would act. Otherwise,
-    log-likelihoods of filters are compared. Soft friction is not considered if another effect at
+    that of the selection, and that at the joint where soft friction would act. If filters find soft
+    friction likelier, this is simulated too. Soft friction is not considered if another effect at
     the joint promises more.
 
     Args:
@@ -75,10 +78,11 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
     filters = context.filters
     if filters.is_soft or not filters.base.has_missing_force:
         return None
-    selected_friction = make_dry_friction_start(context, selected)
-    stiff_friction = _fit_if_explains(context, selected_friction)
-    if stiff_friction is not None:
-        return stiff_friction
+    friction = make_dry_friction_start(context, selected)
+    if friction.effects:
+        stiff_friction = context.search.fit_one(friction, FIRST_ITERATIONS)
+        if is_explained(context, stiff_friction):
+            return remove_idle_effects(context, stiff_friction)
     soft_start = _find_soft_friction(context)
     if soft_start is None:
         return None
@@ -87,26 +91,23 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
     # Another effect at the joint that promises more is fitted first.
     if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
         return None
-    if soft_start.effects != selected_friction.effects:
-        stiff_friction = _fit_if_explains(context, soft_start)
-        if stiff_friction is not None:
-            return stiff_friction
-    if _is_far_less_likely(context, selected, soft_log_likelihood):
-        raise SoftFrictionError(soft_start, is_preliminary=True)
-    useful_selection = drop_surplus_effects(context, selected)
-    log_likelihood = filters.log_likelihood(
-        context.columns.start(useful_selection.groups, useful_selection.coefficients).theta
+    if soft_start.effects != friction.effects:
+        stiff_friction = context.search.fit_one(soft_start, FIRST_ITERATIONS)
+        if is_explained(context, stiff_friction):
+            return remove_idle_effects(context, stiff_friction)
+    if not _is_far_less_likely(context, selected, soft_log_likelihood):
+        useful_selection = drop_surplus_effects(context, selected)
+        start = context.columns.start(useful_selection.groups, useful_selection.coefficients)
+        log_likelihood = filters.log_likelihood(start.theta)
+        if not soft_log_likelihood > log_likelihood + MIN_LEAD:
+            return None
+    # Filters are linear, so simulations of both forms decide.
+    soft_friction = refit_if_likelier_soft(
+        context.search, stiff_friction, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
     )
-    check_filter(context, log_likelihood, is_preliminary=True)
+    if soft_friction is not None:
+        raise SoftFrictionError(soft_friction.fit.make_start(), is_preliminary=True)
     return None
-
-
-def _fit_if_explains(context: SearchContext, friction: FitStart) -> FittedModel | None:
-    """Return dry friction fitted in the stiff form if it explains the runs, else None."""
-    if not friction.effects:
-        return None
-    fitted = context.search.fit_one(friction, FIRST_ITERATIONS)
-    return remove_idle_effects(context, fitted) if is_explained(context, fitted) else None
 
 
 def _find_soft_friction(context: SearchContext) -> FitStart | None:
@@ -158,15 +159,12 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
     return context.filters.log_likelihood(first.theta) < limit
 
 
-def check_filter(
-    context: SearchContext, log_likelihood: float, is_preliminary: bool = False
-) -> None:
+def check_filter(context: SearchContext, log_likelihood: float) -> None:
     """Raise `SoftFrictionError` if soft dry friction is likelier than a model with its filter.
 
     Args:
         context: search, filters and regressions of the recording.
         log_likelihood: log-likelihood of the filter.
-        is_preliminary: whether nothing has been fitted yet.
 
     Raises:
         SoftFrictionError: soft friction is likelier.
@@ -175,8 +173,8 @@ def check_filter(
     if soft_start is None:
         return
     soft_log_likelihood = context.filters.log_likelihood(soft_start.theta, is_soft=True)
-    if soft_log_likelihood > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
-        raise SoftFrictionError(soft_start, is_preliminary)
+    if soft_log_likelihood > log_likelihood + MIN_LEAD:
+        raise SoftFrictionError(soft_start)
 
 
 def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
