@@ -233,10 +233,11 @@ class BroydenSearch:
     def _update_slope(self, step: Array, change: Array) -> None:
         """Correct the slope B by Broyden's update, B + (y - B s) s^T / (s^T s) (3).
 
-            Then B explains the last step: `step` s (dim,) is the difference of two points and
-            `change` y
-        (dim,) that of their estimates h.
-            A step of length zero is ignored.
+        Then B explains the last step. A step of length zero is ignored.
+
+        Args:
+            step: (dim,) s, the difference of two points.
+            change: (dim,) y, the difference of the network's estimates h at these points.
         """
         square = step @ step
         if square > 0.0:

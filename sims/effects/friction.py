@@ -286,7 +286,10 @@ class DirectionalViscousFriction(Force):
 
 
 def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
-    """Return the smaller of two opposing forces (L, 1); zero where they do not oppose.
+    """Return the smaller magnitude of two opposing forces (L, 1); zero where they do not oppose.
+
+    As in MuJoCo's equation of motion, M a = drive - external_load, forces of equal signs oppose
+    each other.
 
     Shapes: L batch elements.
 

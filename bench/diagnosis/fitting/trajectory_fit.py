@@ -366,7 +366,9 @@ class TrajectoryFitter:
     ) -> None:
         """Compute new derivatives for the fits whose present ones predict steps poorly.
 
-        Others continue with Broyden's updates, which need no simulations.
+        Others continue with Broyden's updates, which need no simulations. Derivatives by initial
+        states are those of the base model, which all models share, until a fit needs its own
+        (`needs_own_state_jacobian`).
 
         Shapes: R runs, T samples, C channels.
 

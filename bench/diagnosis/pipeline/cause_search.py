@@ -49,9 +49,11 @@ class CauseSearch:
     def search(self, base: BaseModel) -> SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
 
-        A search ends with `SoftFrictionError` if it finds the soft form likelier. If only filters
-        showed this before any fit (`is_preliminary`) and the soft search explains nothing, the
-        search is made with stiff friction after all, without asking for the form again.
+        A search ends with `SoftFrictionError` if it finds the soft form likelier. There are three
+        outcomes: the search ends with stiff friction; it is repeated with soft friction, whose
+        result counts; or, if the soft form was chosen before other effects were fitted
+        (`is_preliminary`) and then explains nothing, it is repeated with stiff friction after all,
+        without asking for the form again.
 
         Args:
             base: the fitted base model.

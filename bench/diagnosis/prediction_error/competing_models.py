@@ -576,11 +576,13 @@ def _confirm(
 ) -> FitStart | None:
     """Return a start with a competing model that may be as good as the best one, else None.
 
-    The regression is linear. If it puts the competing model within `COMPETING_MODEL_MARGIN` of the
-    best one, the start is returned at once. So is a payload, whose response is far from linear in
-    its place. If not, simulations or a filter decide. Simulations of an effect with one coefficient
-    are faster, and show more if the best model explains the runs. A filter does not follow late
-    readings, so simulations decide about delays and lags.
+    - The start is returned at once if the regression puts the competing model within
+      `COMPETING_MODEL_MARGIN` of the best one. So is a payload, whose response is far from linear
+      in its place.
+    - Simulations decide about delays and lags, because a filter does not follow late readings; and
+      about an effect with one coefficient if the best model explains the runs, because they are
+      faster and show more then.
+    - A filter decides about all others.
 
     Args:
         context: search, filters and regressions of the recording.

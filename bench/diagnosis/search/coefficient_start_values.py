@@ -337,8 +337,9 @@ def _shift_frequency_or_time(
 ) -> Iterator[float]:
     """Yield shifted values of a frequency, a period or an event time.
 
-    Frequencies and periods are shifted by fractions of a cycle over the recording, and event times
-    by samples: about the distance of neighbouring local minima.
+    The shifts are about the distance of neighbouring local minima: event times are shifted by
+    samples, frequencies by fractions of a cycle over the longest run, and periods, which are
+    lengths of travel of a joint, by fractions of a cycle over its largest travel.
 
     Args:
         evaluator: evaluator, whose longest run determines how far a frequency is shifted.
@@ -350,6 +351,7 @@ def _shift_frequency_or_time(
     if is_instant(parameter):
         for samples in EVENT_TIME_SHIFTS_SAMPLES:
             yield value + samples * evaluator.sample_interval
+        return
     for cycles in FREQUENCY_SHIFTS_CYCLES:
         if parameter.unit == "Hz":
             yield value + cycles / evaluator.longest_duration

@@ -407,14 +407,16 @@ class ScoredModelSet(ModelSet):
         """Return the p-value of the gain of a model with more effects.
 
         A small value means that the smaller model lacks an effect. The null hypothesis is that it
-        lacks none. The surrogates have the spectrum of the larger model's residual, which is closer
-        to pure noise.
+        lacks none. Surrogates of the noise have the spectrum of a residual. That of the smaller
+        model contains what an effect explains, so it makes large gains seem likely. If its p-value
+        does not decide, the residual of the larger model is used, which is closer to pure noise.
 
         Args:
             model: model with fewer effects.
             larger: model with more effects.
         """
         gain = larger.likelihood.value - model.likelihood.value
+        # The given model may be a refit, while the scores belong to the fit of the search.
         model = self.models[frozenset(model.effects)]
         first = self.compute_gain_p_value(self.score_missing_effects(model), larger, gain)
         # Such a gain is significant whatever the spectrum of the surrogates.

@@ -232,6 +232,8 @@ def _compute_interpolation_error(times: Array, values: Array, stride: int) -> fl
 def _thin_run(run: Run, stride: int) -> Run:
     """Keep every k-th sample of a run, and average its inputs from each one to the next.
 
+    Inputs that are interpolated linearly between samples are not averaged.
+
     Args:
         run: recorded run: times, channels and inputs.
         stride: the number k.

@@ -569,7 +569,8 @@ class ColumnAssigner:
     ) -> None:
         """Assign a column as command of an actuator, or report that the quantity is wrong.
 
-        A motor takes a torque or force, a servo a position or velocity.
+        A motor takes a torque or force, a servo a position or velocity. A column for a motor that
+        does not state its quantity is taken as a position if it looks like the recorded positions.
 
         Args:
             column: column of the log.
@@ -587,21 +588,22 @@ class ColumnAssigner:
             given_quantity = "position"
         name = f"u.{actuator.name}"
         if expected is not None and given_quantity is not None and given_quantity != expected:
-            words = {"force": "torque" if joint.kind == "hinge" else "force"}
-            given_words, expected_quantity = (
-                words.get(word, word) for word in (given_quantity, expected)
+            force_name = "torque" if joint.kind == "hinge" else "force"
+            given_name, expected_name = (
+                force_name if quantity == "force" else quantity
+                for quantity in (given_quantity, expected)
             )
             self._result.leave_out(
                 column,
-                f"is a desired {given_words} of {joint.name}, and {actuator.name} takes a "
-                f"{expected_quantity}",
+                f"is a desired {given_name} of {joint.name}, and {actuator.name} takes a "
+                f"{expected_name}",
             )
         elif actuator.kind == "motor":
             self._assign_force(column, joint, name, placement)
         elif actuator.kind == "position":
             signal = self._make_position_signal(column, joint, placement)
             self._add_signal(self._signals.inputs, name, column, signal)
-        else:
+        else:  # a velocity servo
             si_unit = f"{joint.unit}/s"
             unit = column.unit if is_convertible(column.unit, si_unit) else si_unit
             signal = Signal(column, unit, placement, f"; in {unit}")

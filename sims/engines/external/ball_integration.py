@@ -297,7 +297,8 @@ class BallRollout:
     def _time_to_ground(self) -> float:
         """Return the seconds until the ball meets the ground with its present acceleration.
 
-        It is 0 on the ground and inf if the ball never meets it.
+        It is 0 for a ball on the ground that moves down, and inf for one that rests on it, or
+        never meets it.
 
         From height H with upward speed u and upward acceleration l, it is (u + r) / -l = 2 H / (r -
         u), r = sqrt(u^2 - 2 l H) (5); the form without cancellation is used.
@@ -307,7 +308,7 @@ class BallRollout:
         lift = self.a[2]
         discriminant = rate * rate - 2.0 * lift * gap
         # (5): of the two forms, the one without cancellation is used.
-        if rate > 0.0 or (rate == 0.0 and lift < 0.0):
+        if rate > 0.0 or (rate == 0.0 and lift < 0.0):  # It rises first, or begins to fall.
             return (rate + math.sqrt(discriminant)) / -lift if lift < 0.0 else math.inf
         if discriminant < 0.0 or (rate == 0.0 and lift >= 0.0):
             return math.inf

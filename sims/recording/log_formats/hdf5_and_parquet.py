@@ -46,14 +46,14 @@ def make_unreadable_error(path: Path, error: Exception) -> InputError:
 
 
 def is_numeric_type(kind: Any) -> bool:
-    """Return whether columns of a pyarrow type hold numbers, times or lists of them."""
+    """Return whether columns of a pyarrow type hold numbers, booleans, times or lists of them."""
     import pyarrow
 
     if _is_list(kind):
         kind = kind.value_type
     types = pyarrow.types
-    numeric = types.is_integer, types.is_floating, types.is_timestamp, types.is_boolean
-    return any(is_one(kind) for is_one in numeric)
+    predicates = types.is_integer, types.is_floating, types.is_timestamp, types.is_boolean
+    return any(predicate(kind) for predicate in predicates)
 
 
 def _is_list(kind: Any) -> bool:
