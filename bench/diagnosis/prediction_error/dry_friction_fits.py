@@ -106,7 +106,9 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         context.search, stiff_friction, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
     )
     if soft_friction is not None:
-        raise SoftFrictionError(soft_friction.fit.make_start(), is_preliminary=True)
+        lead = soft_friction.likelihood.value - stiff_friction.likelihood.value
+        if is_explained(context, soft_friction) or lead > _compute_margin(context, stiff_friction):
+            raise SoftFrictionError(soft_friction.fit.make_start(), is_preliminary=True)
     return None
 
 
@@ -203,9 +205,7 @@ def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
 def check_fit(context: SearchContext, model: FittedModel) -> None:
     """Raise `SoftFrictionError` if a fitted model is likelier with soft dry friction.
 
-    It is refitted with the same effects in the soft form. A model that leaves more than noise
-    changes its likelihood a lot with any law, so the soft form must also gain a share of what the
-    model gains over the base model.
+    It is refitted with the same effects in the soft form.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -214,12 +214,21 @@ def check_fit(context: SearchContext, model: FittedModel) -> None:
     Raises:
         SoftFrictionError: the soft form is likelier.
     """
-    margin = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-    if not is_nearly_explained(context, model):
-        gain = model.likelihood.value - context.search.base_model.likelihood.value
-        margin = max(margin, MIN_LEAD_SHARE * gain)
-    if is_likelier_soft(context.search, model, margin):
+    if is_likelier_soft(context.search, model, _compute_margin(context, model)):
         raise SoftFrictionError
+
+
+def _compute_margin(context: SearchContext, model: FittedModel) -> float:
+    """Return by how much soft friction must be likelier than a model, in twice the log-likelihood.
+
+    A model that leaves more than noise changes its likelihood a lot with any law, so the soft form
+    must then gain a share of what the model gains over the base model.
+    """
+    margin = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    if is_nearly_explained(context, model):
+        return margin
+    gain = model.likelihood.value - context.search.base_model.likelihood.value
+    return max(margin, MIN_LEAD_SHARE * gain)
 
 
 def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:

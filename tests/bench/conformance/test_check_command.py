@@ -66,12 +66,12 @@ def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(name, expect
 def test_simulators_and_effects_are_checked_by_name():
     said = checked("drag.linear")
     assert said.splitlines()[-1] == (
-        "effect drag.linear (sims.effects.drag.LinearDrag): all 10 checks passed",
+        "effect drag.linear (sims.effects.drag.LinearDrag): all 10 checks passed"
     )
     said = checked("slider")
     assert said.splitlines()[-1] == (
-        "simulator slider (sims.systems.slider.Slider): all 10 checks passed, 4 not applicable",
-    )  # fmt: skip
+        "simulator slider (sims.systems.slider.Slider): all 10 checks passed, 4 not applicable"
+    )
     said = checked("spring", *SPRING)
 
 
