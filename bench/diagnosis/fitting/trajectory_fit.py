@@ -669,10 +669,11 @@ class TrajectoryFitter:
 
     def _compute_run_costs(self, simulated: Array, states: Array, sample_mask: Mask) -> Array:
         """Return the part of each run (R,) in the cost; arguments as those of `_compute_cost`."""
-        residual = self._compute_residual(simulated, sample_mask)
-        whitened = whiten(residual, sample_mask, self.noise)
         deviation = self._compute_state_deviation(states)
-        squares = np.square(whitened).sum(axis=(1, 2)) + np.square(deviation).sum(axis=1)
+        with np.errstate(all="ignore"):
+            residual = self._compute_residual(simulated, sample_mask)
+            whitened = whiten(residual, sample_mask, self.noise)
+            squares = np.square(whitened).sum(axis=(1, 2)) + np.square(deviation).sum(axis=1)
         # An abandoned batch element is NaN, which cannot be compared.
         costs: Array = np.where(np.isfinite(squares), squares, np.inf)
         return costs

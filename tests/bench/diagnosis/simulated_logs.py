@@ -63,7 +63,8 @@ def describe(units, noise=None, more="", model="arm"):
 
     Args:
         units: unit of each signal by its name; names of inputs begin with ``u.``.
-        noise: standard deviation of the noise of all channels, or None.
+        noise: standard deviation of the noise of all channels, or of each by its name; None if it
+            is not stated.
         more: further tables.
         model: name of the model file; without a suffix, that of an MJCF.
     """
@@ -71,5 +72,6 @@ def describe(units, noise=None, more="", model="arm"):
     for name, unit in units.items():
         is_input = name.startswith("u.")
         lines += [f'[{"inputs" if is_input else "channels"}."{name}"]', f'unit = "{unit}"']
-        lines += [] if is_input or noise is None else [f"noise = {noise}"]
+        channel_noise = noise.get(name) if isinstance(noise, dict) else noise
+        lines += [] if is_input or channel_noise is None else [f"noise = {channel_noise}"]
     return "\n".join([*lines, more])

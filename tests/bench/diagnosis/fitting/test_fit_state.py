@@ -1,5 +1,7 @@
 """Tests of Jacobians that serve for several steps: their updates and their renewal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,33 @@ def test_what_has_converged_with_derivatives_of_another_point_is_not_believed():
     there.has_own_jacobian = True
     there.mark_converged()
     assert there.is_finished
+
+
+@pytest.mark.parametrize(
+    ("mean_square", "can_stick", "own_cost", "asks"),
+    [
+        pytest.param(2.0, True, np.inf, True, id="sticks"),
+        pytest.param(2.0, False, np.inf, False, id="cannot stick"),
+        pytest.param(1.0, True, np.inf, False, id="leaves only noise"),
+        pytest.param(20.0, True, np.inf, False, id="is very far"),
+        pytest.param(2.0, True, 200.0, False, id="has them at this cost"),
+    ],
+)
+def test_a_fit_of_sticking_joints_asks_for_derivatives_of_its_own(
+    mean_square, can_stick, own_cost, asks
+):
+    state = problem(TRUE)
+    state.sample_count = 100
+    state.point = replace(state.point, cost=100 * mean_square)
+    state.can_stick, state.own_state_cost = can_stick, own_cost
+    state.mark_converged()
+    assert (state.needs_own_state_jacobian, state.is_jacobian_stale) == (asks, asks)
+    assert state.is_finished is not asks
+    state.is_finished = state.is_jacobian_stale = False
+    state.predicted_decrease = 50.0
+    state.reject_step()
+    assert state.is_jacobian_stale is asks
+    assert not state.is_finished
 
 
 def test_known_derivatives_follow_the_parameters_that_they_are_by():
