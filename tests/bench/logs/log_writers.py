@@ -26,6 +26,7 @@ RATE = 100.0
 START = 1.7e9  # A clock of robots counts from 1970, s.
 NANO = 1_000_000_000
 NOISE = 2e-4  # Standard deviation of the positions, rad.
+LATENCY = 0.003  # Time from the stamp of a joint state to its writing, s.
 
 
 def motion(run, count=200):
@@ -43,6 +44,12 @@ def motion(run, count=200):
         for _ in range(round(1 / RATE / model.opt.timestep)):
             mujoco.mj_step(model, data)
     return times, q + NOISE * rng.standard_normal(q.shape), u
+
+
+def motion_with_rates(run, count):
+    """Return times (T,), positions, their derivatives and commands (T, 2) of a run."""
+    times, q, u = motion(run, count)
+    return times, q, np.gradient(q, times, axis=0), u
 
 
 def _frame(run, count):
@@ -118,69 +125,106 @@ def write_torch(folder, run, count):
     torch.save({"time": times, "obs": {"q": q}, "target": u}, folder / f"run{run}.pt")
 
 
-def write_lerobot(folder, run, count):
-    """Add an episode to a dataset of version 2.1, in degrees."""
+def make_episode(number, times, positions, commands):
+    """Return the rows of an episode of a LeRobot dataset."""
     import pandas
 
+    return pandas.DataFrame(
+        {
+            "action": list(commands.astype(np.float32)),
+            "observation.state": list(positions.astype(np.float32)),
+            "timestamp": times.astype(np.float32),
+            "frame_index": np.arange(times.size),
+            "episode_index": np.full(times.size, number),
+        }
+    )
+
+
+def make_dataset_folder(folder, version, joints=JOINTS, rate=RATE):
+    """Write the description of a LeRobot dataset; return the folder of its rows.
+
+    Args:
+        folder: folder of the dataset.
+        version: version of the format, such as ``2.1``.
+        joints: names of the joints, or None if the dataset does not name them.
+        rate: number of rows per second.
+    """
     data = folder / "data" / "chunk-000"
     data.mkdir(parents=True, exist_ok=True)
     (folder / "meta").mkdir(exist_ok=True)
-    names = [f"{joint}.pos" for joint in JOINTS]
-    features = {name: {"names": names} for name in ("action", "observation.state")}
-    about = {"codebase_version": "v2.1", "fps": RATE, "features": features}
+    names = joints and [f"{joint}.pos" for joint in joints]
+    features = {"action": {"names": names}, "observation.state": {"names": {"motors": names}}}
+    about = {"codebase_version": f"v{version}", "fps": rate, "features": features}
     (folder / "meta" / "info.json").write_text(json.dumps(about))
+    return data
+
+
+def write_lerobot(folder, run, count):
+    """Add an episode to a dataset of version 2.1, in degrees."""
+    data = make_dataset_folder(folder, "2.1")
     times, q, u = motion(run, count)
-    pandas.DataFrame(
-        {
-            "action": list(np.degrees(u).astype(np.float32)),
-            "observation.state": list(np.degrees(q).astype(np.float32)),
-            "timestamp": times.astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, run),
-        }
-    ).to_parquet(data / f"episode_{run:06d}.parquet")
+    rows = make_episode(run, times, np.degrees(q), np.degrees(u))
+    rows.to_parquet(data / f"episode_{run:06d}.parquet")
 
 
-def _write_ros(path, run, count, storage):
+def make_stamp(types, seconds):
+    """Return a time stamp of ROS."""
+    return types.types["builtin_interfaces/msg/Time"](*split_seconds(seconds))
+
+
+def split_seconds(seconds):
+    """Return whole seconds and the remaining nanoseconds."""
+    return int(seconds), round(math.fmod(seconds, 1.0) * NANO)
+
+
+def write_bag(path, storage, make_messages):
+    """Write a bag: a file of ROS 1 for the storage "bag", otherwise a folder of ROS 2.
+
+    Args:
+        path: path of the bag.
+        storage: storage format.
+        make_messages: function from the message types to topics, times of writing (s) and messages.
+    """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    store = Stores.ROS1_NOETIC if storage == "bag" else Stores.ROS2_JAZZY
-    types = get_typestore(store)
     plugins = {"mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}
-    writer = (
-        Writer1(path)
-        if storage == "bag"
-        else Writer(path, version=9, storage_plugin=plugins[storage])
-    )
-    made = {
-        name: types.types[f"{package}/msg/{name}"]
-        for package, name in (
-            ("builtin_interfaces", "Time"), ("std_msgs", "Header"), ("sensor_msgs", "JointState"),
-            ("std_msgs", "Float64MultiArray"), ("std_msgs", "MultiArrayLayout"),
-        )
-    }  # fmt: skip
-    times, q, u = motion(run, count)
+    if storage == "bag":
+        types, writer = get_typestore(Stores.ROS1_NOETIC), Writer1(path)
+    else:
+        types = get_typestore(Stores.ROS2_JAZZY)
+        writer = Writer(path, version=9, storage_plugin=plugins[storage])
+    encode = types.serialize_ros1 if storage == "bag" else types.serialize_cdr
     with writer:
         topics = {}
-        for t, position, command in zip(times, q, u, strict=True):
+        for topic, seconds, message in make_messages(types):
+            kind = message.__msgtype__
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=types)
+            writer.write(topics[topic], round(seconds * NANO), encode(message, kind))
+
+
+def _write_ros(path, run, count, storage):
+    """Write joint states that have stamps, and commands and notes that do not.
+
+    The second joint comes first, as in many drivers, and states are written after their stamps.
+    """
+
+    def make_messages(types):
+        names = ("Header", "String", "Float64MultiArray", "MultiArrayLayout")
+        header, note, numbers, layout = (types.types[f"std_msgs/msg/{name}"] for name in names)
+        state = types.types["sensor_msgs/msg/JointState"]
+        extra = {"seq": 0} if storage == "bag" else {}
+        for t, q, v, u in zip(*motion_with_rates(run, count), strict=True):
             seconds = START + t
-            sec = int(seconds)
-            stamp = made["Time"](sec, round((seconds - sec) * NANO))
-            extra = {"seq": 0} if storage == "bag" else {}
-            header = made["Header"](stamp=stamp, frame_id="", **extra)
-            nothing = np.array([])
-            state = made["JointState"](
-                header, ["knee", "hip"], position[::-1].copy(), nothing, nothing
-            )
-            target = made["Float64MultiArray"](made["MultiArrayLayout"]([], 0), command)
-            for topic, message in (("/joint_states", state), ("/commands", target)):
-                kind = message.__msgtype__
-                if topic not in topics:
-                    topics[topic] = writer.add_connection(topic, kind, typestore=types)
-                encode = types.serialize_ros1 if storage == "bag" else types.serialize_cdr
-                writer.write(topics[topic], round(seconds * NANO), encode(message, kind))
+            head = header(stamp=make_stamp(types, seconds), frame_id="", **extra)
+            there = state(head, ["knee", "hip"], q[::-1].copy(), v[::-1].copy(), np.array([]))
+            yield "/joint_states", seconds + LATENCY, there
+            yield "/hardware/commands", seconds, numbers(layout([], 0), u)
+        yield "/note", START, note("begun")
+
+    write_bag(path, storage, make_messages)
 
 
 def write_ros1(folder, run, count):
@@ -195,26 +239,82 @@ def write_db3(folder, run, count):
     _write_ros(folder / f"run{run}", run, count, "db3")
 
 
-def write_json(folder, run, count):
+def write_json_topics(path, messages):
+    """Write topics, times of writing (s) and messages, of which texts are JSON already."""
     from mcap.writer import Writer
 
-    times, q, u = motion(run, count)
-    with (folder / f"run{run}.mcap").open("wb") as file:
+    with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        for t, position, command in zip(times, q, u, strict=True):
-            seconds = START + t
-            stamp = {"sec": int(seconds), "nsec": round(math.fmod(seconds, 1.0) * NANO)}
-            message = {"timestamp": stamp, "name": list(JOINTS), "position": position.tolist()}
-            message["command"] = command.tolist()
-            written = round(seconds * NANO)
-            writer.add_message(channel, written, json.dumps(message).encode(), written)
+        schema, topics = writer.register_schema("state", "jsonschema", b"{}"), {}
+        for topic, seconds, message in messages:
+            if topic not in topics:
+                topics[topic] = writer.register_channel(topic, "json", schema)
+            text = message if isinstance(message, str) else json.dumps(message)
+            stamp = round(seconds * NANO)
+            writer.add_message(topics[topic], stamp, text.encode(), stamp)
         writer.finish()
 
 
+def _iterate_json(run, count, has_objects):
+    """Yield joint states, as parallel lists or as a list of objects with names, and commands."""
+    for t, q, v, u in zip(*motion_with_rates(run, count), strict=True):
+        sec, nsec = split_seconds(START + t)
+        message = {"timestamp": {"sec": sec, "nsec": nsec}}
+        numbers = {"position": q[::-1].tolist(), "velocity": v[::-1].tolist()}
+        if has_objects:
+            parts = zip(JOINTS[::-1], *numbers.values(), strict=True)
+            keys = ("name", *numbers)
+            message["joints"] = [dict(zip(keys, part, strict=True)) for part in parts]
+        else:
+            message |= {"name": JOINTS[::-1], "note": "x", **numbers}
+        yield "/joint_states", START + t + LATENCY, message
+        yield "commands", START + t, {"cmd": dict(zip(JOINTS, u, strict=True))}
+
+
+def write_json(folder, run, count):
+    write_json_topics(folder / f"run{run}.mcap", _iterate_json(run, count, has_objects=False))
+
+
+def write_json_objects(folder, run, count):
+    write_json_topics(folder / f"run{run}.mcap", _iterate_json(run, count, has_objects=True))
+
+
 def write_protobuf(folder, run, count):
+    """Write joint states of an own type, with repeated fields and a stamp."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from mcap_protobuf.writer import Writer
+
+    file = descriptor_pb2.FileDescriptorProto(name="states.proto", package="t", syntax="proto3")
+    kinds = descriptor_pb2.FieldDescriptorProto
+    fields = {
+        "Stamp": {"seconds": kinds.TYPE_INT64, "nanos": kinds.TYPE_INT32},
+        "State": {
+            "stamp": kinds.TYPE_MESSAGE, "on": kinds.TYPE_BOOL, "name": kinds.TYPE_STRING,
+            "position": kinds.TYPE_DOUBLE, "velocity": kinds.TYPE_DOUBLE, "cmd": kinds.TYPE_DOUBLE,
+        },
+    }  # fmt: skip
+    for message, members in fields.items():
+        made = file.message_type.add(name=message)
+        for number, (name, kind) in enumerate(members.items(), 1):
+            is_list = kind in (kinds.TYPE_STRING, kinds.TYPE_DOUBLE)
+            label = kinds.LABEL_REPEATED if is_list else kinds.LABEL_OPTIONAL
+            of = ".t.Stamp" if name == "stamp" else None
+            made.field.add(name=name, number=number, type=kind, label=label, type_name=of)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    state = message_factory.GetMessageClass(pool.FindMessageTypeByName("t.State"))
+    with (folder / f"run{run}.mcap").open("wb") as out, Writer(out) as writer:
+        for k, (t, *numbers) in enumerate(zip(*motion_with_rates(run, count), strict=True)):
+            q, v, u = (values[::-1].tolist() for values in numbers)
+            made = state(name=JOINTS[::-1], on=2 * k < count, position=q, velocity=v, cmd=u)
+            made.stamp.seconds, made.stamp.nanos = split_seconds(START + t)
+            written = round((START + t) * NANO)
+            writer.write_message("states", made, written, written)
+
+
+def write_protobuf_values(folder, run, count):
+    """Write lists of values that are numbers or something else, one topic for each."""
     from google.protobuf import struct_pb2
     from mcap_protobuf.writer import Writer
 
@@ -242,9 +342,13 @@ WRITERS = {
     "ros2": write_ros2,
     "db3": write_db3,
     "mcap json": write_json,
+    "mcap json objects": write_json_objects,
     "mcap protobuf": write_protobuf,
+    "mcap protobuf values": write_protobuf_values,
 }
 """Function that writes a run, by format: folder, number of the run, number of samples."""
+WITH_RATES = ("ros1", "ros2", "db3", "mcap json", "mcap json objects", "mcap protobuf")
+"""Formats whose writer also writes velocities."""
 OPTIONS = {
     "robomimic": ("--rate", "100"),
     "lerobot": ("--position-unit", "deg"),
@@ -252,7 +356,8 @@ OPTIONS = {
 """Options of `simgap import` that a format needs."""
 NEEDED = {
     "hdf5": "h5py", "robomimic": "h5py", "torch": "torch", "ros1": "rosbags", "ros2": "rosbags",
-    "db3": "rosbags", "mcap json": "mcap", "mcap protobuf": "mcap_protobuf",
+    "db3": "rosbags", "mcap json": "mcap", "mcap json objects": "mcap",
+    "mcap protobuf": "mcap_protobuf", "mcap protobuf values": "mcap_protobuf",
 }  # fmt: skip
 """Package with which a format is written."""
 

@@ -9,7 +9,15 @@ import pytest
 
 from bench.cli.main import main
 from bench.logs.recording_loading import load_recording
-from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
+from tests.bench.logs.log_writers import (
+    JOINTS,
+    NEEDED,
+    OPTIONS,
+    WITH_RATES,
+    WRITERS,
+    motion_with_rates,
+    write_folder,
+)
 from tests.command_output import run_command
 from tests.malformed_input.input_strategies import log_folders, run_cases
 from tests.malformed_input.malformed_case import tried
@@ -32,11 +40,14 @@ def test_the_numbers_of_a_folder_are_those_that_were_logged(kind, tmp_path):
     recording, _ = load_recording(out, divide=False)
     assert len(recording.runs) == 3
     for number, run in enumerate(recording.runs):
-        times, q, u = motion(number)
+        times, q, v, u = motion_with_rates(number, 200)
         for k, joint in enumerate(JOINTS):
             seen = run.channels[f"q.{joint}"]
             own = np.isfinite(seen)
             np.testing.assert_allclose(seen[own], q[:, k], atol=1e-6)
+            assert (f"qd.{joint}" in run.channels) == (kind in WITH_RATES)
+            if kind in WITH_RATES:
+                np.testing.assert_allclose(run.channels[f"qd.{joint}"][own], v[:, k], atol=1e-6)
             np.testing.assert_allclose(run.inputs[f"u.m_{joint}"][own], u[:, k], atol=1e-6)
         np.testing.assert_allclose(run.times[own] - run.times[own][0], times, atol=1e-6)
 

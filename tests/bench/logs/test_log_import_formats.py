@@ -16,6 +16,7 @@ from bench.logs.importing.joint_order import order_of_commands
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
+from tests.bench.logs.log_writers import make_dataset_folder, make_episode
 from tests.command_output import run_command
 
 CASES = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"
@@ -444,16 +445,8 @@ def test_files_of_the_same_columns_are_runs(arm, tmp_path):
 
 
 def dataset(folder, positions, commands):
-    data = folder / "data" / "chunk-000"
-    data.mkdir(parents=True)
-    (folder / "meta").mkdir()
-    names = [f"{joint}.pos" for joint in JOINTS]
-    features = {name: {"names": names} for name in ("action", "observation.state")}
-    about = {"codebase_version": "v3.0", "fps": 50, "features": features}
-    (folder / "meta" / "info.json").write_text(json.dumps(about))
-    rows = {"action": list(commands), "observation.state": list(positions), "timestamp": TIMES,
-            "episode_index": np.zeros(len(TIMES), dtype=int)}  # fmt: skip
-    pd.DataFrame(rows).to_parquet(data / "file-000.parquet")
+    data = make_dataset_folder(folder, "3.0", JOINTS, 50)
+    make_episode(0, TIMES, positions, commands).to_parquet(data / "file-000.parquet")
     return folder
 
 

@@ -7,7 +7,7 @@ import simgap
 from bench.logs.recording_loading import compute_recording_digest, load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats.log_files import read_log
-from tests.sims.recording.two_joint_arm import ARM
+from tests.bench.logs.log_writers import ARM
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: extra hdf5")
 
