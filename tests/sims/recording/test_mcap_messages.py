@@ -25,6 +25,9 @@ def test_a_file_is_a_folder_of_topics_with_the_names_of_the_joints(kind, topics,
     (tmp_path / "arm.xml").write_text(ARM)
     made = simgap.import_logs([path], tmp_path / "arm.xml", tmp_path / "log.toml")
     assert made.checks == []
+    positions = [line for line in made.guessed if line.startswith("q.")]
+    assert len(positions) == 2
+    assert all("by its name" in line for line in positions)
 
 
 def test_the_stamp_of_a_message_is_its_time_else_that_of_writing(tmp_path):
