@@ -76,17 +76,25 @@ def write_spreadsheet(folder, run, count):
         table.to_csv(file, sep=";", decimal=",", index=False)
 
 
-def write_rostopic(folder, run, count):
-    """Write the tables of ``rostopic echo -p``; joints are sorted the other way round."""
+def write_rostopic(folder, run, count, commanded=JOINTS):
+    """Write the tables of ``rostopic echo -p``; joints are sorted the other way round.
+
+    Args:
+        folder: folder of all runs.
+        run: number of the run.
+        count: number of samples.
+        commanded: joints in the order of their commands, which have no names.
+    """
     own = folder / f"run{run}"
     own.mkdir()
-    times, q, u = motion(run, count)
-    rows = ["%time,field.name0,field.name1,field.position0,field.position1"]
+    states = ["%time", "name0", "name1", "position0", "position1", "velocity0", "velocity1"]
+    rows = [",field.".join(states)]
     commands = ["%time,field.data0,field.data1"]
-    for t, (a, b), (c, d) in zip(times, q, u, strict=True):
+    for t, (a, b), v, u in zip(*motion_with_rates(run, count), strict=True):
         stamp = round((START + t) * NANO)
-        rows.append(f"{stamp},knee,hip,{b:.9f},{a:.9f}")
-        commands.append(f"{stamp},{c:.9f},{d:.9f}")
+        rows.append(f"{stamp},knee,hip,{b:.9f},{a:.9f},{v[1]:.9f},{v[0]:.9f}")
+        sent = (u[JOINTS.index(joint)] for joint in commanded)
+        commands.append(",".join([str(stamp), *(f"{value:.9f}" for value in sent)]))
     (own / "joint_states.csv").write_text("\n".join(rows) + "\n")
     (own / "commands.csv").write_text("\n".join(commands) + "\n")
 
@@ -347,7 +355,9 @@ WRITERS = {
     "mcap protobuf values": write_protobuf_values,
 }
 """Function that writes a run, by format: folder, number of the run, number of samples."""
-WITH_RATES = ("ros1", "ros2", "db3", "mcap json", "mcap json objects", "mcap protobuf")
+WITH_RATES = (
+    *("rostopic", "ros1", "ros2", "db3", "mcap json", "mcap json objects", "mcap protobuf"),
+)
 """Formats whose writer also writes velocities."""
 OPTIONS = {
     "robomimic": ("--rate", "100"),

@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import simgap
@@ -16,6 +15,7 @@ from bench.logs.importing.joint_order import order_of_commands
 from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
+from tests.bench.logs import log_writers
 from tests.bench.logs.log_writers import make_dataset_folder, make_episode
 from tests.command_output import run_command
 
@@ -106,31 +106,17 @@ def right(out, atol=1e-6):
 # -- names and order
 
 
-def rostopic(folder, commands):
-    """Write tables in the format of `rostopic echo -p`."""
-    stamps = np.round((1.7e9 + TIMES) * 1e9).astype(np.int64)
-    names = sorted(JOINTS)
-    places = [JOINTS.index(name) for name in names]
-    states = {"%time": stamps, "field.header.seq": range(200)}
-    states |= {f"field.name{k}": name for k, name in enumerate(names)}
-    states |= {f"field.position{k}": POSITIONS[:, place] for k, place in enumerate(places)}
-    states |= {f"field.velocity{k}": RATES[:, place] for k, place in enumerate(places)}
-    sent = {"%time": stamps, "field.layout.data_offset": 0}
-    sent |= {f"field.data{k}": COMMANDS[:, JOINTS.index(name)] for k, name in enumerate(commands)}
-    pd.DataFrame(states).to_csv(folder / "joint_states.csv", index=False)
-    pd.DataFrame(sent).to_csv(folder / "commands.csv", index=False)
-    return folder
-
-
-@pytest.mark.parametrize("commands", [JOINTS, tuple(sorted(JOINTS)), JOINTS[::-1]])
-def test_joint_names_of_rostopic_are_used_and_commands_follow(commands, arm, tmp_path):
-    log = tmp_path / "run"
-    log.mkdir()
-    made = simgap.import_logs([rostopic(log, commands)], arm, tmp_path / "l.toml")
-    right(tmp_path / "l.toml")
+@pytest.mark.parametrize("commanded", [log_writers.JOINTS, log_writers.JOINTS[::-1]])
+def test_joint_names_of_rostopic_are_used_and_commands_follow(commanded, tmp_path):
+    log_writers.write_rostopic(tmp_path, 0, 200, commanded)
+    (tmp_path / "two.xml").write_text(log_writers.ARM)
+    out = tmp_path / "l.toml"
+    made = simgap.import_logs([tmp_path / "run0"], tmp_path / "two.xml", out)
     assert made.checks == []
-    assert "column field.position.bend, by its name" in "\n".join(made.guessed)
-    np.testing.assert_allclose(channel(tmp_path / "l.toml", "qd.bend"), RATES[:, 2], atol=1e-6)
+    assert "column field.position.knee, by its name" in "\n".join(made.guessed)
+    _, q, u = log_writers.motion(0)
+    np.testing.assert_allclose(channel(out, "q.knee"), q[:, 1], atol=1e-8)
+    np.testing.assert_allclose(inputs(out)["u.m_knee"], u[:, 1], atol=1e-8)
 
 
 def test_an_order_that_nothing_tells_is_said_to_be_a_guess(arm, tmp_path):
