@@ -305,7 +305,7 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
     rng = np.random.default_rng(3)
     effects = ["drag.quadratic", "contact.friction", "restitution.speed"]
     used, new = (Ball(effects=effects, **settings) for _ in range(2))
-    for i in range(200):
+    for i in range(80):
         start = {
             "z": rng.choice([0.5, 0.49, 0.51, 0.519, 0.502, 0.45, 1.0, 4.5]),
             "vx": rng.choice([0.0, 0.0, 0.1, 1.0, 5.0]),

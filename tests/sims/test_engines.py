@@ -330,26 +330,6 @@ def test_a_copy_has_a_world_of_its_own(system, engine, settings, copied):
     np.testing.assert_array_equal(twin.simulate(theta, run), first)
 
 
-@pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize("system", ["pendulum", "slider", "servo"])
-def test_a_used_world_gives_the_same_bits_as_a_new_one(system, engine):
-    rng, kind = np.random.default_rng(5), SIMULATORS[system]
-    chosen = ["drag.linear", "friction.coulomb"]
-    used = kind(engine=engine, effects=chosen)
-    for _ in range(25):
-        count = int(rng.integers(2, 60))
-        run = Scenario(
-            np.cumsum(rng.choice([5e-3, 1e-2, 1.7e-2], size=count)),
-            {name: rng.normal() for name in kind.states},
-            {channel.name: rng.normal(size=count) for channel in kind.inputs},
-        )
-        theta = theta_for(kind, seed=int(rng.integers(1000)))
-        theta = np.concatenate([theta, [rng.choice([0.0, 0.02], size=2)]], axis=1)
-        new = kind(engine=engine, effects=chosen)
-        np.testing.assert_array_equal(used.simulate(theta, run), new.simulate(theta, run))
-        new.close()
-
-
 FINGERPRINT = """
 import hashlib
 from tests.sims.engine_agreement import SIMULATORS, THETA, scenario

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.core.plugin_registries import simulators
-from sims.core.simulator import InputError, Scenario
+from sims.core.simulator import Scenario
 from sims.systems.two_link_arm import TwoLinkArm
 
 pytest.importorskip("pybullet")
@@ -78,24 +78,6 @@ def test_order_in_the_step_is_second():
     np.testing.assert_allclose(orders, 2.0, atol=0.15)
 
 
-def energy(theta, k, states):
-    (q1, q2), w = states[:, :2].T, states[:, 2:]
-    m1, m2, c1, c2 = theta[:4]
-    kinetic = [0.5 * v @ matrix(theta, k, q) @ v for v, q in zip(w, q2, strict=True)]
-    height1, height2 = -c1 * np.cos(q1), -k["length"] * np.cos(q1) - c2 * np.cos(q1 + q2)
-    return np.array(kinetic) + k["gravity"] * (m1 * height1 + m2 * height2)
-
-
-def test_energy_is_kept_without_damping_and_falls_with_it():
-    arm, scenario = TwoLinkArm(), Scenario(np.arange(250) / 50, START)
-    free, rubbing = arm.simulate(np.stack([FREE, RUBBING]), scenario)
-    total = energy(FREE, arm.constant_values, free)
-    swing = total.max() - energy(FREE, arm.constant_values, np.zeros((1, 4)))[0]
-    assert np.ptp(total) < 1e-3 * swing
-    lost = np.diff(energy(RUBBING, arm.constant_values, rubbing))
-    assert lost.max() < 1e-9
-
-
 def test_dry_friction_holds_what_pulls_less():
     theta = FREE.copy()
     theta[6:] = 0.5, 0.5
@@ -115,15 +97,6 @@ def test_a_copy_has_a_world_of_its_own():
     other = copy.deepcopy(arm)
     arm.close()
     np.testing.assert_array_equal(other.simulate(RUBBING[None], scenario), before)
-
-
-def test_what_it_cannot_have_is_refused_by_name():
-    with pytest.raises(
-        InputError, match=r"arm cannot have effect friction\.coulomb: it takes no forces"
-    ):
-        TwoLinkArm(effects=["friction.coulomb"])
-    with pytest.raises(InputError, match="arm steps itself; it has no engine 'mujoco'"):
-        TwoLinkArm(engine="mujoco")
 
 
 def test_without_pybullet_it_is_listed_as_skipped(monkeypatch):
