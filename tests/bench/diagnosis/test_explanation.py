@@ -73,6 +73,8 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
     assert html.startswith("<iframe ")
     assert html.endswith("</iframe>")
     assert html.count("<") == 2, "the report is an attribute, so none of its elements is the cell's"
+    # The frame has another origin, so its code cannot access the notebook.
+    assert 'sandbox="allow-scripts allow-downloads"' in html
     page = unescape(re.search('srcdoc="([^"]*)"', html)[1])
     assert page.startswith("<!DOCTYPE html>")
     assert "90\xa0% of the gap closed" in page

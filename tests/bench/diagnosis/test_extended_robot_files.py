@@ -1,6 +1,5 @@
 """Tests of the model file written next to extended.toml for a robot, and of its score."""
 
-from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from bench.diagnosis.extended_robot_files import (
     build_robot_files,
     collect_causes,
 )
-from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.score_extended import score_model
 from sims.extended_simulator import ExtendedSimulator, FittedValue, get_robot_reference
 from sims.robot.export import round_trip_check
@@ -50,7 +48,7 @@ def arm():
     return make_robot_simulator(EXAMPLE / "arm2.xml")
 
 
-def test_it_is_written_with_the_rest(arm, tmp_path):
+def test_it_is_written_with_the_rest_and_its_changed_lines_are_in_the_report(arm, tmp_path):
     shown = make_report()
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     paths = explanation.write(tmp_path)
@@ -63,21 +61,13 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
     report = paths[-1].read_text()
     assert "Changes of the model file" in report
     assert report.count('<ins class="line">') == 1
-    assert 'frictionloss="0.03"' in unescape(report)
-
-
-def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
-    monkeypatch.setattr(explanation_figures, "render_figures", lambda _: {})
-    shown = replace(make_report(), robot=arm.robot)
-    explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
-    html = (explanation.write(tmp_path)[0].parent / "report.html").read_text()
     before = '<joint name="elbow" type="hinge" axis="0 1 0" damping="0.1" armature="0.005"/>'
-    assert f"− {before}</del>" in unescape(html)
-    assert 'armature="0.005" frictionloss="0.03"' in unescape(html)
-    assert "dry friction is stiff in the file" in html
-    nothing = Explanation(shown.verdict, replace(shown, verdict=make_report("adequate").verdict),
-                          extended_of(arm))  # fmt: skip
-    assert "Changes of the model file" not in nothing._repr_html_()
+    assert f"− {before}</del>" in unescape(report)
+    assert 'armature="0.005" frictionloss="0.03"' in unescape(report)
+    assert "dry friction is stiff in the file" in report
+    nothing = make_report("adequate")
+    explanation = Explanation(nothing.verdict, nothing, extended_of(arm))
+    assert "Changes of the model file" not in explanation._repr_html_()
 
 
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):

@@ -258,11 +258,18 @@ def test_a_parameter_absorbs_what_is_significant(before, after, absorbed):
     assert has_absorbed_gap(p) is absorbed
     assert ("absorbed part of the gap" in said) is absorbed
     assert "(0.0 %)" not in said
-    assert format_shift(replace(p, after=before)) == "unchanged"
 
 
-def test_a_change_that_rounds_to_nothing_is_said_as_such():
-    p = ParameterChange(
-        "inertia", "kg*m^2", (1.0, 0.99999, 1.00001), (1.0001, 1.00009, 1.00011), True
-    )
-    assert format_shift(p) == "changes by less than 0.1 %"
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        (1.0, 1.0, "unchanged"),
+        (1.0, 1.0001, "changes by less than 0.1 %"),
+        (1.0, 1.05, "+5.0 %"),
+        (1.0, 0.9, "−10 %"),
+        (0.0, 0.5, "+0.5 N"),
+    ],
+)
+def test_a_shift_is_relative_unless_it_begins_at_zero(before, after, text):
+    intervals = [(value, value - 0.05, value + 0.05) for value in (before, after)]
+    assert format_shift(ParameterChange("b", "N", *intervals, True)) == text

@@ -10,7 +10,6 @@ from bench.diagnosis.fitting.trajectory_fit import (
     TrajectoryFitter,
     compute_state_prior,
 )
-from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,
@@ -54,23 +53,6 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back():
     assert np.abs(fit.simulated - there.observed)[seen].max() < 1e-3
     assert fit.cost < 60, "sum of squares over 560 samples in units of a noise of 1e-3"
     assert not seen[0, 60:].any()
-
-
-def test_restitution_and_six_initial_states_of_noiseless_bounces():
-    times = np.arange(90) / 60
-    starts = [
-        {"z": 2.0, "vx": 1.0, "vz": 0.5},
-        {"z": 3.0, "y": 0.3, "vy": -0.7},
-    ]
-    there = evaluator(recorded(Ball(observe=["x", "y", "z"]), [0.72], starts, times))
-    fit = fitted(there)
-    assert fit.theta[0] == pytest.approx(0.72, abs=2e-5)
-    # Columns: x, y, z and their rates.
-    expected = [
-        [0, 0, 2, 1, 0, 0.5],
-        [0, 0.3, 3, 0, -0.7, 0],
-    ]
-    np.testing.assert_allclose(fit.initial_states, expected, atol=1e-4)
 
 
 def test_an_effect_is_fitted_with_the_parameters():

@@ -61,12 +61,6 @@ def test_before_and_after_are_both_drawn_where_there_is_an_after(named):
     assert share(adequate, 0xD5, 0x5E, 0x00) > 1e-3
 
 
-def test_without_being_asked_there_are_no_vector_graphics():
-    for png, svg, pdf, _ in render_figures(make_report()).values():
-        assert png.startswith(b"\x89PNG")
-        assert pdf is svg is None
-
-
 def test_figures_are_the_same_again(named):
     with pdf_figures():
         assert render_figures(make_report()) == named

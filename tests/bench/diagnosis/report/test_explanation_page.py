@@ -14,7 +14,6 @@ from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.pipeline.report_data_builder import _read_track_figure
 from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
 from bench.figures.figure_output import FigureFiles
-from bench.pages.html_page import make_iframe
 from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
 from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, HELD_OUT, TILT, evil, make_report
@@ -294,16 +293,6 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figure
     )
     for more in ({"thorough": True}, {"held_out": None}):
         assert "--thorough" not in Reader(render_report(replace(partial, **more), figures)).text
-
-
-def test_in_a_frame_the_page_stays_whole(figures):
-    html = render_report(evil(), figures)
-    reader = Reader(make_iframe(html))
-    attributes = {name: value for _, name, value in reader.attributes}
-    assert reader.tags == ["iframe"]
-    assert attributes["srcdoc"] == html
-    # The frame has another origin, so its code cannot access the notebook.
-    assert attributes["sandbox"] == "allow-scripts allow-downloads"
 
 
 def test_what_the_recording_can_fix_comes_before_any_verdict(figures):

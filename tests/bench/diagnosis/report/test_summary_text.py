@@ -1,5 +1,4 @@
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,16 +14,14 @@ from bench.diagnosis.report.effect_and_unit_text import (
     format_unit,
     joined,
 )
-from bench.diagnosis.report.report_data import ChannelInfo, DataSplit, ParameterChange
+from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
 from bench.diagnosis.report.summary_text import (
     compute_detectable_gap,
     format_gain,
     format_gain_and_caveats,
     format_headline,
-    format_shift,
     format_summary,
     get_held_out_unit,
-    has_absorbed_gap,
 )
 from tests.bench.diagnosis.sample_report_data import (
     DRAG,
@@ -198,17 +195,6 @@ def test_parameters_tell_what_they_had_absorbed():
     )
     assert "it had absorbed part of the gap" in said
     assert "restitution does not influence these data and stays at its nominal 0.7." in said
-
-
-def test_a_move_within_both_intervals_is_no_absorption():
-    p = ParameterChange("m", "kg", (1.0, 0.9, 1.1), (1.05, 0.95, 1.15), True)
-    assert not has_absorbed_gap(p)
-    assert has_absorbed_gap(replace(p, after=(1.2, 1.15, 1.25)))
-    assert format_shift(p) == "+5.0 %"
-    assert format_shift(replace(p, after=(0.9, 0.8, 1.0))) == "−10 %"
-    assert (
-        format_shift(ParameterChange("b", "N", (0.0, -1.0, 1.0), (0.5, 0.4, 0.6), True)) == "+0.5 N"
-    )
 
 
 def test_the_largest_gap_is_located():
