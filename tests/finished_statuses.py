@@ -2,23 +2,14 @@
 
 import time
 
-from bench.benchmark.storage.run_journal import read_statuses_by_file
-
-
-def read_finished_statuses(folder):
-    """Return the statuses of the finished runs of a study by index in the plan."""
-    return {
-        plan_index: status
-        for _, statuses in read_statuses_by_file(folder)
-        for plan_index, status in statuses.items()
-    }
+from bench.benchmark.storage.run_journal import read_statuses
 
 
 def wait_for_runs(process, folder, count, seconds=120.0):
     """Wait until a process has finished this number of runs, has ended, or the time is over."""
     deadline = time.monotonic() + seconds
     while (
-        len(read_finished_statuses(folder)) < count
+        len(read_statuses(folder)) < count
         and process.poll() is None
         and time.monotonic() < deadline
     ):

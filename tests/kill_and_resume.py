@@ -28,8 +28,8 @@ import tomli_w
 
 from bench.benchmark.isolation.tuner_processes import remove_stale_folders
 from bench.benchmark.storage.result_folder import read_configuration
+from bench.benchmark.storage.run_journal import read_statuses
 from tests.conftest import PLUGINS
-from tests.finished_statuses import read_finished_statuses
 from tests.local_cluster import cluster, command_line
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND
@@ -120,7 +120,7 @@ def disturbed(folder, experiment, kills, rng, running, environment, isolation):
             if process.returncode != 0:
                 raise AssertionError(ended(process, folder))
             return hits
-        before = read_finished_statuses(folder)
+        before = read_statuses(folder)
         what = str(
             rng.choice(["runner", "cluster worker" if running else "worker", *ISOLATION_PROCESSES])
         )
@@ -129,7 +129,7 @@ def disturbed(folder, experiment, kills, rng, running, environment, isolation):
         hits[what] += 1
         if what == "runner":
             process.wait()
-            after = read_finished_statuses(folder)
+            after = read_statuses(folder)
             lost = set(before) - set(after)
             if lost and (folder / "segments").exists():
                 raise AssertionError(f"lost {len(lost)} finished runs")

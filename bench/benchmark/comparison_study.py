@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bench.benchmark.runner.stored_study import PrintLine, Study
 from bench.benchmark.storage.csv_reader import RunsTable
 from bench.benchmark.storage.result_file_consistency import (
+    check_journal_statuses,
     check_plan,
     check_rows_match_statuses,
     check_runs,
-    check_segment_statuses,
 )
 from bench.benchmark.storage.result_folder import (
     read_comparison,
@@ -21,20 +21,19 @@ from bench.benchmark.storage.result_folder import (
     write_results,
 )
 from bench.benchmark.storage.run_journal import (
+    JOURNAL_FILE,
+    JOURNAL_REMEDY,
     PLAN_FILE,
     PLAN_REMEDY,
-    SEGMENT_REMEDY,
     SEGMENTS_FOLDER,
     RunJournal,
     read_plan,
-    read_statuses_by_file,
+    read_statuses,
     write_plan,
 )
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
-    STATUS_COLUMN_NAMES,
     RunEnd,
-    RunStatus,
     StudyOutcome,
 )
 from sims.core.files import write_atomically
@@ -111,7 +110,7 @@ class Comparison(Study):
         """Prepare the comparison for running: open its journal, write or check its plan.
 
         `results` are the problem and the planned runs. A finished comparison has no journal any
-        more; then the statuses of its runs are read from its tables.
+        more; then its tables are compared with the plan.
 
         Raises:
             InputError: the stored plan or runs do not belong to the configuration.
@@ -124,8 +123,13 @@ class Comparison(Study):
             str(path.resolve()) for path in (self.folder, get_weights_folder())
         )
         ids = [job.request.run for job in results.plan]
-        if not (self.folder / SEGMENTS_FOLDER).exists():
-            results.run_sink.statuses = self._index_finished_statuses(ids)
+        if not self.is_unfinished:
+            finished_ids = [end.name for end in self._list_finished_ends()]
+            if finished_ids != ids:
+                raise InputError(
+                    f"{self.folder / 'status.csv'}: expected the {len(ids)} runs of the plan, "
+                    f"found {len(finished_ids)} or others; start a new comparison"
+                )
             return
         planned_ids = read_plan(self.folder)
         journal = RunJournal(self.folder)
@@ -154,47 +158,31 @@ class Comparison(Study):
         Raises:
             InputError: a row is damaged, or belongs to another plan.
         """
-        experiment = self.configuration.experiment
-        for path, statuses_by_index, records in journal.list_segment_contents():
-            file = RunsTable(path, SEGMENT_REMEDY)
-            statuses = check_segment_statuses(
-                path, statuses_by_index, experiment, ids, SEGMENT_REMEDY
-            )
-            runs = file.read_runs(experiment, records)
+        experiment, first_row = self.configuration.experiment, 0
+        statuses = check_journal_statuses(journal.path, journal.statuses, experiment, ids)
+        statuses.index = list(journal.statuses)
+        for indices, rows in journal.iterate_tables():
+            file = RunsTable(journal.path, JOURNAL_REMEDY, rows, first_row)
+            runs = file.read_runs(experiment)
             check_runs(runs, file, experiment)
             check_rows_match_statuses(
-                runs, file, statuses, partial(_make_status_error, file), "its statuses"
+                runs,
+                file,
+                statuses.loc[indices].reset_index(drop=True),
+                partial(_make_status_error, file),
+                "its statuses",
             )
+            first_row += len(rows)
 
-    def _index_finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
-        """Return the statuses of a finished comparison by their index in the plan.
-
-        Args:
-            ids: IDs of the planned runs, in the order of the plan.
-
-        Raises:
-            InputError: the folder has other runs than the plan, or is damaged.
-        """
-        statuses = self._list_finished_statuses()
-        if [status.run for status in statuses] != ids:
-            raise InputError(
-                f"{self.folder / 'status.csv'}: expected the {len(ids)} runs of the plan, found "
-                f"{len(statuses)} or others; start a new comparison"
-            )
-        return dict(enumerate(statuses))
-
-    def _list_finished_statuses(self) -> list[RunStatus]:
-        """Return the statuses of a finished comparison in the order of its plan.
+    def _list_finished_ends(self) -> list[RunEnd]:
+        """List how the runs of a finished comparison ended, in the order of its plan.
 
         Tuners that were skipped have no run in the plan, so their rows are left out.
         """
         statuses = read_comparison(self.folder, ["run", "tuner", "k"]).statuses
         executed = statuses[statuses["status"] != "skipped"]
-        rows: list[dict[str, Any]] = [
-            {str(name): value for name, value in row.items()}
-            for row in executed[STATUS_COLUMN_NAMES].to_dict("records")
-        ]
-        return [RunStatus(**row) for row in rows]
+        rows = executed[["run", "tuner", "status", "reason"]].to_numpy().tolist()
+        return [RunEnd(*row) for row in rows]
 
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
@@ -281,22 +269,24 @@ class Comparison(Study):
         """List how every run ended, for `simgap status`.
 
         A finished comparison has one table of statuses. In an unfinished one they are in its
-        segments (the journal and its parts), which are checked against the plan; a planned run that
-        has not ended has no status.
+        journal, which is checked against the plan; a planned run that has not ended has no status.
         """
         if not self.is_unfinished:
-            return [_find_run_end(status.run, status) for status in self._list_finished_statuses()]
+            return self._list_finished_ends()
         planned_ids, experiment = read_plan(self.folder), self.configuration.experiment
+        segments = self.folder / SEGMENTS_FOLDER
         if planned_ids is not None:
-            path = self.folder / SEGMENTS_FOLDER / PLAN_FILE
-            check_plan(planned_ids, experiment, path, PLAN_REMEDY)
-        statuses_by_run: dict[str, RunStatus] = {}
-        for path, statuses_by_index in read_statuses_by_file(self.folder):
-            check_segment_statuses(path, statuses_by_index, experiment, planned_ids, SEGMENT_REMEDY)
-            statuses_by_run |= {status.run: status for status in statuses_by_index.values()}
+            check_plan(planned_ids, experiment, segments / PLAN_FILE, PLAN_REMEDY)
+        statuses = read_statuses(self.folder)
+        check_journal_statuses(segments / JOURNAL_FILE, statuses, experiment, planned_ids)
+        ends = {
+            status.run: RunEnd(status.run, status.tuner, status.status, status.reason)
+            for status in statuses.values()
+        }
         return [
-            _find_run_end(name, statuses_by_run.get(name))
-            for name in (statuses_by_run if planned_ids is None else planned_ids)
+            # The id of a run begins with the label of its tuner.
+            ends.get(name) or RunEnd(name, name.partition("/")[0], MISSING_STATUS)
+            for name in (ends if planned_ids is None else planned_ids)
         ]
 
     @property
@@ -324,16 +314,3 @@ class Comparison(Study):
 def _make_status_error(file: RunsTable, _row: int, problem: str) -> InputError:
     """Make the error for a status of a journal file, which belongs to none of its rows."""
     return file.make_error(None, problem)
-
-
-def _find_run_end(name: str, status: RunStatus | None) -> RunEnd:
-    """Return how a planned run ended, or that it is missing.
-
-    Args:
-        name: id of the run, which begins with the label of its tuner.
-        status: stored status; None if the run is missing.
-    """
-    tuner = name.partition("/")[0]
-    if status is None:
-        return RunEnd(name, tuner, MISSING_STATUS)
-    return RunEnd(name, tuner, str(status.status), str(status.reason))

@@ -1,13 +1,13 @@
 """Read the CSV files of a result folder, runs batch by batch, and check every cell.
 
-Rows of runs are those of runs.parquet and of the parts of a journal.
+Rows of runs are those of runs.parquet and of a journal.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -178,10 +178,14 @@ class RunsTable(NamedTuple):
     Attributes:
         path: Path of the file.
         remedy: Advice for a damaged file.
+        rows: Rows that were read already, for a file that is not Parquet; otherwise None.
+        first_row: Number of the first of these rows in the file.
     """
 
     path: Path
     remedy: str
+    rows: pa.Table | None = None
+    first_row: int = 0
 
     def make_error(self, row: int | None, problem: str) -> InputError:
         """Make the error for a row, counted from 0, or for the whole file.
@@ -190,12 +194,10 @@ class RunsTable(NamedTuple):
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        place = "" if row is None else f", row {row}"
+        place = "" if row is None else f", row {self.first_row + row}"
         return InputError(f"{self.path}{place}: {problem}; {self.remedy}")
 
-    def read_runs(
-        self, experiment: Experiment, records: Sequence[pa.Table] | None = None
-    ) -> pd.DataFrame:
+    def read_runs(self, experiment: Experiment) -> pd.DataFrame:
         """Check all rows, and return one line per run, in the order of the file.
 
         Each line has the columns that are constant within the run, ``row``, at which it begins, and
@@ -204,7 +206,6 @@ class RunsTable(NamedTuple):
 
         Args:
             experiment: Experiment of the runs.
-            records: Tables that were read before, for a file that is not Parquet.
 
         Raises:
             InputError: The file is damaged; the message is one line.
@@ -213,9 +214,8 @@ class RunsTable(NamedTuple):
         from pyarrow import parquet
 
         try:
-            if records is not None:
-                table = pa.concat_tables(records)
-                return _read_checked_runs(table.select, table.column_names, experiment)
+            if self.rows is not None:
+                return _read_checked_runs(self.rows.select, self.rows.column_names, experiment)
             with parquet.ParquetFile(self.path) as file:
                 names = list(file.schema_arrow.names)
                 return _read_checked_runs(

@@ -19,6 +19,7 @@ from bench.benchmark.storage.cell_validation import (
     raise_for_first_bad_row,
 )
 from bench.benchmark.storage.csv_reader import CsvTable, RunsTable
+from bench.benchmark.storage.run_journal import JOURNAL_REMEDY
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.table_schemas import (
     ERROR_TABLE_COLUMNS,
@@ -433,23 +434,19 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
             check_equal(runs[name], expected, name, "as in other runs on this target", at)
 
 
-def check_segment_statuses(
+def check_journal_statuses(
     path: Path,
     statuses_by_index: Mapping[int, RunStatus],
     experiment: Experiment,
     plan: Sequence[str] | None,
-    remedy: str,
 ) -> pd.DataFrame:
-    """Check the statuses in a part of the results: its runs must be those of the plan.
-
-    A comparison that is still running stores its results in parts and a journal.
+    """Check the statuses of a journal: its runs must be those of the plan.
 
     Args:
-        path: Path of the part or journal.
+        path: Path of the journal.
         statuses_by_index: Statuses by index in the plan.
         experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
         plan: The id of every run; None if unknown.
-        remedy: Advice for a damaged file.
 
     Returns:
         The statuses as rows of status.csv.
@@ -461,9 +458,8 @@ def check_segment_statuses(
 
     plan_indices = list(statuses_by_index)
 
-    def make_status_error(row: int | None, problem: str) -> InputError:
-        place = "" if row is None else f", run {plan_indices[row]}"
-        return InputError(f"{path}{place}: {problem}; {remedy}")
+    def make_status_error(row: int, problem: str) -> InputError:
+        return InputError(f"{path}, run {plan_indices[row]}: {problem}; {JOURNAL_REMEDY}")
 
     statuses = pd.DataFrame(
         [vars(status) for status in statuses_by_index.values()], columns=STATUS_COLUMN_NAMES

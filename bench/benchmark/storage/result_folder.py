@@ -229,7 +229,7 @@ def write_results(
 
     with atomic_replacement(folder / "runs.parquet") as partial:
         writer = None
-        for rows in journal.iterate_tables():
+        for _, rows in journal.iterate_tables():
             # The first table defines the columns.
             writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
             writer.write_table(rows)

@@ -10,11 +10,12 @@ import pandas as pd
 import pytest
 import tomli_w
 
+from bench.benchmark.storage.run_journal import read_statuses
 from bench.cli.main import main
 from sims.core.simulator import InputError
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
-from tests.finished_statuses import read_finished_statuses, wait_for_runs
+from tests.finished_statuses import wait_for_runs
 from tests.plugins.chaos import STATUSES
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND
@@ -83,7 +84,7 @@ def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(
     finished_folder, tmp_path
 ):
     folder = start_and_kill(tmp_path / "out", finished_folder / "e.toml", 5)
-    before = read_finished_statuses(folder)
+    before = read_statuses(folder)
     assert 5 <= len(before) < 48
     said = run_command("status", folder, code=1).out
     assert f"{len(before)} of 48 runs finished" in said

@@ -6,9 +6,10 @@ import subprocess
 import pandas as pd
 import pytest
 
+from bench.benchmark.storage.run_journal import read_statuses
 from tests.bench.runner.test_comparison_study import CHAOS, SPRING_PLUGIN, same, simgap, write
 from tests.command_output import run_command
-from tests.finished_statuses import read_finished_statuses, wait_for_runs
+from tests.finished_statuses import wait_for_runs
 from tests.local_cluster import cluster
 from tests.without_drawing import COMMAND
 
@@ -76,7 +77,7 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     assert f"simgap: cluster {started.address}: the scheduler cannot be reached" in errors
     assert f"simgap compare --resume {folder}" in errors
     assert "Traceback" not in errors, errors
-    kept = read_finished_statuses(folder)
+    kept = read_statuses(folder)
     assert 12 <= len(kept) < 2400
     ends = {(s.tuner, s.status) for s in kept.values()}
     assert ends == {("random", "done"), ("chaos_exit", "crashed"), ("chaos_raise", "crashed")}

@@ -17,12 +17,12 @@ from bench.benchmark.storage.result_folder import read_comparison
 from bench.benchmark.storage.run_journal import (
     RunJournal,
     read_plan,
+    read_statuses,
     write_plan,
 )
 from bench.core.plugin_registries import load_plugins
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS
-from tests.finished_statuses import read_finished_statuses
 from tests.sample_experiments import spring_experiment
 
 EFFECT = """
@@ -69,7 +69,7 @@ def run_interrupted(experiment, plugins, folder):
     Interrupting.left = 1
     made = Comparison.begin(prepare_study(experiment, plugins, folder, jobs=0)).run(jobs=0)
     assert made.interrupted
-    assert len(read_finished_statuses(folder)) == 1
+    assert len(read_statuses(folder)) == 1
     return folder
 
 
@@ -84,7 +84,7 @@ def refused(folder, what, words="its {} changed since it was started"):
 
 def goes_on(folder):
     """Check that resuming executes the missing run only."""
-    kept = read_finished_statuses(folder)
+    kept = read_statuses(folder)
     made = Comparison.resume(folder).run(jobs=0)
     assert made.is_complete
     statuses = read_comparison(folder, ["run", "tuner", "k"]).statuses
@@ -212,7 +212,7 @@ def test_a_finished_run_of_another_plan_is_refused(folder):
     foreign = replace(journal.statuses[0], run="random/in-000/0/0123456789")
     journal.append(1, {"run": [foreign.run], "k": np.zeros(1, dtype=int)}, foreign)
     journal.close()
-    words = r"000001.journal, run 1: run: expected interrupting/in-000/0/\w+ by plan.txt, found"
+    words = r"runs.journal, run 1: run: expected interrupting/in-000/0/\w+ by plan.txt, found"
     refused(folder, "", words)
 
 

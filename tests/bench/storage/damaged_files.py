@@ -1,15 +1,22 @@
 """Kinds of damage to result folders by name."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet
+
+from bench.benchmark.storage.run_journal import (
+    JOURNAL_FILE,
+    decode_rows,
+    encode_record,
+    read_records,
+)
 
 
 class Damage(NamedTuple):
@@ -123,7 +130,7 @@ def gone(name):
 
 
 PARQUET, STATUS_CSV, PLAN = "runs.parquet", "status.csv", "segments/plan.txt"
-PART = "segments/000001.parquet"
+JOURNAL = f"segments/{JOURNAL_FILE}"
 TRAINED = ["random,0,1,1.5,True"]
 DONE = {
     "no column": rows(lambda f: f.drop(columns="loss")),
@@ -234,34 +241,35 @@ HALF = {
     "plan twice": lines(PLAN, lambda ls: [*ls, ls[0]]),
     "plan shortened": lines(PLAN, lambda ls: ls[:-1]),
     "plan bytes": raw(PLAN, lambda data: data + b"\xff"),
-    "part cut": raw(PART, lambda d: d[:-7]),
-    "part empty": raw(PART, lambda _: b""),
-    "part named": Damage(
-        "segments/old.parquet",
-        lambda f: shutil.copy(f / "segments/000001.parquet", f / "segments/old.parquet"),
-    ),
-    "part twice": Damage(
-        "segments/000009.parquet",
-        lambda f: shutil.copy(f / "segments/000001.parquet", f / "segments/000009.parquet"),
-    ),
+    "journal with a damaged record": raw(JOURNAL, lambda d: d[:60] + b"\xff\xff" + d[62:]),
+    "journal of another kind": raw(JOURNAL, lambda _: b"a text instead of records"),
+    "journal twice": raw(JOURNAL, lambda d: d + d),
 }
 
 
-def statuses(change):
-    """Return a function that changes the statuses in a segment file."""
+def records(change):
+    """Return a function that changes the records of a journal, each [index, status, rows]."""
 
     def damage(folder):
-        path = folder / PART
-        table = parquet.read_table(path)
-        held = json.loads(table.schema.metadata[b"statuses"])
-        table = table.replace_schema_metadata({"statuses": json.dumps(change(held))})
-        parquet.write_table(table, path)
+        path = folder / JOURNAL
+        held = [[*json.loads(r.head), decode_rows(r.rows)] for r in read_records(path)]
+        path.write_bytes(b"".join(_encode(*record) for record in change(held)))
 
-    return Damage(PART, damage)
+    return Damage(JOURNAL, damage)
+
+
+def _encode(index, status, rows):
+    """Encode a record whose status may be anything."""
+    with patch("bench.benchmark.storage.run_journal.asdict", lambda _: status):
+        return encode_record(index, status, rows)
 
 
 def change_status(**changes):
-    return statuses(lambda held: [[held[0][0], {**held[0][1], **changes}], *held[1:]])
+    def change(held):
+        (index, status, table), *others = held
+        return [[index, {**status, **changes}, table], *others]
+
+    return records(change)
 
 
 HALF |= {
@@ -270,18 +278,32 @@ HALF |= {
     "foreign tuner": change_status(tuner="annealing"),
     "status of numbers": change_status(status=3),
     "seconds in words": change_status(seconds="long"),
-    "negative time in a part": change_status(seconds=-1.0),
-    "infinite time in a part": change_status(seconds=float("inf")),
+    "negative time in a journal": change_status(seconds=-1.0),
+    "infinite time in a journal": change_status(seconds=float("inf")),
     "too many simulations": change_status(simulations=99),
-    "no place": statuses(lambda held: [["x", held[0][1]], *held[1:]]),
-    "beyond the plan": statuses(lambda held: [[99, held[0][1]], *held[1:]]),
-    "statuses no list": statuses(lambda _: {"a": 1}),
-    "status without a column": statuses(lambda held: [[0, {"run": "x"}]]),
+    "no place": records(lambda held: [["x", *held[0][1:]], *held[1:]]),
+    "beyond the plan": records(lambda held: [[99, *held[0][1:]], *held[1:]]),
+    "status no table": records(lambda held: [[0, ["a"], held[0][2]], *held[1:]]),
+    "status without a column": records(lambda held: [[0, {"run": "x"}, held[0][2]]]),
 }
-ROWS_OF_PARTS = {
-    "part without a column": rows(lambda f: f.drop(columns="loss"), PART),
-    "part without a run": rows(lambda f: f[f["run"] != f["run"][0]], PART),
-    "part with other k": rows(lambda f: f.assign(k=f["k"] * 2), PART),
-    "part without an end": rows(lambda f: f.drop(index=3), PART),
-    "part with text": rows(lambda f: f.assign(loss="x"), PART),
+
+
+def rows_of_journal(change):
+    """Return a function that changes the rows of the first run in a journal."""
+
+    def changed(held):
+        index, status, table = held[0]
+        return [[index, status, pa.Table.from_pandas(change(table.to_pandas()))], *held[1:]]
+
+    return records(changed)
+
+
+ROWS_OF_JOURNAL = {
+    "journal without a column": records(
+        lambda held: [[i, status, table.drop_columns("loss")] for i, status, table in held]
+    ),
+    "journal with other k": rows_of_journal(lambda f: f.assign(k=f["k"] * 2)),
+    "journal without an end": rows_of_journal(lambda f: f.drop(index=3)),
+    "journal with rows of another run": rows_of_journal(lambda f: f.assign(run="x")),
+    "journal with text": rows_of_journal(lambda f: f.assign(loss="x")),
 }

@@ -31,9 +31,10 @@ from tests.bench.storage.damaged_files import (
     BOTH,
     DONE,
     HALF,
+    JOURNAL,
     PARQUET,
     PLAN,
-    ROWS_OF_PARTS,
+    ROWS_OF_JOURNAL,
     STATUS_CSV,
     both,
     cell,
@@ -52,7 +53,7 @@ SPRING_PLUGIN = str(PLUGINS / "spring.py")
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, spring):
-    """Folder with a finished comparison and with one whose runs are all in its segments."""
+    """Folder with a finished comparison and with one whose runs are all in its journal."""
     experiment = spring_experiment(
         targets=2, seeds=2, budget=3, tuners={"random": {}, "nelder_mead": {"seeds": 1}}
     )
@@ -60,11 +61,8 @@ def folders(tmp_path_factory, spring):
     made = Comparison.begin(prepare_study(experiment, [SPRING_PLUGIN], place / "done", jobs=0))
     made.run(jobs=0)
     begun = Comparison.begin(prepare_study(experiment, [SPRING_PLUGIN], place / "half", jobs=0))
-    results = begun.results
-    results.run_sink.close()
-    results.run_sink = RunJournal(place / "half", part_runs=5)
-    run_experiment(results, [SPRING_PLUGIN], 0)
-    results.run_sink.close()
+    run_experiment(begun.results, [SPRING_PLUGIN], 0)
+    begun.close()
     return place
 
 
@@ -123,9 +121,9 @@ def test_so_is_one_that_is_under_way(damage, folders, tmp_path):
         is_one_line(COMMANDS[who](folder), folder, act.file)
 
 
-@pytest.mark.parametrize("damage", ROWS_OF_PARTS)
-def test_rows_of_a_part_are_checked_before_more_are_made(damage, folders, tmp_path):
-    act = ROWS_OF_PARTS[damage]
+@pytest.mark.parametrize("damage", ROWS_OF_JOURNAL)
+def test_rows_of_a_journal_are_checked_before_more_are_made(damage, folders, tmp_path):
+    act = ROWS_OF_JOURNAL[damage]
     folder = damaged(folders, "half", act, tmp_path)
     is_one_line(COMMANDS["resume"](folder), folder, act.file)
     again = RunJournal(folder)  # the folder is not locked
@@ -187,11 +185,11 @@ def test_without_a_plan_nothing_is_complete(folders, tmp_path):
     assert len(read_plan(folder)) == 12
 
 
-def test_a_damaged_part_that_was_deleted_is_made_again(folders, tmp_path):
-    folder = damaged(folders, "half", gone("segments/000002.parquet"), tmp_path)
+def test_a_damaged_journal_that_was_deleted_is_made_again(folders, tmp_path):
+    folder = damaged(folders, "half", gone(JOURNAL), tmp_path)
     run_command("status", folder, code=1)
     comparison = Comparison.resume(folder)
-    assert len(comparison.results.run_sink.statuses) == 7
+    assert comparison.results.run_sink.statuses == {}
     assert comparison.run(jobs=0).is_complete
     assert len(read_comparison(folder).statuses) == 12
 

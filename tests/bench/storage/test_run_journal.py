@@ -1,19 +1,22 @@
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from bench.benchmark.storage.run_journal import (
+    JOURNAL_FILE,
     SEGMENTS_FOLDER,
     RunJournal,
+    encode_record,
     read_plan,
     read_records,
+    read_statuses,
     write_plan,
 )
 from bench.benchmark.storage.run_status import RunStatus
 from sims.core.simulator import InputError
-from tests.finished_statuses import read_finished_statuses
 
 
 def columns(place, k=3):
@@ -42,15 +45,15 @@ def closed(monkeypatch):
             journal.close()
 
 
-def filled(folder, places, part_runs=4):
-    journal = RunJournal(folder, part_runs)
+def filled(folder, places):
+    journal = RunJournal(folder)
     for place in places:
         journal.append(place, columns(place), status(place))
     return journal
 
 
 def everything(journal, runs=2000):
-    return pa.concat_tables(list(journal.iterate_tables(runs))).to_pydict()
+    return pa.concat_tables([rows for _, rows in journal.iterate_tables(runs)]).to_pydict()
 
 
 def expected(places):
@@ -65,15 +68,15 @@ def expected(places):
 def test_rows_come_back_in_the_order_of_the_plan_bit_for_bit(tmp_path, runs):
     order = [5, 0, 3, 9, 1, 8, 2, 7, 6, 4, 10]
     journal = filled(tmp_path, order)
-    assert len(list((tmp_path / SEGMENTS_FOLDER).glob("*.parquet"))) == 2
     assert everything(journal, runs) == expected(order)
+    assert [places for places, _ in journal.iterate_tables(4)][1:] == [[4, 5, 6, 7], [8, 9, 10]]
 
 
 def test_reopened_after_any_cut_it_holds_every_whole_record_and_goes_on(tmp_path):
-    filled(tmp_path, [2, 0], part_runs=100).close()
-    path = tmp_path / SEGMENTS_FOLDER / "000001.journal"
+    filled(tmp_path, [2, 0]).close()
+    path = tmp_path / SEGMENTS_FOLDER / JOURNAL_FILE
     data = path.read_bytes()
-    ends = [end for *_, end in read_records(path)]
+    ends = [record.end for record in read_records(path)]
     assert ends[-1] == len(data)
     for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 5, ends[0] + 40, len(data) - 1, len(data)]:
         path.write_bytes(data[:cut])
@@ -89,29 +92,30 @@ def test_reopened_after_any_cut_it_holds_every_whole_record_and_goes_on(tmp_path
 
 
 def test_damaged_record_is_dropped_and_its_run_counts_as_missing(tmp_path):
-    filled(tmp_path, [0, 1], part_runs=100).close()
-    path = tmp_path / SEGMENTS_FOLDER / "000001.journal"
+    filled(tmp_path, [0, 1]).close()
+    path = tmp_path / SEGMENTS_FOLDER / JOURNAL_FILE
     data = bytearray(path.read_bytes())
     data[-10] ^= 1
     path.write_bytes(data)
-    assert list(RunJournal(tmp_path).statuses) == [0]
-
-
-def test_killed_between_the_part_and_the_deletion_of_its_journal_doubles_nothing(tmp_path):
-    filled(tmp_path, [0, 1, 2], part_runs=100).close()
-    kept = (tmp_path / SEGMENTS_FOLDER / "000001.journal").read_bytes()
-    journal = RunJournal(tmp_path, part_runs=4)
-    journal.append(3, columns(3), status(3))
+    journal = RunJournal(tmp_path)
+    assert list(journal.statuses) == [0]
     journal.close()
-    assert not (tmp_path / SEGMENTS_FOLDER / "000001.journal").exists()
-    (tmp_path / SEGMENTS_FOLDER / "000001.journal").write_bytes(kept)
-    # The next journal is started only after that deletion, so it does not exist yet.
-    (tmp_path / SEGMENTS_FOLDER / "000002.journal").unlink()
-    (tmp_path / SEGMENTS_FOLDER / "000002.partial").write_bytes(b"half a part")
-    again = RunJournal(tmp_path)
-    assert everything(again) == expected([0, 1, 2, 3])
-    again.close()
-    assert sorted(read_finished_statuses(tmp_path)) == [0, 1, 2, 3]
+    # Before other records it is no consequence of a kill, and nothing is deleted.
+    data[60] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=f"{JOURNAL_FILE}: expected a record before byte"):
+        RunJournal(tmp_path)
+    assert path.read_bytes() == data
+
+
+def test_zeros_that_a_crash_of_the_machine_left_are_dropped(tmp_path):
+    filled(tmp_path, [0]).close()
+    path = tmp_path / SEGMENTS_FOLDER / JOURNAL_FILE
+    whole = path.read_bytes()
+    path.write_bytes(whole + bytes(5000))
+    journal = RunJournal(tmp_path)
+    assert list(journal.statuses) == [0]
+    assert path.read_bytes() == whole
 
 
 def test_two_processes_never_write_one_folder(tmp_path):
@@ -122,30 +126,42 @@ def test_two_processes_never_write_one_folder(tmp_path):
     RunJournal(tmp_path).close()
 
 
-def test_damaged_part_is_one_line(tmp_path):
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        (lambda: encode_record(0, status(0), pa.table(columns(0))), "every run once, found that"),
+        (lambda: encode_record(-1, status(9), pa.table(columns(9))), "place in the plan: expected"),
+        (lambda: encode_record(9, replace(status(9), seed="x"), pa.table(columns(9))), "seed: exp"),
+    ],
+)
+def test_damaged_status_is_one_line(tmp_path, record, words):
     filled(tmp_path, range(4)).close()
-    path = tmp_path / SEGMENTS_FOLDER / "000001.parquet"
-    path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(
-        InputError, match=r"000001.parquet: expected a part of a comparison, found damage"
-    ) as caught:
+    path = tmp_path / SEGMENTS_FOLDER / JOURNAL_FILE
+    path.write_bytes(path.read_bytes() + record())
+    with pytest.raises(InputError, match=f"{JOURNAL_FILE}: expected .*{words}") as caught:
         RunJournal(tmp_path)
     assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=words):
+        read_statuses(tmp_path)
+    # The lock was released.
+    path.unlink()
+    RunJournal(tmp_path).close()
 
 
 def test_statuses_of_a_folder_that_is_being_written(tmp_path):
     journal = filled(tmp_path, range(6))
-    assert sorted(read_finished_statuses(tmp_path)) == list(range(6))
-    assert read_finished_statuses(tmp_path)[5] == status(5)
+    assert sorted(read_statuses(tmp_path)) == list(range(6))
+    assert read_statuses(tmp_path)[5] == status(5)
     journal.delete_segments()
-    assert read_finished_statuses(tmp_path) == {}
+    assert read_statuses(tmp_path) == {}
     assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_ever_unpickled(tmp_path):
     (tmp_path / SEGMENTS_FOLDER).mkdir()
-    (tmp_path / SEGMENTS_FOLDER / "000001.journal").write_bytes(pickle.dumps({"run": 1}))
-    assert RunJournal(tmp_path).statuses == {}
+    (tmp_path / SEGMENTS_FOLDER / JOURNAL_FILE).write_bytes(pickle.dumps({"run": 1}))
+    with pytest.raises(InputError, match="found damage"):
+        RunJournal(tmp_path)
 
 
 def test_plan(tmp_path):
