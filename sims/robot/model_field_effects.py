@@ -54,6 +54,29 @@ FieldWriter = Callable[[Fields, RobotModel, str, Array], None]
 
 
 @dataclass(frozen=True)
+class ModelField:
+    """An element of a field of mujoco.MjModel that holds a number of the model file.
+
+    Attributes:
+        name: name of the field, such as ``dof_damping``; ``opt.gravity`` for a field of the
+            options.
+        address: index of the element.
+        sign: -1 if the field holds the negative of the number, such as the bias of a servo.
+    """
+
+    name: str
+    address: tuple[int, ...]
+    sign: int = 1
+
+
+Find = Callable[[RobotModel, str], "list[list[ModelField]]"]
+"""Function that finds the elements of each coefficient, by robot and place."""
+
+Operation = Literal["abs", "add", "scale"]
+"""Operation that applies a random number to a field: replace, add to, or multiply its number."""
+
+
+@dataclass(frozen=True)
 class ModelFieldEffect:
     """An effect that is written into fields of the model.
 
@@ -63,11 +86,16 @@ class ModelFieldEffect:
             effect.
         changes_derived_constants: whether MuJoCo derives constants from the fields, so that
             ``set_const`` must be called; this requires a model of `compile_batch_model`.
+        find: finds the elements that hold the number of each coefficient; None if no element does.
+        operation: operation that applies a random number to these elements. A position is shifted;
+            a tensor or a vector is scaled, so that it keeps its direction.
     """
 
     fields: tuple[str, ...]
     write: FieldWriter
     changes_derived_constants: bool = False
+    find: Find | None = None
+    operation: Operation = "abs"
 
 
 def add_to_file_value(file_value: Any, c: Any) -> Any:
@@ -102,36 +130,25 @@ def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
     return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
 
 
-@dataclass(frozen=True)
-class ModelField:
-    """An element of a field of mujoco.MjModel that holds a number of the model file.
+def _make_finder(name: str, *index: int) -> Find:
+    """Return a finder of an element at a joint or a body, as the name of its field tells.
 
-    Attributes:
-        name: name of the field, such as ``dof_damping``; ``opt.gravity`` for a field of the
-            options.
-        address: index of the element.
-        sign: -1 if the field holds the negative of the number, such as the bias of a servo.
+    Fields called ``dof_`` have a row for each velocity, ``qpos`` for each position, ``jnt_`` for
+    each joint, and ``body_`` for each body.
+
+    Args:
+        name: name of the field.
+        index: index within the row.
     """
 
-    name: str
-    address: tuple[int, ...]
-    sign: int = 1
+    def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
+        if name.startswith("body_"):
+            return [[ModelField(name, (robot.body(place).id, *index))]]
+        joint = robot.joint(place)
+        rows = {"dof": joint.velocity, "jnt": joint.id, "qpo": joint.position}
+        return [[ModelField(name, (rows[name[:3]], *index))]]
 
-
-Find = Callable[[RobotModel, str], "list[list[ModelField]]"]
-"""Function that finds the elements of each coefficient, by robot and place."""
-
-
-def _make_dof_finder(name: str, *index: int) -> Find:
-    return lambda robot, place: [[ModelField(name, (robot.joint(place).velocity, *index))]]
-
-
-def _make_joint_finder(name: str, *index: int) -> Find:
-    return lambda robot, place: [[ModelField(name, (robot.joint(place).id, *index))]]
-
-
-def _make_body_finder(name: str) -> Find:
-    return lambda robot, place: [[ModelField(name, (robot.body(place).id,))]]
+    return find
 
 
 def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
@@ -183,10 +200,6 @@ def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelFi
         ModelField("actuator_forcerange", (actuator_id, end), (-1, 1)[end]) for end in (1, 0)
     ]
     return [range_fields]
-
-
-def _make_gravity_finder(*axes: int) -> Find:
-    return lambda _robot, _place: [[ModelField("opt.gravity", (axis,))] for axis in axes]
 
 
 def _view_element(fields: Fields, element: ModelField) -> Any:
@@ -491,42 +504,58 @@ CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
 """Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
 _SERVO_FIELDS = ("actuator_gainprm", "actuator_biasprm")
 
+
+def _make_effect(
+    make_writer: Callable[[Find], FieldWriter],
+    find: Find,
+    *fields: str,
+    changes_derived_constants: bool = False,
+    operation: Operation = "abs",
+) -> ModelFieldEffect:
+    """Make an effect whose coefficients change the elements of a finder, all in the same way."""
+    return ModelFieldEffect(fields, make_writer(find), changes_derived_constants, find, operation)
+
+
 MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
-    "drag.linear": ModelFieldEffect(("dof_damping",), _add(_make_dof_finder("dof_damping"))),
-    "drag.quadratic": ModelFieldEffect(
-        ("dof_dampingpoly",), _add(_make_dof_finder("dof_dampingpoly", 0))
-    ),
+    "drag.linear": _make_effect(_add, _make_finder("dof_damping"), "dof_damping"),
+    "drag.quadratic": _make_effect(_add, _make_finder("dof_dampingpoly", 0), "dof_dampingpoly"),
     "friction.coulomb": ModelFieldEffect(
-        ("dof_frictionloss", "dof_solref", "dof_solimp"), _add_friction
+        ("dof_frictionloss", "dof_solref", "dof_solimp"),
+        _add_friction,
+        find=_make_finder("dof_frictionloss"),
     ),
-    "spring.linear": ModelFieldEffect(
-        ("jnt_stiffness",), _add(_make_joint_finder("jnt_stiffness"))
-    ),
-    "spring.cubic": ModelFieldEffect(
-        # A spring may soften.
-        ("jnt_stiffnesspoly",),
-        _shift(_make_joint_finder("jnt_stiffnesspoly", 1)),
-    ),
-    "inertia.armature": ModelFieldEffect(
-        ("dof_armature",), _add(_make_dof_finder("dof_armature")), changes_derived_constants=True
+    "spring.linear": _make_effect(_add, _make_finder("jnt_stiffness"), "jnt_stiffness"),
+    # A spring may soften.
+    "spring.cubic": _make_effect(_shift, _make_finder("jnt_stiffnesspoly", 1), "jnt_stiffnesspoly"),
+    "inertia.armature": _make_effect(
+        _add, _make_finder("dof_armature"), "dof_armature", changes_derived_constants=True
     ),
     "mass.scale": ModelFieldEffect(
-        ("body_mass", "body_inertia"), _scale_mass, changes_derived_constants=True
+        ("body_mass", "body_inertia"),
+        _scale_mass,
+        changes_derived_constants=True,
+        find=_make_finder("body_mass"),
     ),
-    "mass.offset": ModelFieldEffect(
-        ("body_ipos",), _shift(_find_mass_centre_fields), changes_derived_constants=True
+    "mass.offset": _make_effect(
+        _shift,
+        _find_mass_centre_fields,
+        "body_ipos",
+        changes_derived_constants=True,
+        operation="add",
     ),
-    "inertia.scale": ModelFieldEffect(
-        ("body_inertia",), _scale(_make_body_finder("body_inertia")), changes_derived_constants=True
+    "inertia.scale": _make_effect(
+        _scale,
+        _make_finder("body_inertia"),
+        "body_inertia",
+        changes_derived_constants=True,
+        operation="scale",
     ),
-    "actuator.stiffness": ModelFieldEffect(_SERVO_FIELDS, _scale(_make_servo_gain_finder(1))),
-    "actuator.damping": ModelFieldEffect(_SERVO_FIELDS, _scale(_make_servo_gain_finder(2))),
-    "joint.zero": ModelFieldEffect(
-        ("qpos0",), _shift(lambda r, place: [[ModelField("qpos0", (r.joint(place).position,))]])
-    ),
+    "actuator.stiffness": _make_effect(_scale, _make_servo_gain_finder(1), *_SERVO_FIELDS),
+    "actuator.damping": _make_effect(_scale, _make_servo_gain_finder(2), *_SERVO_FIELDS),
+    "joint.zero": ModelFieldEffect(("qpos0",), _shift(_make_finder("qpos0"))),
     "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
     "link.length": ModelFieldEffect(
-        ("body_pos",), _scale(_make_body_finder("body_pos")), changes_derived_constants=True
+        ("body_pos",), _scale(_make_finder("body_pos")), changes_derived_constants=True
     ),
     "gravity.compensation": ModelFieldEffect(
         ("body_gravcomp",), _compensate_gravity, changes_derived_constants=True
@@ -536,8 +565,17 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
         _add_payload,
         changes_derived_constants=True,
     ),
-    "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
-    "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
+    "gravity.scale": ModelFieldEffect(
+        ("opt.gravity",),
+        _scale_gravity,
+        find=lambda _robot, _place: [[ModelField("opt.gravity", ())]],
+        operation="scale",
+    ),
+    "gravity.tilt": ModelFieldEffect(
+        ("opt.gravity",),
+        _tilt_gravity,
+        find=lambda _robot, _place: [[ModelField("opt.gravity", (axis,))] for axis in (0, 1)],
+    ),
     "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
     "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
     "contact.softness": ModelFieldEffect(("pair_solref",), _scale_solref(0)),
@@ -546,7 +584,9 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
         ("geom_size", "geom_rbound", "geom_aabb", "bvh_aabb"), _scale_radius
     ),
     "actuator.limit": ModelFieldEffect(
-        ("actuator_forcelimited", "actuator_forcerange"), _limit_force
+        ("actuator_forcelimited", "actuator_forcerange"),
+        _limit_force,
+        find=_find_force_range_fields,
     ),
 }
 """Model-field effects by name.
@@ -564,36 +604,6 @@ def get_write_order(effect: str) -> int:
     return int(effect in ("joint.zero", "payload"))
 
 
-Operation = Literal["abs", "add", "scale"]
-"""Operation that applies a random number to a field: replace, add to, or multiply its number."""
-
-_FIELDS: Mapping[str, Find] = {
-    "drag.linear": _make_dof_finder("dof_damping"),
-    "drag.quadratic": _make_dof_finder("dof_dampingpoly", 0),
-    "friction.coulomb": _make_dof_finder("dof_frictionloss"),
-    "inertia.armature": _make_dof_finder("dof_armature"),
-    "spring.linear": _make_joint_finder("jnt_stiffness"),
-    "spring.cubic": _make_joint_finder("jnt_stiffnesspoly", 1),
-    "actuator.limit": _find_force_range_fields,
-    "actuator.stiffness": _make_servo_gain_finder(1),
-    "actuator.damping": _make_servo_gain_finder(2),
-    "mass.scale": _make_body_finder("body_mass"),
-    "mass.offset": _find_mass_centre_fields,
-    "inertia.scale": _make_body_finder("body_inertia"),
-    "gravity.scale": lambda _robot, _place: [[ModelField("opt.gravity", ())]],
-    "gravity.tilt": _make_gravity_finder(0, 1),
-}
-_OPERATIONS: Mapping[str, Operation] = {
-    "mass.offset": "add",
-    "inertia.scale": "scale",
-    "gravity.scale": "scale",
-}
-"""Operations other than ``abs``, by effect.
-
-A position is shifted. A tensor or a vector is scaled, so that it keeps its direction.
-"""
-
-
 def model_fields(robot: RobotModel, effect: str, place: str) -> list[list[ModelField]]:
     """Find the elements of the compiled model that an effect changes, by coefficient.
 
@@ -606,9 +616,10 @@ def model_fields(robot: RobotModel, effect: str, place: str) -> list[list[ModelF
         For each coefficient, the elements that hold its number, the main one first; empty if the
         model has no such number.
     """
-    return _FIELDS[effect](robot, place) if effect in _FIELDS else []
+    found = MODEL_FIELD_EFFECTS.get(effect)
+    return found.find(robot, place) if found and found.find else []
 
 
 def operation_of(effect: str) -> Operation:
     """Return how a random number is applied to the field of an effect."""
-    return _OPERATIONS.get(effect, "abs")
+    return MODEL_FIELD_EFFECTS[effect].operation if effect in MODEL_FIELD_EFFECTS else "abs"
