@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError, make_read_only
+from sims.core.toml_validation import check_known_names
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
 from sims.recording.drive_switches import apply_drive_switches
@@ -28,7 +29,6 @@ from sims.recording.recording_description import (
     RecordingDescription,
     RunMetadata,
     check_description,
-    check_run_names,
     model_in,
     read_meta,
     read_system_name,
@@ -257,7 +257,9 @@ def _assemble_recording(
         description_path: its path, for messages.
         model: model file of a robot; None for a system.
     """
-    check_run_names(description_path, description.runs, [part.name for part in parts])
+    check_known_names(
+        f"entry in [runs] of {description_path}", description.runs, [part.name for part in parts]
+    )
     switched = apply_drive_switches(
         table, [_make_run(table, part, description) for part in parts], description.switches
     )

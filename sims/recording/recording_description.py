@@ -60,6 +60,9 @@ _TOP_LEVEL_KEYS = (
 )
 """Keys allowed at the top level of the file."""
 
+_COLUMN_KEYS = ("unit", "scale", "offset", "column", "matrix", "file")
+"""Keys allowed in the table of a channel or an input."""
+
 HOLD_MODES = ("zero", "linear")
 """How an input continues between two samples: it is held (zero order) or interpolated linearly."""
 
@@ -197,7 +200,8 @@ def read_system_name(path: str | Path) -> str:
     Raises:
         InputError: The description is missing or malformed, or states no system.
     """
-    return _read_system_name(*read_meta(Path(path)))
+    description, meta = read_meta(Path(path))
+    return _check_system_name(description, meta)
 
 
 def get_description_path(table: Path) -> Path:
@@ -228,11 +232,8 @@ def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str
         InputError: The description is missing or malformed.
     """
     description = get_description_path(path)
-    meta = read_toml(description)
-    columns = {
-        **_read_columns(description, "channel", meta, _list_channels(declared)),
-        **_read_columns(description, "input", meta, declared.inputs),
-    }
+    reader = _DescriptionReader(description, read_toml(description), declared)
+    columns = {**reader.read_channels(), **reader.read_columns("input", declared.inputs)}
     return {
         name: (str(c.table["unit"]), c.scale.gain, float(c.table.get("scale", 1.0)))
         for name, c in columns.items()
@@ -271,9 +272,6 @@ def check_description(
 ) -> RecordingDescription:
     """Check a description against the system's channels, inputs, constants and states.
 
-    Tables are checked in this order: channels, inputs, constants, runs, extra columns, and columns
-    that switch drives.
-
     Args:
         path: Path of the description, for messages.
         meta: Content of the description, as in `NAME.toml`.
@@ -285,128 +283,10 @@ def check_description(
     Raises:
         InputError: The description is malformed; the message is one line.
     """
-    _check_known_names(path, "", meta, _TOP_LEVEL_KEYS)
-    if "free" in meta and "model" not in meta:
-        raise make_error(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
-    title = check_text(path, "title", meta.get("title", path.stem))
-    _refuse_poses(path, meta, declared)
-    channels = _read_columns(path, "channel", meta, _list_channels(declared))
-    orientations = _find_orientations(path, channels, declared)
-    _refuse_inputs(path, meta, declared)
-    inputs = _read_columns(path, "input", meta, declared.inputs)
-    if not channels:
-        raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
-    constants = _read_constants(path, "constants", meta.get("constants", {}), declared)
-    _check_constants_possible(path, "constants", constants, declared)
-    # The names of the runs are checked after the table was read (`check_run_names`).
-    run_tables = get_subtable(path, meta, "runs")
-    runs = {
-        name: _read_run(path, name, run_table, declared) for name, run_table in run_tables.items()
-    }
-    # A robot has no system name: its model file is stated instead.
-    is_robot = declared.has_model
-    extra = _read_extra_columns(path, meta, declared)
-    switches = _read_drive_switches(path, meta, declared)
-    extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
-    sources = read_sources(
-        path,
-        meta,
-        {name: column.table for name, column in (*channels.items(), *inputs.items())},
-        extra,
-    )
-    extra_units = {name: str(table["unit"]) for name, table in extra.items()}
-    return RecordingDescription(
-        system=declared.name if is_robot else _read_system_name(path, meta),
-        title=title,
-        channels={name: column.scale for name, column in channels.items()},
-        inputs={name: column.scale for name, column in inputs.items()},
-        noise=_convert_quaternion_noise(_read_noises(path, channels, declared), orientations),
-        constants=constants,
-        runs=runs,
-        extra=extra_units,
-        initial_pose_scales=_read_pose_columns(path, extra_units, declared),
-        linear=frozenset(
-            name for name, column in inputs.items() if _read_interpolation(path, name, column)
-        ),
-        sources=sources,
-        switches=switches,
-        wrapped=_read_wrapped_channels(path, channels, inputs, declared),
-        orientations=orientations,
-    )
+    return _DescriptionReader(path, meta, declared).read()
 
 
-def _read_wrapped_channels(
-    path: Path,
-    channels: Mapping[str, _Column],
-    inputs: Mapping[str, _Column],
-    declared: DeclaredSignals,
-) -> dict[str, str]:
-    """Return the channels whose whole turns are restored: angles recorded within one turn.
-
-    Such a channel has an entry `unwrap`: true, or the name of the command whose turn it shares. The
-    result has this name, or "" for true.
-
-    Args:
-        path: path of the description, for messages.
-        channels: columns of the channels.
-        inputs: columns of the inputs.
-        declared: signals that the system declares.
-    """
-    units = {channel.name: channel.unit for channel in _list_channels(declared)}
-    commands_by_channel = {}
-    for name, column in channels.items():
-        value = column.table.get("unwrap", False)
-        key = f"channels.{name}.unwrap"
-        if not isinstance(value, (bool, str)):
-            raise make_error(
-                path, key, "true, or the name of the command that determines the turn", value
-            )
-        if isinstance(value, str):
-            check_known_names(f"{key} of {path}", [value], inputs)
-        if value and units[name] != "rad":
-            raise make_error(
-                path, key, f"it with an angle alone ({name} is in {units[name]})", value
-            )
-        if value:
-            commands_by_channel[name] = value if isinstance(value, str) else ""
-    return commands_by_channel
-
-
-def _read_drive_switches(
-    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
-) -> tuple[DriveSwitch, ...]:
-    """Read and check the columns that say when drives are on.
-
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-        declared: channels and inputs that the system declares.
-    """
-    switches = read_switches(path, meta)
-    names = [signal.name for signal in (*declared.channels, *declared.inputs)]
-    actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
-    check_switches(path, switches, actuators, ["run", "t", *names])
-    return switches
-
-
-def check_run_names(path: Path, marked: Iterable[str], table_names: Iterable[str]) -> None:
-    """Check that all runs in the description exist in the table.
-
-    Raises:
-        InputError: The description mentions another run.
-    """
-    _check_known_names(path, "runs", marked, table_names)
-
-
-def _check_known_names(
-    path: Path, table_name: str, entry_names: Iterable[str], allowed_names: Iterable[str]
-) -> None:
-    check_known_names(
-        f"entry {f'in [{table_name}] ' if table_name else ''}of {path}", entry_names, allowed_names
-    )
-
-
-def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
+def _check_system_name(path: Path, meta: Mapping[str, Any]) -> str:
     """Return the name of the system that a description states."""
     system = meta.get("system")
     if not isinstance(system, str):
@@ -414,143 +294,15 @@ def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
     return system
 
 
-def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
-    """Return the units of the states of floating bodies, by name; empty if there are none."""
-    units: Mapping[str, str] = getattr(_get_system(declared), "floating_state_units", {})
-    return units
-
-
-def _get_orientations(declared: DeclaredSignals) -> Mapping[str, tuple[float, ...]]:
-    """Return the orientation in the model file of floating bodies whose pose is recorded."""
-    orientations: Mapping[str, tuple[float, ...]] = getattr(
-        _get_system(declared), "base_orientations", {}
-    )
-    return orientations
-
-
-def _list_channels(declared: DeclaredSignals) -> list[Channel]:
-    """List the channels of a system, and the quaternions from which some of them are computed."""
-    quaternions = [
-        Channel(f"q.{base}.{entry}", "1")
-        for base in _get_orientations(declared)
-        for entry in QUATERNION_ENTRIES
-    ]
-    return [*declared.channels, *quaternions]
-
-
-def _find_orientations(
-    path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
-) -> dict[str, Array]:
-    """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
-
-    A motion capture system, for example, records quaternions where the robot has joints; they are
-    converted relative to the orientation in the model file. Bodies without such channels are left
-    out.
-
-    Args:
-        path: file of the description, for error messages.
-        channels: columns of the channels.
-        declared: signals that the system declares.
-
-    Raises:
-        InputError: A quaternion is incomplete, or the angles are recorded in addition.
-    """
-    found = {}
-    for base, reference in _get_orientations(declared).items():
-        names = [f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES]
-        recorded = [name for name in names if name in channels]
-        if not recorded:
-            continue
-        missing = [name for name in names if name not in channels]
-        if missing:
-            raise InputError(f"{path}: expected all of {', '.join(names)}, found no {missing[0]}")
-        doubled = [f"q.{base}.{angle}" for angle in ANGLES if f"q.{base}.{angle}" in channels]
-        if doubled:
-            raise InputError(
-                f"{path}: expected {names[0]} or {doubled[0]}, found both; leave one out"
-            )
-        found[base] = np.array(reference)
-    return found
-
-
-def _convert_quaternion_noise(
-    noises: Mapping[str, float], orientations: Mapping[str, Array]
-) -> dict[str, float]:
-    """Replace the noise of quaternions by that of the angles, which is twice as large.
-
-    A small rotation by an angle changes an entry of the quaternion by half of it.
-
-    Args:
-        noises: stated noise of each signal.
-        orientations: bodies whose orientation is recorded as a quaternion.
-    """
-    result = dict(noises)
-    for base in orientations:
-        stated = [result.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES]
-        if max(stated) > 0:
-            result |= {f"q.{base}.{angle}": 2.0 * max(stated) for angle in ANGLES}
-    return result
-
-
 def _get_system(declared: DeclaredSignals) -> object:
     """Return the system of a simulator, or the system itself."""
     return getattr(declared, "system", declared)
 
 
-def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
-    """Refuse inputs whose effect depends on quantities that a recording does not contain.
-
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-        declared: channels and inputs that the system declares.
-
-    Raises:
-        InputError: the description has such an input.
-    """
-    reasons: Mapping[str, str] = getattr(_get_system(declared), "refused_inputs", {})
-    input_tables = dotted(get_subtable(path, meta, "inputs"), reasons)
-    for name in (name for name in reasons if name in input_tables):
-        raise InputError(f"{path}: input {name}: {reasons[name]}")
-
-
-def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
-    """Refuse poses of floating bodies among the channels, and explain where to state them.
-
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-        declared: channels and inputs that the system declares.
-
-    Raises:
-        InputError: a pose is among the channels.
-    """
-    units = get_floating_state_units(declared)
-    channel_tables = dotted(get_subtable(path, meta, "channels"), units)
-    for name in (name for name in units if name in channel_tables):
-        raise InputError(
-            f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
-            f'[extra."{name}"] the column\'s first cell says where a run begins'
-        )
-
-
-def _read_columns(
-    path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
-) -> dict[str, _Column]:
-    """Return the conversion to SI units of each column of one kind ("channel" or "input").
-
-    Args:
-        path: path of the description, for messages.
-        kind: ``channel`` or ``input``.
-        meta: content of the description.
-        declared: signals of this kind that the system declares.
-    """
-    units = {signal.name: signal.unit for signal in declared}
-    tables = dotted(get_subtable(path, meta, f"{kind}s"), units)
-    check_known_names(f"{kind} in {path}", tables, units)
-    return {
-        name: _read_column(path, kind, name, table, units[name]) for name, table in tables.items()
-    }
+def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
+    """Return the units of the states of floating bodies, by name; empty if there are none."""
+    units: Mapping[str, str] = getattr(_get_system(declared), "floating_state_units", {})
+    return units
 
 
 def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -577,225 +329,349 @@ def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]
     return flat_table
 
 
-def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
-    """Check the table of one channel or input, and compute its conversion to SI units.
+class _DescriptionReader:
+    """Reader of the tables of one description, which are checked against a system."""
 
-    The table states a unit, and perhaps a scale s and an offset o, such as those of an encoder.
-    With the conversion x -> g x + b of the unit, a value x of the log becomes g (s x + o) + b.
+    def __init__(self, path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
+        """Store the description, and list the signals that it may state.
 
-    Args:
-        path: Path of the description, for messages.
-        kind: ``channel`` or ``input``.
-        name: Name of the signal.
-        value: Table from the description.
-        unit: SI unit of the signal.
-    """
-    location, usual = f"{kind} {name}", f'unit = "{unit}"'
-    table = check_table(path, location, value, f"a table with {usual}")
-    # Noise of an input is not allowed, because simulations cannot use it.
-    allowed_keys = (
-        "unit",
-        "scale",
-        "offset",
-        "column",
-        "matrix",
-        "file",
-        *(("noise", "unwrap") if kind == "channel" else ("hold",)),
-    )
-    _check_known_names(path, f"{kind}s.{name}", table, allowed_keys)
-    # The unit is required: a log in degrees without a unit would be read as radians.
-    stated_unit = check_text(
-        path, location, table.get("unit"), f"{usual} or one that converts to it"
-    )
-    try:
-        converted = compute_unit_scale(stated_unit, unit)
-    except InputError as error:
-        raise InputError(f"{path}: {location}: {error}") from None
-    if not {"scale", "offset"} & table.keys():
-        return _Column(converted, table)
-    factor = check_finite(path, f"{kind}s.{name}.scale", table.get("scale", 1.0))
-    if factor == 0:
-        raise make_error(path, f"{kind}s.{name}.scale", "a factor that is not zero", table["scale"])
-    # The offset is in the stated unit, so that the zero of an encoder can be copied from its log.
-    offset = check_finite(path, f"{kind}s.{name}.offset", table.get("offset", 0.0))
-    gain = factor * converted.gain
-    return _Column(UnitScale(gain, converted.gain * offset + converted.offset), table)
+        `orientations` are those in the model file of floating bodies whose pose is recorded. Some
+        channels of such a body are computed from its quaternion, which may be stated instead.
 
-
-def _read_interpolation(path: Path, name: str, column: _Column) -> bool:
-    """Return whether an input is interpolated linearly between samples.
-
-    Args:
-        path: path of the description, for messages.
-        name: name of the input.
-        column: table of the input in the description.
-    """
-    hold_mode = column.table.get("hold", "zero")
-    if hold_mode not in HOLD_MODES:
-        raise make_error(
-            path, f"inputs.{name}.hold", " or ".join(f'"{mode}"' for mode in HOLD_MODES), hold_mode
+        Args:
+            path: Path of the description, for messages.
+            meta: Content of the description.
+            declared: System, or simulator of it.
+        """
+        self.path, self.meta, self.declared = path, meta, declared
+        self.system = _get_system(declared)
+        self.pose_units = get_floating_state_units(declared)
+        self.orientations: Mapping[str, tuple[float, ...]] = getattr(
+            self.system, "base_orientations", {}
         )
-    return bool(hold_mode == "linear")
+        quaternions = [
+            Channel(f"q.{base}.{entry}", "1")
+            for base in self.orientations
+            for entry in QUATERNION_ENTRIES
+        ]
+        self.possible_channels = {c.name: c for c in (*declared.channels, *quaternions)}
 
+    def read(self) -> RecordingDescription:
+        """Read all tables.
 
-def _read_noises(
-    path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
-) -> dict[str, float]:
-    """Return the standard deviation of each channel's noise where stated, in SI units.
+        They are checked in this order: channels, inputs, constants, runs, extra columns, and
+        columns that switch drives.
+        """
+        path, meta, declared = self.path, self.meta, self.declared
+        self._check_known_names("", meta, _TOP_LEVEL_KEYS)
+        if "free" in meta and "model" not in meta:
+            raise make_error(
+                path, "free", "it with model = FILE alone (else --free A,B)", meta["free"]
+            )
+        title = check_text(path, "title", meta.get("title", path.stem))
+        channels = self.read_channels()
+        orientations = self._find_orientations(channels)
+        # The effect of some inputs depends on quantities that a recording does not contain.
+        reasons: Mapping[str, str] = getattr(self.system, "refused_inputs", {})
+        tables = self._get_tables("inputs", reasons)
+        for name in (name for name in reasons if name in tables):
+            raise InputError(f"{path}: input {name}: {reasons[name]}")
+        inputs = self.read_columns("input", declared.inputs)
+        if not channels:
+            raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
+        constants = self._read_constants("constants", meta.get("constants", {}))
+        self._check_constants_possible("constants", constants)
+        # The names of the runs are checked after the table was read.
+        runs = {
+            name: self._read_run(name, table)
+            for name, table in get_subtable(path, meta, "runs").items()
+        }
+        extra = self._read_extra_columns()
+        switches = self._read_drive_switches()
+        extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
+        sources = read_sources(
+            path,
+            meta,
+            {name: column.table for name, column in (*channels.items(), *inputs.items())},
+            extra,
+        )
+        return RecordingDescription(
+            # A robot has no system name: its model file is stated instead.
+            system=declared.name if declared.has_model else _check_system_name(path, meta),
+            title=title,
+            channels={name: column.scale for name, column in channels.items()},
+            inputs={name: column.scale for name, column in inputs.items()},
+            noise=self._read_noises(channels, orientations),
+            constants=constants,
+            runs=runs,
+            extra={name: str(table["unit"]) for name, table in extra.items()},
+            initial_pose_scales={
+                name: self._compute_scale(f"extra {name}", str(extra[name]["unit"]), unit)
+                for name, unit in self.pose_units.items()
+                if name in extra
+            },
+            linear=frozenset(
+                name for name, column in inputs.items() if self._is_interpolated(name, column)
+            ),
+            sources=sources,
+            switches=switches,
+            wrapped=self._read_wrapped_channels(channels, inputs),
+            orientations=orientations,
+        )
 
-    It is stated in the unit of the column. Values beyond plausible sizes are refused, since the
-    unit is probably wrong.
+    def _check_known_names(
+        self, table_name: str, entry_names: Iterable[str], allowed_names: Iterable[str]
+    ) -> None:
+        location = f"in [{table_name}] " if table_name else ""
+        check_known_names(f"entry {location}of {self.path}", entry_names, allowed_names)
 
-    Args:
-        path: path of the description, for messages.
-        channels: columns of the channels.
-        declared: signals that the system declares, with their scales.
-    """
-    sizes = {channel.name: channel.scale for channel in _list_channels(declared)}
-    noises = {}
-    for name, column in channels.items():
-        if "noise" not in column.table:
-            continue
-        # A standard deviation has no offset and no sign.
-        noises[name] = abs(column.scale.gain) * _read_noise(path, name, column.table["noise"])
-        if not 1 / _MAX_NOISE_FACTOR < noises[name] / sizes[name] < _MAX_NOISE_FACTOR:
-            expected = f"that of values of about {sizes[name]:g} in SI units"
-            raise make_error(path, f"channels.{name}.noise", expected, column.table["noise"])
-    return noises
+    def _get_tables(self, key: str, names: Collection[str]) -> dict[str, Any]:
+        """Return the tables below a key of the description, by their full names (`dotted`)."""
+        return dotted(get_subtable(self.path, self.meta, key), names)
 
+    def _compute_scale(self, location: str, unit: str, target: str) -> UnitScale:
+        """Return the conversion of a stated unit, with the location in the message of an error."""
+        try:
+            return compute_unit_scale(unit, target)
+        except InputError as error:
+            raise InputError(f"{self.path}: {location}: {error}") from None
 
-def _read_noise(path: Path, name: str, value: Any) -> float:
-    """Check the stated standard deviation of a channel's noise, in the unit of the column.
+    # -- columns
 
-    Args:
-        path: path of the description, for messages.
-        name: name of the channel.
-        value: value of the entry ``noise``.
-    """
-    key = f"channels.{name}.noise"
-    noise = check_finite(path, key, value)
-    if noise <= 0:
-        raise make_error(path, key, "more than 0 (leave it out if unknown)", value)
-    return noise
+    def read_channels(self) -> dict[str, _Column]:
+        """Return the columns of the channels.
 
+        Poses of floating bodies are refused, with an explanation of where to state them.
+        """
+        tables = self._get_tables("channels", self.pose_units)
+        for name in (name for name in self.pose_units if name in tables):
+            raise InputError(
+                f"{self.path}: channel {name}: expected a joint or a sensor, found where a body "
+                f'floats; as [extra."{name}"] the column\'s first cell says where a run begins'
+            )
+        return self.read_columns("channel", list(self.possible_channels.values()))
 
-def _read_extra_columns(
-    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
-) -> dict[str, Mapping[str, Any]]:
-    """Return the tables of the columns that belong to no channel or input.
+    def read_columns(self, kind: str, signals: Sequence[Channel]) -> dict[str, _Column]:
+        """Return the conversion to SI units of each column of one kind.
 
-    Args:
-        path: path of the description, for messages.
-        meta: content of the description.
-        declared: channels and inputs that the system declares.
-    """
-    # A forgotten channel must not be accepted as an unused column.
-    signals = (*_list_channels(declared), *declared.inputs)
-    used_names = ["run", "t", *(signal.name for signal in signals)]
-    tables: dict[str, Mapping[str, Any]] = {}
-    extra_tables = dotted(get_subtable(path, meta, "extra"), get_floating_state_units(declared))
-    for name, column_table in extra_tables.items():
-        if name in used_names:
-            remedy = "declare it as channel or input"
-            raise InputError(f"{path}: extra.{name}: is declared as a column already; {remedy}")
-        unit = column_table.get("unit") if isinstance(column_table, dict) else None
-        if not isinstance(unit, str):
-            raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', column_table)
-        _check_known_names(path, f"extra.{name}", column_table, ("unit", "file", "column"))
-        tables[name] = column_table
-    return tables
+        Args:
+            kind: ``channel`` or ``input``.
+            signals: signals of this kind that may be stated.
+        """
+        units = {signal.name: signal.unit for signal in signals}
+        tables = self._get_tables(f"{kind}s", units)
+        check_known_names(f"{kind} in {self.path}", tables, units)
+        return {
+            name: self._read_column(kind, name, table, units[name])
+            for name, table in tables.items()
+        }
 
+    def _read_column(self, kind: str, name: str, value: Any, unit: str) -> _Column:
+        """Check the table of one channel or input, and compute its conversion to SI units.
 
-def _read_pose_columns(
-    path: Path, extra: Mapping[str, str], declared: DeclaredSignals
-) -> dict[str, UnitScale]:
-    """Return the conversion to SI units of the columns with initial poses of floating bodies.
+        The table states a unit, and perhaps a scale s and an offset o, such as those of an encoder.
+        With the conversion x -> g x + b of the unit, a value x of the log becomes g (s x + o) + b.
 
-    Args:
-        path: path of the description, for messages.
-        extra: unit of each extra column.
-        declared: signals that the system declares.
-    """
-    pose_scales = {}
-    for name, unit in get_floating_state_units(declared).items():
-        if name in extra:
-            try:
-                pose_scales[name] = compute_unit_scale(extra[name], unit)
-            except InputError as error:
-                raise InputError(f"{path}: extra {name}: {error}") from None
-    return pose_scales
+        Args:
+            kind: ``channel`` or ``input``.
+            name: Name of the signal.
+            value: Table from the description.
+            unit: SI unit of the signal.
+        """
+        path, location, usual = self.path, f"{kind} {name}", f'unit = "{unit}"'
+        table = check_table(path, location, value, f"a table with {usual}")
+        # Noise of an input is not allowed, because simulations cannot use it.
+        own_keys = ("noise", "unwrap") if kind == "channel" else ("hold",)
+        self._check_known_names(f"{kind}s.{name}", table, (*_COLUMN_KEYS, *own_keys))
+        # The unit is required: a log in degrees without a unit would be read as radians.
+        stated_unit = check_text(
+            path, location, table.get("unit"), f"{usual} or one that converts to it"
+        )
+        converted = self._compute_scale(location, stated_unit, unit)
+        if not {"scale", "offset"} & table.keys():
+            return _Column(converted, table)
+        factor = check_finite(path, f"{kind}s.{name}.scale", table.get("scale", 1.0))
+        if factor == 0:
+            raise make_error(
+                path, f"{kind}s.{name}.scale", "a factor that is not zero", table["scale"]
+            )
+        # The offset is in the stated unit, so that the zero of an encoder can be copied from its
+        # log.
+        offset = check_finite(path, f"{kind}s.{name}.offset", table.get("offset", 0.0))
+        gain = factor * converted.gain
+        return _Column(UnitScale(gain, converted.gain * offset + converted.offset), table)
 
+    def _is_interpolated(self, name: str, column: _Column) -> bool:
+        """Return whether an input is interpolated linearly between samples."""
+        hold_mode = column.table.get("hold", "zero")
+        if hold_mode not in HOLD_MODES:
+            expected = " or ".join(f'"{mode}"' for mode in HOLD_MODES)
+            raise make_error(self.path, f"inputs.{name}.hold", expected, hold_mode)
+        return bool(hold_mode == "linear")
 
-def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
-    """Check the table of one run: its constants, its initial state, and whether it is held out.
+    def _read_wrapped_channels(
+        self, channels: Mapping[str, _Column], inputs: Mapping[str, _Column]
+    ) -> dict[str, str]:
+        """Return the channels whose whole turns are restored: angles recorded within one turn.
 
-    Args:
-        path: path of the description, for messages.
-        name: name of the run.
-        value: its table.
-        declared: constants and states that the system declares.
-    """
-    location = f"runs.{name}"
-    table = check_table(path, location, value)
-    constant_names = [c.name for c in declared.constants]
-    _check_known_names(
-        path,
-        location,
-        table,
-        ("constants", "initial", "held_out", "folder", "file", *constant_names),
-    )
-    held_out = table.get("held_out")
-    if held_out is not None:
-        check_type(path, f"{location}.held_out", held_out, bool, "true or false")
-    # The constants of a run may be in a table of their own or among its other entries.
-    constants = _read_constants(path, f"{location}.constants", table.get("constants", {}), declared)
-    direct_constants = {key: number for key, number in table.items() if key in constant_names}
-    for repeated_name in constants.keys() & direct_constants.keys():
-        raise InputError(f"{path}: {location}: constant {repeated_name} is given twice")
-    constants |= _read_constants(path, location, direct_constants, declared)
-    _check_constants_possible(path, location, constants, declared)
-    states = [*declared.states, *getattr(_get_system(declared), "activations", ())]
-    initial = _read_numbers(path, f"{location}.initial", table.get("initial", {}), states)
-    return RunMetadata(constants, initial, held_out)
+        Such a channel has an entry `unwrap`: true, or the name of the command whose turn it shares.
+        The result has this name, or "" for true.
+        """
+        commands_by_channel = {}
+        for name, column in channels.items():
+            value, key = column.table.get("unwrap", False), f"channels.{name}.unwrap"
+            if not isinstance(value, (bool, str)):
+                expected = "true, or the name of the command that determines the turn"
+                raise make_error(self.path, key, expected, value)
+            if isinstance(value, str):
+                check_known_names(f"{key} of {self.path}", [value], inputs)
+            unit = self.possible_channels[name].unit
+            if value and unit != "rad":
+                expected = f"it with an angle alone ({name} is in {unit})"
+                raise make_error(self.path, key, expected, value)
+            if value:
+                commands_by_channel[name] = value if isinstance(value, str) else ""
+        return commands_by_channel
 
+    def _find_orientations(self, channels: Mapping[str, _Column]) -> dict[str, Array]:
+        """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
 
-def _read_constants(
-    path: Path, key: str, value: Any, declared: DeclaredSignals
-) -> dict[str, float]:
-    return _read_numbers(path, key, value, [c.name for c in declared.constants])
+        A motion capture system, for example, records quaternions where the robot has joints; they
+        are converted relative to the orientation in the model file. Bodies without such channels
+        are left out.
 
+        Raises:
+            InputError: A quaternion is incomplete, or the angles are recorded in addition.
+        """
+        found = {}
+        for base, reference in self.orientations.items():
+            names = [f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES]
+            missing = [name for name in names if name not in channels]
+            if len(missing) == len(names):
+                continue
+            if missing:
+                raise InputError(
+                    f"{self.path}: expected all of {', '.join(names)}, found no {missing[0]}"
+                )
+            doubled = [f"q.{base}.{angle}" for angle in ANGLES if f"q.{base}.{angle}" in channels]
+            if doubled:
+                raise InputError(
+                    f"{self.path}: expected {names[0]} or {doubled[0]}, found both; leave one out"
+                )
+            found[base] = np.array(reference)
+        return found
 
-def _read_numbers(
-    path: Path, key: str, value: Any, allowed_names: Collection[str]
-) -> dict[str, float]:
-    """Check a table of finite numbers, whose names must be among the allowed ones.
+    def _read_noises(
+        self, channels: Mapping[str, _Column], orientations: Collection[str]
+    ) -> dict[str, float]:
+        """Return the standard deviation of each channel's noise where stated, in SI units.
 
-    Args:
-        path: path of the description, for messages.
-        key: key of the table.
-        value: the table.
-        allowed_names: names that may occur in it.
-    """
-    entries = dotted(check_table(path, key, value), allowed_names)
-    _check_known_names(path, key, entries, allowed_names)
-    return {name: check_finite(path, f"{key}.{name}", number) for name, number in entries.items()}
+        It is stated in the unit of the column. Values beyond plausible sizes are refused, since the
+        unit is probably wrong. The noise of quaternions is replaced by that of the angles, which is
+        twice as large: a small rotation by an angle changes an entry of the quaternion by half of
+        it.
 
+        Args:
+            channels: columns of the channels.
+            orientations: bodies whose orientation is recorded as a quaternion.
+        """
+        noises = {}
+        for name, column in channels.items():
+            if "noise" not in column.table:
+                continue
+            key, value = f"channels.{name}.noise", column.table["noise"]
+            noise = check_finite(self.path, key, value)
+            if noise <= 0:
+                raise make_error(self.path, key, "more than 0 (leave it out if unknown)", value)
+            # A standard deviation has no offset and no sign.
+            noises[name] = abs(column.scale.gain) * noise
+            size = self.possible_channels[name].scale
+            if not 1 / _MAX_NOISE_FACTOR < noises[name] / size < _MAX_NOISE_FACTOR:
+                expected = f"that of values of about {size:g} in SI units"
+                raise make_error(self.path, key, expected, value)
+        for base in orientations:
+            stated = [noises.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES]
+            if max(stated) > 0:
+                noises |= {f"q.{base}.{angle}": 2.0 * max(stated) for angle in ANGLES}
+        return noises
 
-def _check_constants_possible(
-    path: Path, key: str, constants: Mapping[str, float], declared: DeclaredSignals
-) -> None:
-    """Check that constants are physically possible, such as a positive mass.
+    def _read_extra_columns(self) -> dict[str, Mapping[str, Any]]:
+        """Return the tables of the columns that belong to no channel or input."""
+        # A forgotten channel must not be accepted as an unused column.
+        input_names = (signal.name for signal in self.declared.inputs)
+        used_names = ["run", "t", *self.possible_channels, *input_names]
+        tables = self._get_tables("extra", self.pose_units)
+        for name, table in tables.items():
+            if name in used_names:
+                remedy = "declare it as channel or input"
+                raise InputError(
+                    f"{self.path}: extra.{name}: is declared as a column already; {remedy}"
+                )
+            unit = table.get("unit") if isinstance(table, dict) else None
+            if not isinstance(unit, str):
+                raise make_error(self.path, f"extra {name}", 'a table with unit = "TEXT"', table)
+            self._check_known_names(f"extra.{name}", table, ("unit", "file", "column"))
+        return tables
 
-    Args:
-        path: path of the description, for messages.
-        key: key of their table.
-        constants: constants by name.
-        declared: constants that the system declares.
+    def _read_drive_switches(self) -> tuple[DriveSwitch, ...]:
+        """Read and check the columns that say when drives are on."""
+        switches = read_switches(self.path, self.meta)
+        names = [signal.name for signal in (*self.declared.channels, *self.declared.inputs)]
+        actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
+        check_switches(self.path, switches, actuators, ["run", "t", *names])
+        return switches
 
-    Raises:
-        InputError: a constant is impossible.
-    """
-    for constant in declared.constants:
-        if constant.name in constants and (expected := constant.wanted(constants[constant.name])):
-            value = constants[constant.name]
-            raise InputError(f"{path}: {key}.{constant.name}: expected {expected}, found {value:g}")
+    # -- runs and constants
+
+    def _read_run(self, name: str, value: Any) -> RunMetadata:
+        """Check the table of one run: constants, initial state, and whether it is held out."""
+        location = f"runs.{name}"
+        table = check_table(self.path, location, value)
+        constant_names = [c.name for c in self.declared.constants]
+        self._check_known_names(
+            location,
+            table,
+            ("constants", "initial", "held_out", "folder", "file", *constant_names),
+        )
+        held_out = table.get("held_out")
+        if held_out is not None:
+            check_type(self.path, f"{location}.held_out", held_out, bool, "true or false")
+        # The constants of a run may be in a table of their own or among its other entries.
+        constants = self._read_constants(f"{location}.constants", table.get("constants", {}))
+        direct_constants = {key: number for key, number in table.items() if key in constant_names}
+        for repeated_name in constants.keys() & direct_constants.keys():
+            raise InputError(f"{self.path}: {location}: constant {repeated_name} is given twice")
+        constants |= self._read_constants(location, direct_constants)
+        self._check_constants_possible(location, constants)
+        states = [*self.declared.states, *getattr(self.system, "activations", ())]
+        initial = self._read_numbers(f"{location}.initial", table.get("initial", {}), states)
+        return RunMetadata(constants, initial, held_out)
+
+    def _read_constants(self, key: str, value: Any) -> dict[str, float]:
+        return self._read_numbers(key, value, [c.name for c in self.declared.constants])
+
+    def _read_numbers(
+        self, key: str, value: Any, allowed_names: Collection[str]
+    ) -> dict[str, float]:
+        """Check a table of finite numbers, whose names must be among the allowed ones.
+
+        Args:
+            key: key of the table.
+            value: the table.
+            allowed_names: names that may occur in it.
+        """
+        entries = dotted(check_table(self.path, key, value), allowed_names)
+        self._check_known_names(key, entries, allowed_names)
+        return {
+            name: check_finite(self.path, f"{key}.{name}", number)
+            for name, number in entries.items()
+        }
+
+    def _check_constants_possible(self, key: str, constants: Mapping[str, float]) -> None:
+        """Check that constants are physically possible, such as a positive mass."""
+        for constant in self.declared.constants:
+            value = constants.get(constant.name)
+            if value is not None and (expected := constant.wanted(value)):
+                raise InputError(
+                    f"{self.path}: {key}.{constant.name}: expected {expected}, found {value:g}"
+                )
