@@ -16,10 +16,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.log_formats.read_errors import convert_read_errors
-
-MAX_COLUMNS = 10_000
-"""Maximum number of columns of a log, and of entries of a list in a cell."""
+from sims.recording.log_formats.log_columns import MAX_COLUMNS, convert_read_errors
 
 
 def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
@@ -37,12 +34,6 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
         else:
             columns[name] = make_read_only(values)
     return columns, texts
-
-
-def make_unreadable_error(path: Path, error: Exception) -> InputError:
-    """Make the error for a file that pyarrow cannot read."""
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: not a Parquet file: {reason[:300]}")
 
 
 def is_numeric_type(kind: Any) -> bool:

@@ -31,11 +31,8 @@ import numpy as np
 
 from sims.core.files import require_file
 from sims.core.simulator import Array, InputError
-from sims.recording.log_formats.hdf5_and_parquet import (
-    is_numeric_type,
-    make_unreadable_error,
-    read_numeric_columns,
-)
+from sims.recording.log_formats.hdf5_and_parquet import is_numeric_type, read_numeric_columns
+from sims.recording.log_formats.log_columns import convert_read_errors
 
 FRAMES_LOG = "frames"
 """Name of the log of an episode."""
@@ -108,7 +105,7 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
     info_file, *files = list_episode_files(dataset, episode)
     parts = []
     for file in files:
-        try:
+        with convert_read_errors(file, "a Parquet file"):
             # Images stored in the table are not loaded.
             column_names = [
                 field.name for field in parquet.read_schema(file) if is_numeric_type(field.type)
@@ -116,8 +113,6 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
             rows = [(EPISODE_COLUMN, "==", episode)]
             parts.append(parquet.read_table(file, columns=column_names, filters=rows))
             table = pyarrow.concat_tables(parts)
-        except (pyarrow.ArrowException, OSError) as error:
-            raise make_unreadable_error(file, error) from None
     numeric_columns, texts = read_numeric_columns(table)
     columns: dict[str, Array] = {}
     for name, values in numeric_columns.items():
@@ -168,16 +163,13 @@ def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dic
     Args:
         stamps: Path, time of last change (ns) and size (bytes) of each file.
     """
-    import pyarrow
     import pyarrow.parquet as parquet
 
     files_by_episode: dict[int, list[Path]] = {}
     for file, *_ in stamps:
-        try:
+        with convert_read_errors(file, "a Parquet file"):
             column = parquet.read_table(file, columns=[EPISODE_COLUMN]).column(EPISODE_COLUMN)
             numbers = np.unique(column.to_numpy().astype(np.int64)).tolist()
-        except (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
-            raise make_unreadable_error(file, error) from None
         for number in numbers:
             files_by_episode.setdefault(number, []).append(file)
     return files_by_episode

@@ -1,14 +1,17 @@
-"""Columns of a log, by name."""
+"""Columns of a log, by name, and one-line errors of the libraries that read logs."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sims.core.simulator import Array, InputError, make_read_only
 
+MAX_COLUMNS = 10_000
+"""Maximum number of columns of a log, and of entries of a list in a cell."""
 _LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
 
 
@@ -101,3 +104,29 @@ class LogFile:
             else:
                 column_names += [f"{name}[{k}]" for k in range(values.shape[1])]
         return column_names
+
+
+@contextmanager
+def convert_read_errors(path: Path, kind: str, hint: str = "") -> Iterator[None]:
+    """Convert all errors of the library that reads a file.
+
+    Args:
+        path: Path of the file.
+        kind: Kind of the file with its article, for the message.
+        hint: Advice at the end of the message.
+
+    Raises:
+        InputError: The file cannot be read; the message is one line.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except MemoryError:
+        # A damaged file may state any size.
+        raise InputError(
+            f"{path}: the file is damaged, or its content does not fit into memory"
+        ) from None
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not {kind} that can be read: {reason[:300]}{hint}") from None

@@ -18,8 +18,8 @@ from sims.core.files import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_and_parquet, lerobot_dataset, ros_bags
 from sims.recording.log_formats.column_names import arrays_by_name
-from sims.recording.log_formats.hdf5_and_parquet import make_unreadable_error, read_numeric_columns
-from sims.recording.log_formats.log_columns import LogFile
+from sims.recording.log_formats.hdf5_and_parquet import read_numeric_columns
+from sims.recording.log_formats.log_columns import LogFile, convert_read_errors
 from sims.recording.log_formats.ros_bags import TIME_COLUMN
 from sims.recording.log_formats.text_table import read_text_table
 
@@ -161,21 +161,19 @@ def _read_npz(path: Path) -> LogFile:
     """
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
-    try:
-        # Opened here, because numpy does not close a file that is not an archive.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            for name in arrays.files:
-                values = arrays[name]
-                if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:
-                    is_text_list = values.dtype.kind == "U" and values.ndim == 1
-                    texts[name] = values.tolist() if is_text_list else []
-                else:
-                    columns[name] = make_read_only(values.astype(np.float64))
-    except (ValueError, EOFError, KeyError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not an archive of arrays of numbers: {reason}") from None
-    except Exception as error:  # numpy raises many kinds of errors
-        raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
+    # Opened here, because numpy does not close a file that is not an archive.
+    with (
+        convert_read_errors(path, "an archive of arrays of numbers"),
+        path.open("rb") as file,
+        np.load(file, allow_pickle=False) as arrays,
+    ):
+        for name in arrays.files:
+            values = arrays[name]
+            if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:
+                is_text_list = values.dtype.kind == "U" and values.ndim == 1
+                texts[name] = values.tolist() if is_text_list else []
+            else:
+                columns[name] = make_read_only(values.astype(np.float64))
     return _make_array_log(path, columns, texts)
 
 
@@ -210,13 +208,10 @@ def _read_torch_file(path: Path) -> LogFile:
 
 def _read_parquet(path: Path) -> LogFile:
     """Read the columns of a Parquet file, including lists."""
-    import pyarrow
     import pyarrow.parquet as parquet
 
-    try:
+    with convert_read_errors(path, "a Parquet file"):
         table = parquet.read_table(path)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise make_unreadable_error(path, error) from None
     columns, texts = read_numeric_columns(table)
     return LogFile(path, columns, tuple(texts), "row")
 

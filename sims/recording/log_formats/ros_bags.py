@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.log_formats.read_errors import convert_read_errors
+from sims.recording.log_formats.log_columns import convert_read_errors
 
 ENCODINGS = ("json", "protobuf")
 """Encodings of messages that are read here."""

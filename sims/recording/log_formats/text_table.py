@@ -27,8 +27,7 @@ from sims.recording.log_formats.column_names import (
     name_numbered_columns,
     read_unit,
 )
-from sims.recording.log_formats.hdf5_and_parquet import MAX_COLUMNS
-from sims.recording.log_formats.log_columns import LogFile
+from sims.recording.log_formats.log_columns import MAX_COLUMNS, LogFile
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Possible separators of the cells of a table; a blank means any number of blanks."""

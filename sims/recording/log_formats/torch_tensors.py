@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.log_formats.hdf5_and_parquet import MAX_COLUMNS
-from sims.recording.log_formats.read_errors import make_memory_error
+from sims.recording.log_formats.log_columns import MAX_COLUMNS, convert_read_errors
 
 ENDINGS = (".pt", ".pth")
 """File name endings of PyTorch files."""
@@ -111,22 +110,15 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
     Raises:
         InputError: The file is not a PyTorch archive; the message is one line.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _read_tensors(path, archive)
-    except zipfile.BadZipFile:
-        raise InputError(
-            f"{path}: expected a PyTorch file as a zip archive, found another format; save it "
-            "again with torch.save of PyTorch 1.6 or newer"
-        ) from None
-    except InputError:
-        raise
-    except MemoryError:
-        raise make_memory_error(path) from None
-    except Exception as error:  # a damaged archive or program can fail in any step
-        raise InputError(
-            f"{path}: not a PyTorch file that can be read ({type(error).__name__})"
-        ) from None
+    with convert_read_errors(path, "a PyTorch file"):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return _read_tensors(path, archive)
+        except zipfile.BadZipFile:
+            raise InputError(
+                f"{path}: expected a PyTorch file as a zip archive, found another format; save it "
+                "again with torch.save of PyTorch 1.6 or newer"
+            ) from None
 
 
 def _read_tensors(

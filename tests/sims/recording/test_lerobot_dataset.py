@@ -80,14 +80,16 @@ def test_what_is_not_there_or_not_whole_is_one_line(tmp_path):
     with pytest.raises(InputError, match=r"set: no episode 9; there are: 0 to 3"):
         read_log(folder / "episode_000009" / "frames")
     (folder / "data" / "chunk-000" / "episode_000001.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(InputError, match=r"episode_000001.parquet: not a Parquet file: "):
+    with pytest.raises(InputError, match=r"000001.parquet: not a Parquet file that can be read: "):
         read_log(folder / "episode_000000" / "frames")
     (tmp_path / "arm.xml").write_text(ARM)
-    with pytest.raises(InputError, match=r"\.parquet: not a Parquet file: "):
+    with pytest.raises(InputError, match=r"\.parquet: not a Parquet file that can be read: "):
         simgap.import_logs([folder], tmp_path / "arm.xml", tmp_path / "log.toml")
     assert not (tmp_path / "log.toml").exists()
     frames(0).drop(columns="episode_index").to_parquet(
         folder / "data" / "chunk-000" / "episode_000001.parquet"
     )
-    with pytest.raises(InputError, match=r"episode_000001.parquet: not a Parquet file: .*episode"):
+    with pytest.raises(
+        InputError, match=r"000001.parquet: not a Parquet file that can be read: .*episode"
+    ):
         list_episodes(folder)
