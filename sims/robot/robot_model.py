@@ -12,7 +12,7 @@ import numpy as np
 
 from sims.core.simulator import make_unknown_name_error
 from sims.recording.recorded_poses import ANGLES, POSITION_AXES
-from sims.robot.friction_form import FrictionForm
+from sims.robot.integrator_settings import FrictionForm
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing.collision_hulls import CollisionShapes
 
@@ -365,9 +365,9 @@ class RobotModel:
         for sensor_id in range(model.nsensor):
             name = model.sensor(sensor_id).name or f"sensor{sensor_id}"
             begin, count = int(model.sensor_adr[sensor_id]), int(model.sensor_dim[sensor_id])
-            name_endings = (
-                [""] if count == 1 else [f".{axis}" for axis in _list_axis_suffixes(count)]
-            )
+            # Axes, quaternion entries, or numbers.
+            suffixes = {3: "xyz", 4: "wxyz"}.get(count) or map(str, range(count))
+            name_endings = [""] if count == 1 else [f".{suffix}" for suffix in suffixes]
             unit = self._get_sensor_unit(sensor_id)
             rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(name_endings)]
         return tuple(rows)
@@ -497,14 +497,6 @@ def filters() -> tuple[int, int]:
     import mujoco
 
     return int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-
-
-def _list_axis_suffixes(count: int) -> list[str]:
-    """Return name endings for the numbers of a sensor: axes, quaternion entries, or indices."""
-    suffixes_by_count = {3: "xyz", 4: "wxyz"}
-    if count in suffixes_by_count:
-        return list(suffixes_by_count[count])
-    return [str(k) for k in range(count)]
 
 
 _UNITS: Mapping[int, str] = {

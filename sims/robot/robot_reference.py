@@ -21,7 +21,7 @@ from sims.core.toml_validation import (
     get_subtable,
     make_error,
 )
-from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
+from sims.robot.integrator_settings import FRICTION_FORMS, FrictionForm
 
 if TYPE_CHECKING:
     from sims.robot.robot_simulator import RobotSimulator
@@ -138,6 +138,9 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
     if "system" in document:
         raise InputError(f"{source}: expected system or model, found both; leave one out")
     digest = document.get("digest")
+    friction_form = document.get("friction_form", "stiff")
+    if friction_form not in FRICTION_FORMS:
+        raise make_error(source, "friction_form", " or ".join(FRICTION_FORMS), friction_form)
     return RobotReference(
         source.parent / check_text(source, "model", document["model"]),
         None if digest is None else check_text(source, "digest", digest),
@@ -145,20 +148,8 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
         get_subtable(source, document, "actuators"),
         get_subtable(source, document, "engine"),
         _check_numerics(source, document.get("numerics", {})),
-        _check_friction_form(source, document.get("friction_form", "stiff")),
+        friction_form,
     )
-
-
-def _check_friction_form(source: Source, value: Any) -> FrictionForm:
-    """Check the value of ``friction_form``.
-
-    Raises:
-        InputError: it is not one of `FRICTION_FORMS`.
-    """
-    for form in FRICTION_FORMS:
-        if value == form:
-            return form
-    raise make_error(source, "friction_form", " or ".join(FRICTION_FORMS), value)
 
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:

@@ -65,10 +65,10 @@ from sims.robot.dynamics.series_joints import AddedElements, group_by_added_elem
 from sims.robot.dynamics.step_forces import StepForces
 from sims.robot.dynamics.stepping_with_forces import step_with_forces
 from sims.robot.floating_joints import FloatingJoints, FloatingState
-from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (
     INTEGRATOR_IDS,
     RK4_INTEGRATOR_ID,
+    FrictionForm,
     IntegratorSettings,
     RobotEngine,
     read_integrator_settings,
