@@ -87,18 +87,11 @@ class FloatingJoints:
 
     def names(self) -> tuple[list[str], list[str]]:
         """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
-        axes = [(joint.name, _list_translation_axes(joint)) for joint in self.joints]
-        positions = [
-            f"q.{name}.{axis}"
-            for name, joint_axes in axes
-            for axis in joint_axes + QUATERNION_ENTRIES
-        ]
-        velocities = [
-            f"qd.{name}.{axis}"
-            for name, joint_axes in axes
-            for axis in joint_axes + ANGULAR_VELOCITY_AXES
-        ]
-        return positions, velocities
+        names = list(self.units())
+        return (
+            [name for name in names if name.startswith("q.")],
+            [name for name in names if name.startswith("qd.")],
+        )
 
     def units(self) -> dict[str, str]:
         """Return the units of positions and velocities by name.
@@ -108,9 +101,10 @@ class FloatingJoints:
         """
         units: dict[str, str] = {}
         for joint in self.joints:
-            units |= {f"q.{joint.name}.{axis}": "m" for axis in _list_translation_axes(joint)}
+            axes = _list_translation_axes(joint)
+            units |= {f"q.{joint.name}.{axis}": "m" for axis in axes}
             units |= {f"q.{joint.name}.{axis}": "1" for axis in QUATERNION_ENTRIES}
-            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _list_translation_axes(joint)}
+            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in axes}
             units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in ANGULAR_VELOCITY_AXES}
         return units
 
