@@ -68,33 +68,24 @@ class AttributeStatement:
     insisted: bool = False
 
 
-class FieldAddress(NamedTuple):
-    """Addresses of an element in the fields of a compiled model.
+def _get_element_values(model: Any, element: ModelElement, name: str, values: Any) -> Any:
+    """Return the values of an element in a field, whose name tells what its rows are.
 
-    Attributes:
-        id: number of the element.
-        velocity: address of a joint's velocity (dof).
-        position: address of a joint's position.
-        control: address of an actuator's control.
+    Args:
+        model: compiled model.
+        element: joint with one coordinate, body, actuator, pair, geom, or the options.
+        name: name of the field.
+        values: values of all elements, one row for each; those of an option have no rows.
     """
-
-    id: int
-    velocity: int = 0
-    position: int = 0
-    control: int = 0
-
-    def get_values(self, field_name: str, values: Any) -> Any:
-        """Return the values of the element in a field, whose name tells what its rows are.
-
-        Args:
-            field_name: name of the field.
-            values: values of all elements, one row for each.
-        """
-        if field_name.startswith("opt."):
-            return values
-        rows = {"dof_": self.velocity, "qpos": self.position, "actuator_ctrl": self.control}
-        matching = (row for start, row in rows.items() if field_name.startswith(start))
-        return values[next(matching, self.id)]
+    row_fields = {
+        "dof_": "jnt_dofadr",
+        "qpos": "jnt_qposadr",
+        "actuator_ctrl": "actuator_ctrladr",
+    }
+    if name.startswith("opt."):
+        return values
+    row_field = next((row for start, row in row_fields.items() if name.startswith(start)), None)
+    return values[element.id if row_field is None else getattr(model, row_field)[element.id]]
 
 
 class MjcfAttribute(NamedTuple):
@@ -112,9 +103,18 @@ class MjcfAttribute(NamedTuple):
     spec: str
     column: int | None = None
 
-    def read(self, fields: Fields, address: FieldAddress) -> Values:
-        """Return the values of the element at an address."""
-        parts = [np.ravel(address.get_values(name, fields[name][0])) for name in self.fields]
+    def read(self, fields: Fields, model: Any, element: ModelElement) -> Values:
+        """Return the values of an element.
+
+        Args:
+            fields: fields of a compiled model.
+            model: compiled model with the element.
+            element: the element.
+        """
+        parts = [
+            np.ravel(_get_element_values(model, element, name, fields[name][0]))
+            for name in self.fields
+        ]
         values = tuple(np.concatenate(parts).astype(float).tolist())
         return values if self.column is None else (values[self.column],)
 
@@ -207,16 +207,6 @@ def copy_model_fields(model: Any) -> Fields:
     return {name: np.array(attrgetter(name)(model))[None] for name in _FIELD_NAMES}
 
 
-def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
-    """Return the addresses of an element in the fields of a compiled model."""
-    i = element.id
-    if element.kind == "joint":
-        return FieldAddress(i, int(model.jnt_dofadr[i]), int(model.jnt_qposadr[i]))
-    if element.kind == "actuator":
-        return FieldAddress(i, control=int(model.actuator_ctrladr[i]))
-    return FieldAddress(i)
-
-
 def list_elements(model: Any) -> list[ModelElement]:
     """List the elements of a model whose attributes can be written.
 
@@ -282,11 +272,10 @@ def find_differing_statements(
     """
     statements = []
     for element in list_elements(model):
-        field_address = get_field_address(model, element)
         values = {}
         for attribute in ATTRIBUTES_BY_KIND[element.kind]:
-            present_value = attribute.read(present_values, field_address)
-            target_value = attribute.read(target_values, field_address)
+            present_value = attribute.read(present_values, model, element)
+            target_value = attribute.read(target_values, model, element)
             if not _is_equal(present_value, target_value, tolerance):
                 values[attribute.name] = target_value
         if element.kind == "body" and values:
@@ -307,9 +296,8 @@ def list_all_attributes(
         element: the element.
         target_values: wanted fields.
     """
-    field_address = get_field_address(model, element)
     return {
-        attribute.name: attribute.read(target_values, field_address)
+        attribute.name: attribute.read(target_values, model, element)
         for attribute in ATTRIBUTES_BY_KIND[element.kind]
     }
 
