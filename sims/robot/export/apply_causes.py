@@ -165,7 +165,9 @@ def apply_causes(
             notes.append(f"{cause.format(recording)}: not in the file: {reason}")
             continue
         applied_causes.append(cause)
-        note = f"{cause.effect}: {remark}" if remark else _find_note(robot, cause)
+        note = f"{cause.effect}: {remark}" if remark else _NOTES.get(cause.effect)
+        if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
+            note = _SOFT_FRICTION_NOTE
         if note and note not in notes:
             notes.append(note)
         changed_elements = [
@@ -197,18 +199,6 @@ def apply_causes(
     )
 
 
-def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
-    """Return what the user should know about an effect that the file contains; None if nothing.
-
-    Args:
-        robot: model of the robot.
-        cause: the effect with its coefficients.
-    """
-    if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
-        return _SOFT_FRICTION_NOTE
-    return _NOTES.get(cause.effect)
-
-
 def _is_at_contact(cause: FittedCause) -> bool:
     """Return whether a cause is an effect at a contact of two geoms."""
     known = cause.effect in library.list_names()
@@ -225,16 +215,11 @@ def _is_in_series(cause: FittedCause) -> bool:
 def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, SeriesElement]:
     """Combine the elements that causes put in series with joints, by joint."""
     elements: dict[str, list[SeriesElement]] = {}
-    for cause in causes:
-        if _is_in_series(cause):
-            elements.setdefault(cause.place, []).append(_make_series_element(cause))
+    for cause in (cause for cause in causes if _is_in_series(cause)):
+        numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
+        element = make_series_element(library.get_effect(cause.effect), numbers)
+        elements.setdefault(cause.place, []).append(element)
     return {place: combine_elements(place_elements) for place, place_elements in elements.items()}
-
-
-def _make_series_element(cause: FittedCause) -> SeriesElement:
-    """Make the element in series with a joint from the coefficients of a cause."""
-    numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
-    return make_series_element(library.get_effect(cause.effect), numbers)
 
 
 def _write_cause(
@@ -400,7 +385,10 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
             value = _convert_to_attribute(element, name, spec_names[name], values)
         setattr(element, spec_names[name], value)
     if kind == "body":
-        _make_inertia_explicit(element)
+        # Otherwise a full tensor or an orientation from the file would take precedence.
+        element.explicitinertial = True
+        element.fullinertia = np.full(6, np.nan)
+        element.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
         element.springdamper = (0.0, 0.0)
 
@@ -447,15 +435,3 @@ def _convert_to_attribute(element: Any, name: str, attribute: str, values: Seque
     padded = np.zeros(present_values.shape)
     padded[: len(values)] = values[: len(padded)]
     return padded
-
-
-def _make_inertia_explicit(body: Any) -> None:
-    """Make MuJoCo's compiler use the mass and principal moments that were set for a body.
-
-    Otherwise a full inertia tensor or an orientation from the file would take precedence.
-    """
-    import mujoco
-
-    body.explicitinertial = True
-    body.fullinertia = np.full(6, np.nan)
-    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

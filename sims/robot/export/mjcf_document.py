@@ -6,7 +6,7 @@ It relates the elements of the source text to their numbers in the compiled mode
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -268,14 +268,19 @@ class XmlText:
 
     def _render_comment(self, text: str) -> bytes:
         """Render text as an XML comment, with the line ends of the file."""
-        # Two hyphens would end a comment early, and so would a hyphen at its end.
-        escaped_text = re.sub(r"-(?=-)", "- ", text)
-        return f"<!-- {escaped_text} -->".encode().replace(b"\n", self._newline)
+        return format_comment(text).encode().replace(b"\n", self._newline)
 
     def _get_indentation(self, begin: int) -> bytes:
         """Return the indentation of an element; empty if other text precedes it on its line."""
         line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
         return line if not line.strip() else b""
+
+
+def format_comment(text: str) -> str:
+    """Format text as an XML comment."""
+    # Two hyphens would end a comment early, and so would a hyphen at its end.
+    escaped_text = re.sub(r"-(?=-)", "- ", text)
+    return f"<!-- {escaped_text} -->"
 
 
 def format_element(name: str, attributes: Mapping[str, str]) -> str:
@@ -293,14 +298,16 @@ def _render_attribute(name: str, value: str) -> bytes:
     return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
 
 
-def format_heading(lines: list[str]) -> str:
-    """Format the comment at the top of a written file.
+def format_heading(path: Path, recording: str, notes: Iterable[str]) -> str:
+    """Format the comment at the top of a written file: its origin, and notes.
 
     Args:
-        lines: description of the file, followed by notes.
+        path: model file from which it was made.
+        recording: title of the recording to which its causes were fitted; empty if none.
+        notes: a line for each note.
     """
-    first, *other_lines = lines
-    return "\n     ".join([f"{first}; written by simgap", *other_lines])
+    origin = f", with the causes found in {recording}" if recording else ""
+    return "\n     ".join([f"{path.name}{origin}; written by simgap", *notes])
 
 
 def strip_heading(text: str) -> str:

@@ -67,20 +67,11 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
 def _make_solref_reader(index: int) -> Read:
     """Return a reader of the time constant (0) or damping ratio (1) of a contact.
 
-    It is infinite, thus no number of the file, if the file states stiffness and damping.
+    MuJoCo's `solref` has these two numbers, or stiffness and damping if they are negative; the
+    number is then infinite, thus no number of the file.
     """
 
     def read(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
-        """Return the number of the contact in a list of one.
-
-        MuJoCo's `solref` has a time constant and a damping ratio, or stiffness and damping if they
-        are negative; `index` selects one. For the latter form, the number is infinite.
-
-        Args:
-            f: fields of the model with the effects.
-            robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-            place: name of the contact.
-        """
         values = f["pair_solref"][0, find_pair(robot, place)]
         return [values[index] if values[0] > 0 else np.inf]
 
@@ -193,22 +184,11 @@ def _list_totals(
     if not pairs[0].size:
         return [None] * count
     hinge_unit, slide_unit = _UNITS.get(_get_effect_name(effect), ("", ""))
+    joint = robot.actuator(effect.place).joint if effect.at == "actuator" else None
+    is_at_slide = joint is not None and robot.joint(joint).kind == "slide"
     number_totals: list[Total | None] = []
     for c, before, total in zip(effect.coefficients, *pairs, strict=True):
-        unit = (slide_unit if _acts_on_slide(robot, effect) else "") or hinge_unit or c.units[0]
+        unit = (slide_unit if is_at_slide else "") or hinge_unit or c.units[0]
         is_stated = np.isfinite([before, total]).all()
         number_totals.append(Total(float(before), float(total), unit or "1") if is_stated else None)
     return number_totals
-
-
-def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:
-    """Return whether an effect acts at an actuator of a slide joint.
-
-    Args:
-        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        effect: class of the effect at its place.
-    """
-    if effect.at != "actuator":
-        return False
-    joint = robot.actuator(effect.place).joint
-    return joint is not None and robot.joint(joint).kind == "slide"

@@ -64,25 +64,24 @@ def check_written_files(
     Raises:
         RuntimeError: a number or the motion differs; names the field. This is a program error.
     """
+    import mujoco
+
     with tempfile.TemporaryDirectory() as folder:
         if written_files.xml is not None:
             path = Path(folder) / "extended.xml"
             path.write_bytes(written_files.xml.encode())
-            _check_mjcf(written_files, path)
+            with capture_mujoco_warnings():
+                model = mujoco.MjModel.from_xml_path(str(path))
+            target_model = written_files.applied.model
+            difference = find_first_difference(model, target_model, EQUAL_NUMBERS_TOLERANCE)
+            if difference:
+                raise RuntimeError(f"{path.name} differs from the intended model: {difference}")
+            _compare_motion(model, target_model, path.name)
             release_free_memory()
         if written_files.urdf is not None:
             path = Path(folder) / "extended.urdf"
             path.write_bytes(written_files.urdf.encode())
             _check_urdf(robot, causes, path)
-
-
-def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
-    """Compile a written MJCF, and check that it equals the intended model."""
-    import mujoco
-
-    with capture_mujoco_warnings():
-        model = mujoco.MjModel.from_xml_path(str(path))
-    _compare_models(model, written_files.applied.model, path.name)
 
 
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
@@ -98,6 +97,8 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     Raises:
         RuntimeError: fields, inertia tensors or the motion differ.
     """
+    import mujoco
+
     from sims.robot.export.urdf_writer import UrdfWriter
     from sims.robot.parsing.read_model_file import read_robot
 
@@ -113,58 +114,33 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     # 2. Written URDF.
     reloaded_model = read_robot(path).compiled
     # 3. Comparison.
-    for name in _URDF_FIELDS:
-        reloaded_values, target_values = getattr(reloaded_model, name), getattr(target_model, name)
+    # The axes of two equal moments are arbitrary, so whole tensors are compared.
+    reloaded_tensors, target_tensors = (
+        compute_inertia_tensors(m.body_iquat, m.body_inertia)
+        for m in (reloaded_model, target_model)
+    )
+    tensor_tolerance = max(MOTION_TOLERANCE * np.abs(target_tensors).max(), MIN_MOMENT)
+    for name, reloaded_values, target_values, tolerance in (
+        *(
+            (name, getattr(reloaded_model, name), getattr(target_model, name), 0.0)
+            for name in _URDF_FIELDS
+        ),
+        ("body_inertia", reloaded_tensors, target_tensors, tensor_tolerance),
+    ):
         if reloaded_values.shape != target_values.shape or not np.allclose(
             reloaded_values,
             target_values,
             rtol=EQUAL_NUMBERS_TOLERANCE,
-            atol=EQUAL_NUMBERS_TOLERANCE,
+            atol=max(tolerance, EQUAL_NUMBERS_TOLERANCE),
         ):
             raise RuntimeError(f"extended.urdf differs from the intended model: {name}")
-    # The axes of two equal moments are arbitrary, so whole tensors are compared.
-    reloaded_values, target_values = (
-        compute_inertia_tensors(m.body_iquat, m.body_inertia)
-        for m in (reloaded_model, target_model)
-    )
-    if not np.allclose(
-        reloaded_values,
-        target_values,
-        rtol=EQUAL_NUMBERS_TOLERANCE,
-        atol=max(MOTION_TOLERANCE * np.abs(target_values).max(), MIN_MOMENT),
-    ):
-        raise RuntimeError("extended.urdf differs from the intended model: body_inertia")
     for model in (target_model, reloaded_model):
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
-        _disable_contacts(model)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         for name in _UNCOMPARED_FIELDS:
             getattr(model, name)[:] = getattr(reloaded_model, name)
     _compare_motion(reloaded_model, target_model, "extended.urdf")
-
-
-def _disable_contacts(model: Any) -> None:
-    """Switch off contacts in a compiled model, so that only joints and actuators are compared."""
-    import mujoco
-
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-
-
-def _compare_models(reloaded_model: Any, target_model: Any, name: str) -> None:
-    """Check that a reloaded model equals the wanted one in its fields and in its motion.
-
-    Args:
-        reloaded_model: model compiled from the written file.
-        target_model: intended model.
-        name: name of the file in messages.
-
-    Raises:
-        RuntimeError: a field or the motion differs, so the written file would mislead the user.
-    """
-    difference = find_first_difference(reloaded_model, target_model, EQUAL_NUMBERS_TOLERANCE)
-    if difference:
-        raise RuntimeError(f"{name} differs from the intended model: {difference}")
-    _compare_motion(reloaded_model, target_model, name)
 
 
 def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:

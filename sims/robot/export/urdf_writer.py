@@ -32,10 +32,7 @@ from sims.robot.export.mjcf_document import (
 )
 from sims.robot.fitted_causes import FittedCause
 from sims.robot.inertia_tensors import compute_point_inertias
-from sims.robot.model_field_effects import (
-    add_to_file_value,
-    compute_factor,
-)
+from sims.robot.model_field_effects import add_to_file_value, compute_factor
 from sims.robot.robot_model import RobotModel
 
 _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -91,8 +88,7 @@ class UrdfWriter:
         Args:
             lines: lines for the comment at the top of the file.
         """
-        origin_text = f", with the causes found in {self.recording}" if self.recording else ""
-        comment = format_heading([f"{self.robot.path.name}{origin_text}", *lines])
+        comment = format_heading(self.robot.path, self.recording, lines)
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()
 
@@ -150,12 +146,7 @@ class UrdfWriter:
 
     def _write_mass(self, cause: FittedCause) -> None:
         """Scale mass and inertia tensor of each link in the body by 1 + c, eq. (1)."""
-        inertials = self._find_inertials(cause)
-        factor = float(compute_factor(cause.coefficients[0]))
-        for _, inertial in inertials:
-            self._add_comment(inertial, cause)
-            _scale_attributes(inertial, "mass", ("value",), factor)  # (1)
-            _scale_attributes(inertial, "inertia", _TENSOR_ATTRIBUTES, factor)
+        self._scale_inertials(cause, {"mass": ("value",), "inertia": _TENSOR_ATTRIBUTES})
 
     def _write_inertia_tensor(self, cause: FittedCause) -> None:
         """Scale the inertia tensor of the body's only link by 1 + c; its mass stays.
@@ -163,14 +154,28 @@ class UrdfWriter:
         A body of several links is refused: its tensor includes the distances between the
         links, which no change of the links' own tensors would scale.
         """
-        inertials = self._find_inertials(cause)
-        if len(inertials) > 1:
+        if len(self._find_inertials(cause)) > 1:
             raise UnstatableCauseError("the body is not one link with an inertial")
-        ((_, inertial),) = inertials
-        self._add_comment(inertial, cause)
-        _scale_attributes(
-            inertial, "inertia", _TENSOR_ATTRIBUTES, float(compute_factor(cause.coefficients[0]))
-        )
+        self._scale_inertials(cause, {"inertia": _TENSOR_ATTRIBUTES})
+
+    def _scale_inertials(
+        self, cause: FittedCause, attributes: Mapping[str, tuple[str, ...]]
+    ) -> None:
+        """Multiply stated attributes of the inertials of a body by 1 + c.
+
+        Args:
+            cause: Effect on the body, with the coefficient c.
+            attributes: Attributes to multiply, by child element; those not stated stay so.
+        """
+        factor = float(compute_factor(cause.coefficients[0]))
+        for _, inertial in self._find_inertials(cause):
+            self._add_comment(inertial, cause)
+            for name, keys in attributes.items():
+                child = _find_child(inertial, name)
+                for key in keys:
+                    value = child.get_attribute(key) if child else None
+                    if child and value is not None:
+                        child.new[key] = format_number(float(value) * factor)
 
     def _write_centre_of_mass(self, cause: FittedCause) -> None:
         """Move the centre of mass of each link in the body by the same vector c in metres.
@@ -340,24 +345,6 @@ def _has_mass(inertial: XmlElement) -> bool:
     return any(
         float(tag.get_attribute(key) or 0.0) for tag, keys in stated_values if tag for key in keys
     )
-
-
-def _scale_attributes(
-    inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float
-) -> None:
-    """Multiply stated attributes of an inertial's child element (mass, inertia) by a factor.
-
-    Args:
-        inertial: Element ``<inertial>`` of a link.
-        name: Name of the child element.
-        attributes: Attributes of the child to multiply.
-        factor: Factor; attributes that are not stated stay so.
-    """
-    child = _find_child(inertial, name)
-    for attribute in attributes:
-        value = child.get_attribute(attribute) if child else None
-        if child and value is not None:
-            child.new[attribute] = format_number(float(value) * factor)
 
 
 def _parse_vector(text: str | None) -> Array:

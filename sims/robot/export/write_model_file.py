@@ -35,6 +35,7 @@ from sims.robot.export.mjcf_document import (
     FILE_ELEMENTS,
     MjcfDocument,
     NotEditableError,
+    format_comment,
     format_element,
     format_heading,
     format_number,
@@ -126,8 +127,11 @@ def render_with_added_elements(applied: ModifiedModel) -> bytes:
     if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
         return text
     document = MjcfDocument(text, robot.path)
-    if has_fixed_base:
-        _fix_base(document)
+    # Free joints and keyframes are removed, as by `parsing.compile_repairs.fix_bases`.
+    for tag in document.walk() if has_fixed_base else ():
+        is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+        if tag.name in ("freejoint", "keyframe") or is_free:
+            tag.text = b""
     if robot.coupled:
         _write_couplings(document, applied)
     _add_pairs(document, robot)
@@ -138,14 +142,6 @@ def render_with_added_elements(applied: ModifiedModel) -> bytes:
             raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
         joint_tag.after.append(_render_series_joint(series_joint))
     return document.to_text().encode()
-
-
-def _fix_base(document: MjcfDocument) -> None:
-    """Remove free joints and keyframes, as `parsing.compile_repairs.fix_bases` does."""
-    for tag in document.walk():
-        is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
-        if tag.name in ("freejoint", "keyframe") or is_free:
-            tag.text = b""
 
 
 def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
@@ -334,13 +330,9 @@ class MjcfEditor:
         writer = MjcfWriter(document, self.original, self.applied.target_values)
         for statement in statements:
             writer.write(statement, self.applied.comments.get(statement.element, [KEPT_VALUE_NOTE]))
-        document.root.within.insert(0, ([self._format_heading()], ""))
+        heading = format_heading(self.robot.path, self.recording, self.applied.notes)
+        document.root.within.insert(0, ([heading], ""))
         return document.to_text()
-
-    def _format_heading(self) -> str:
-        """Format the comment at the top: the origin of the file, and notes."""
-        origin_text = f", with the causes found in {self.recording}" if self.recording else ""
-        return format_heading([f"{self.robot.path.name}{origin_text}", *self.applied.notes])
 
 
 def compile_mjcf(text: str) -> Any:
@@ -384,12 +376,12 @@ def render_default_class(
         name: name of the class.
         notes: further comments.
     """
-    lines = [f'<default class="{name}">', *(f"  {_format_comment(note)}" for note in notes)]
+    lines = [f'<default class="{name}">', *(f"  {format_comment(note)}" for note in notes)]
     elements = [ModelElement("joint", joint)]
     elements += [] if actuator is None else [ModelElement("actuator", actuator)]
     for element in elements:
         cause_comments = applied.comments.get(element, [])
-        lines += [f"  {_format_comment(text)}" for text in dict.fromkeys(cause_comments)]
+        lines += [f"  {format_comment(text)}" for text in dict.fromkeys(cause_comments)]
         tag, attributes = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
@@ -413,7 +405,7 @@ def _format_default_element(
     class_values = {
         name: value
         for name, value in values.items()
-        if name not in _POSE_ATTRIBUTES and not _is_default(name, value)
+        if name not in _POSE_ATTRIBUTES and value != _MUJOCO_DEFAULTS.get(name, (0.0,) * len(value))
     }
     if element.kind == "joint":
         if not values["frictionloss"][0]:
@@ -433,10 +425,6 @@ def _format_default_element(
     return "position", gains | format_attributes(
         {k: v for k, v in class_values.items() if not k.startswith(("gain", "bias", "dyn"))}
     )
-
-
-def _is_default(name: str, values: Values) -> bool:
-    return values == _MUJOCO_DEFAULTS[name] if name in _MUJOCO_DEFAULTS else not any(values)
 
 
 def _is_servo(values: Mapping[str, Values]) -> bool:
@@ -496,10 +484,3 @@ def render_model_using_class(
     if difference:
         raise NotEditableError(difference)
     return written_text
-
-
-def _format_comment(text: str) -> str:
-    """Render text as an XML comment."""
-    # Two hyphens would end an XML comment early.
-    escaped_text = text.replace("--", "- -")
-    return f"<!-- {escaped_text} -->"
