@@ -8,7 +8,7 @@ soft, so that a joint at rest creeps; effects add stiff friction.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -16,16 +16,6 @@ from sims.core.engine import IntegrationBatch, Trajectories
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
-
-FrictionForm = Literal["stiff", "soft"]
-"""Form in which MuJoCo's solver applies the dry friction that effects add.
-
-``stiff`` is Coulomb friction that is as stiff as the integrator allows. ``soft`` keeps the solver
-parameters of the model file (`solreffriction`, `solimpfriction`), or MuJoCo's defaults if the file
-does not specify them.
-"""
-FRICTION_FORMS: tuple[FrictionForm, ...] = ("stiff", "soft")
-"""All values of `FrictionForm`."""
 
 INTEGRATOR_IDS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
 """Numbers of MuJoCo's integrators (mjtIntegrator), by their names in a model file."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from sims.core.simulator import make_unknown_name_error
 from sims.recording.recorded_poses import ANGLES, POSITION_AXES
-from sims.robot.integrator_settings import FrictionForm
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing.collision_hulls import CollisionShapes
 
@@ -22,6 +21,15 @@ _T = TypeVar("_T")
 Format = Literal["mjcf", "urdf"]
 JointKind = Literal["hinge", "slide", "ball", "free"]
 ActuatorKind = Literal["motor", "position", "velocity", "pid", "other"]
+FrictionForm = Literal["stiff", "soft"]
+"""Form in which MuJoCo's solver applies the dry friction that effects add.
+
+``stiff`` is Coulomb friction that is as stiff as the integrator allows. ``soft`` keeps the solver
+parameters of the model file (`solreffriction`, `solimpfriction`), or MuJoCo's defaults if the file
+does not specify them.
+"""
+FRICTION_FORMS: tuple[FrictionForm, ...] = ("stiff", "soft")
+"""All values of `FrictionForm`."""
 KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")
 """Joint kinds, in the order of MuJoCo's mjtJoint."""
 

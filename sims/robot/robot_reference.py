@@ -21,7 +21,7 @@ from sims.core.toml_validation import (
     get_subtable,
     make_error,
 )
-from sims.robot.integrator_settings import FRICTION_FORMS, FrictionForm
+from sims.robot.robot_model import FRICTION_FORMS, FrictionForm
 
 if TYPE_CHECKING:
     from sims.robot.robot_simulator import RobotSimulator

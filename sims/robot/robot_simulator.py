@@ -68,13 +68,12 @@ from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.integrator_settings import (
     INTEGRATOR_IDS,
     RK4_INTEGRATOR_ID,
-    FrictionForm,
     IntegratorSettings,
     RobotEngine,
     read_integrator_settings,
 )
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.robot_model import RobotModel
+from sims.robot.robot_model import FrictionForm, RobotModel
 from sims.robot.robot_system import RobotSystem, make_robot_system
 from sims.system_simulator import SystemSimulator
 
