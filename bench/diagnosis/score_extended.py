@@ -18,7 +18,7 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.importing.sample_selection import fill_lost_commands, leave_out_settling
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size, check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator, open_extended, read_extended

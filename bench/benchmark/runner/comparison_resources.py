@@ -24,7 +24,7 @@ from bench.core.resource_estimates import (
     get_machine_resources,
     get_max_step,
 )
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from sims.recording.recording import read_recording
 
 _ROW_DISK = 50

@@ -76,8 +76,8 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
     from bench.logs import recording_summary
-    from bench.logs.quality.clock_checks import find_anomalies, find_log_anomalies
-    from bench.logs.quality.log_quality import check_log_quality
+    from bench.logs.quality.clock_checks import find_anomalies
+    from bench.logs.quality.log_quality import check_log_quality, find_log_anomalies
     from bench.logs.quality.pose_check import find_missing_base_poses
     from bench.logs.recording_loading import load_recording
     from bench.logs.recording_summary import format_summary

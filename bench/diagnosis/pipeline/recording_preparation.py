@@ -21,7 +21,7 @@ from bench.logs.importing.sample_selection import (
     leave_out_settling,
     thin_recording,
 )
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size, load_joined
 from bench.logs.segmentation import segment_recording
 from bench.pages.text_format import joined

@@ -37,14 +37,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.core.resource_estimates import FORCE_HINT
-from bench.logs.importing.normalised_positions import check_normalised_positions
 from bench.logs.importing.sample_selection import MAX_FILLED_SAMPLES, find_lost_samples
 from bench.logs.quality import pose_check
-from bench.logs.quality.pose_check import find_missing_base_poses
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding
 from sims.core.plain_values import join_first_names
-from sims.core.simulator import Array, InputError, Simulator
+from sims.core.simulator import Array, Simulator
 from sims.core.system import StateSnapshot, System
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
@@ -219,45 +216,6 @@ The samples before such a gap do not determine the motion after it.
 _MIN_CHECKED_SAMPLES = 10
 """Minimum number of samples of a run that is checked."""
 _TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-
-
-def check_recording_plausible(
-    recording: Recording, kind: type[Simulator], force: bool = False
-) -> list[str]:
-    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
-
-    Args:
-        recording: Recording as it was read.
-        kind: Simulator class of its system.
-        force: Whether the user insists.
-
-    Returns:
-        Texts of the anomalies, to be shown to the user.
-
-    Raises:
-        InputError: An anomaly is certain and `force` is False; the message is one line.
-    """
-    # Positions first: their wrong units make stamps look implausible, but not vice versa.
-    anomalies = [
-        *find_log_anomalies(recording),
-        *pose_check.check_poses(recording, kind),
-        *find_anomalies(recording, kind),
-        *find_missing_base_poses(recording, kind),
-        *(
-            Anomaly(overlap.text_line, False)
-            for overlap in pose_check.find_overlaps(recording, kind)
-        ),
-    ]
-    for oddity in anomalies:
-        if oddity.certain and not force:
-            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
-    return [oddity.text for oddity in anomalies]
-
-
-def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:
-    """Yield the omissions from a recording's logs, and units that they do not state."""
-    yield from (Anomaly(note, False) for note in recording.notes)
-    yield from check_normalised_positions(recording)
 
 
 def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:

@@ -1,15 +1,18 @@
-"""Run all quality checks of a log: clock, signal values and consistency of channels.
+"""Run all checks of a log: clock, signal values and consistency of channels.
 
-The checks need no fitted model. Each finding is one line with its remedy.
+The checks need no fitted model. Quality checks give findings, each with its remedy; implausible
+logs are refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from bench.core.resource_estimates import FORCE_HINT
+from bench.logs.importing.normalised_positions import check_normalised_positions
 from bench.logs.quality import clock_checks, pose_check, signal_checks
-from bench.logs.quality.quality_finding import QualityFinding
-from sims.core.simulator import Simulator
+from bench.logs.quality.quality_finding import Anomaly, QualityFinding
+from sims.core.simulator import InputError, Simulator
 from sims.recording.recording import Recording
 
 
@@ -31,3 +34,42 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     yield from signal_checks.check_standstill(recording, kind)
     yield from signal_checks.check_velocities(recording, kind)
     yield from pose_check.find_overlaps(recording, kind)
+
+
+def check_recording_plausible(
+    recording: Recording, kind: type[Simulator], force: bool = False
+) -> list[str]:
+    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+        force: Whether the user insists.
+
+    Returns:
+        Texts of the anomalies, to be shown to the user.
+
+    Raises:
+        InputError: An anomaly is certain and `force` is False; the message is one line.
+    """
+    # Positions first: their wrong units make stamps look implausible, but not vice versa.
+    anomalies = [
+        *find_log_anomalies(recording),
+        *pose_check.check_poses(recording, kind),
+        *clock_checks.find_anomalies(recording, kind),
+        *pose_check.find_missing_base_poses(recording, kind),
+        *(
+            Anomaly(overlap.text_line, False)
+            for overlap in pose_check.find_overlaps(recording, kind)
+        ),
+    ]
+    for oddity in anomalies:
+        if oddity.certain and not force:
+            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
+    return [oddity.text for oddity in anomalies]
+
+
+def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:
+    """Yield the omissions from a recording's logs, and units that they do not state."""
+    yield from (Anomaly(note, False) for note in recording.notes)
+    yield from check_normalised_positions(recording)

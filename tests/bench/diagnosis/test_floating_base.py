@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.diagnosis.explain import explain
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import read_recording

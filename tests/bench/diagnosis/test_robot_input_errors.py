@@ -5,7 +5,7 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.explain import explain
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.diagnosis.arm_model import ARM

@@ -12,7 +12,7 @@ import pytest
 import simgap
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.importing.joint_order import order_of_commands
-from bench.logs.quality.clock_checks import check_recording_plausible
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.logs import log_writers
