@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import check_text, get_subtable, toml_key
 
 Mask = NDArray[np.bool_]
@@ -180,7 +180,12 @@ def apply_drive_switches(
         if any(mask.any() for mask in off_masks):
             note = f"where {switch.condition}: {spans_of_runs(runs, off_masks)}"
             notes.setdefault(note, []).append(switch.actuator)
-    run_notes = [f"{_make_subject_and_verb(names)} nothing {note}" for note, names in notes.items()]
+    run_notes = [
+        f"actuator {names[0]} exerts nothing {note}"
+        if len(names) == 1
+        else f"actuators {', '.join(names)} exert nothing {note}"
+        for note, names in notes.items()
+    ]
     switched = tuple(
         replace(run, off=masks) if masks else run for run, masks in zip(runs, by_run, strict=True)
     )
@@ -194,29 +199,18 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
         runs: Runs.
         off: Mask (T,) of each run.
     """
-    run_texts = [
-        f"run {run.name}, {_describe_time_spans(run.times, mask)}"
-        for run, mask in zip(runs, off, strict=True)
-        if mask.any()
-    ]
+    run_texts = []
+    for run, mask in zip(runs, off, strict=True):
+        span_texts = [
+            f"{run.times[first]:.4g} to {run.times[end - 1]:.4g} s" for first, end in spans(mask)
+        ]
+        run_texts += [f"run {run.name}, {', '.join(span_texts)}"] if span_texts else []
     suffix = (
         f"; and {len(run_texts) - MAX_LISTED_RUNS} more runs"
         if len(run_texts) > MAX_LISTED_RUNS
         else ""
     )
     return f"{'; '.join(run_texts[:MAX_LISTED_RUNS])}{suffix}"
-
-
-def _make_subject_and_verb(names: Sequence[str]) -> str:
-    """Return subject and verb of a sentence about actuators."""
-    if len(names) == 1:
-        return f"actuator {names[0]} exerts"
-    return f"actuators {', '.join(names)} exert"
-
-
-def _describe_time_spans(times: Array, mask: Mask) -> str:
-    """Describe the time spans in which a mask (T,) is set."""
-    return ", ".join(f"{times[first]:.4g} to {times[end - 1]:.4g} s" for first, end in spans(mask))
 
 
 def spans(mask: Mask) -> list[tuple[int, int]]:

@@ -64,32 +64,27 @@ def format_table(runs: Sequence[Run], digits: int) -> str:
         runs: Runs with the same signals; those of the first determine the columns.
         digits: Number of significant digits.
     """
-    inputs, channels = list(runs[0].inputs), list(runs[0].channels)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    extra = list(runs[0].extra)
     # The columns are those of the first run, and all other runs must have the same.
-    writer.writerow(["run", "t", *inputs, *channels, *extra])
+    names = {kind: list(getattr(runs[0], kind)) for kind in ("inputs", "channels", "extra")}
+    writer.writerow(["run", "t", *(name for of_kind in names.values() for name in of_kind)])
     run_names: set[str] = set()
     for run in runs:
         if run.name in run_names:
             raise InputError(f"two runs are called {run.name!r}; expected different names")
         run_names.add(run.name)
-        for names, signal_columns, kind in _list_signals(run, inputs, channels, extra):
-            if set(names) != set(signal_columns):
+        columns = [run.times]
+        for kind, expected_names in names.items():
+            signals: Mapping[str, Array] = getattr(run, kind)
+            if set(expected_names) != set(signals):
+                word = "extra column" if kind == "extra" else kind.removesuffix("s")
                 raise make_unknown_name_error(
-                    f"{kind} of run {run.name}",
-                    ", ".join(set(names) ^ set(signal_columns)),
-                    names or ["none"],
+                    f"{word} of run {run.name}",
+                    ", ".join(set(expected_names) ^ set(signals)),
+                    expected_names or ["none"],
                 )
-        columns = [
-            run.times,
-            *(
-                signal_columns[n]
-                for names, signal_columns, _ in _list_signals(run, inputs, channels, extra)
-                for n in names
-            ),
-        ]
+            columns += [signals[name] for name in expected_names]
         writer.writerows(
             zip(
                 [run.name] * len(run.times),
@@ -98,24 +93,6 @@ def format_table(runs: Sequence[Run], digits: int) -> str:
             )
         )
     return text.getvalue()
-
-
-def _list_signals(
-    run: Run, inputs: list[str], channels: list[str], extra: list[str]
-) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
-    """Return expected names, signals of the run, and a word for each kind of column.
-
-    Args:
-        run: recorded run: times, channels and inputs.
-        inputs: names of the inputs of all runs.
-        channels: names of the channels of all runs.
-        extra: names of further columns of all runs.
-    """
-    return (
-        (inputs, run.inputs, "input"),
-        (channels, run.channels, "channel"),
-        (extra, run.extra, "extra column"),
-    )
 
 
 def _format_cells(values: Array, digits: int) -> list[str]:
@@ -159,9 +136,10 @@ def format_description(recording: Recording, declared: DeclaredSignals, folder: 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
     first_run = recording.runs[0]
     document: dict[str, Any] = {**_describe_source(recording, folder), "title": recording.title}
-    document["channels"] = {
-        n: {"unit": units[n], **_get_stated_noise(recording.noise, n)} for n in first_run.channels
-    }
+    document["channels"] = {n: {"unit": units[n]} for n in first_run.channels}
+    for name in recording.noise.keys() & first_run.channels.keys():
+        if recording.noise[name]:
+            document["channels"][name]["noise"] = recording.noise[name]
     if first_run.inputs:
         document["inputs"] = {
             n: {"unit": units[n], **({"hold": "linear"} if n in first_run.linear else {})}
@@ -177,10 +155,6 @@ def format_description(recording: Recording, declared: DeclaredSignals, folder: 
     if any(runs.values()):
         document["runs"] = {name: marks for name, marks in runs.items() if marks}
     return tomli_w.dumps(document)
-
-
-def _get_stated_noise(noise: Mapping[str, float], name: str) -> dict[str, float]:
-    return {"noise": noise[name]} if noise.get(name) else {}
 
 
 def _describe_run(run: Run) -> dict[str, Any]:

@@ -97,7 +97,8 @@ def find_layout(path: Path) -> Layout:
     rows_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
     units_by_column: dict[int, str] = {}
     if rows_above and first_data_line:
-        units_by_column = _parse_units(_normalise_row(rows[rows_above[-1]], width), columns)
+        # Missing cells at the end of the row are empty.
+        units_by_column = _parse_units([*rows[rows_above[-1]], *[""] * width], columns)
     if units_by_column:
         rows_above.pop()
     for n in reversed(rows_above):
@@ -218,11 +219,6 @@ def _find_row_width(rows: Sequence[Sequence[str]]) -> int:
     return max(counts, key=lambda count: (counts[count], count), default=0)
 
 
-def _normalise_row(row: Sequence[str], width: int) -> list[str]:
-    """Strip the cells of a row, and shorten or extend it to `width` cells."""
-    return [cell.strip() for cell in [*row, *[""] * width][:width]]
-
-
 def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
     """Return the positions of the columns in which at least half of the cells are numbers.
 
@@ -308,7 +304,7 @@ def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
     """
     units_by_place = {}
     for column in columns:
-        text = row[column].strip("[](){}<> ") if row[column] else ""
+        text = row[column].strip().strip("[](){}<> ")
         if not text:
             continue
         unit = read_unit(text)
@@ -512,7 +508,8 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
-            if filled < layout.width and line >= _find_last_line(layout):
+            is_last = all(later <= line for later, *_ in _iterate_rows(layout))
+            if filled < layout.width and is_last:
                 remedy = "the log is truncated there: delete this row"
             return InputError(
                 f"{layout.path}, row {line}: expected {layout.width} cells {reference}, "
@@ -547,18 +544,6 @@ def _iterate_rows(layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
             if any(row) and not COMMENT.match(row[0]):
                 yield last_line + 1, last, row
             last_line = last
-
-
-def _find_last_line(layout: Layout) -> int:
-    """Return the line of the last data row.
-
-    Args:
-        layout: layout of the table.
-    """
-    last = 0
-    for line, *_ in _iterate_rows(layout):
-        last = line
-    return last
 
 
 def _find_line(layout: Layout, record: int) -> int:
