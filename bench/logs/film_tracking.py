@@ -270,9 +270,8 @@ def write_film(
         missing = "has missing samples; a film shows the ball in every frame"
         raise InputError(f"{recording}: run {chosen_run.name}: {missing}")
     check_film_size(recording, len(positions), pixels, force)
-    radius = {**loaded_recording.constants, **chosen_run.constants}.get(
-        "radius", _get_default_constant("radius")
-    )
+    defaults = {constant.name: constant.value for constant in BallSystem.constants}
+    radius = {**defaults, **loaded_recording.constants, **chosen_run.constants}["radius"]
     rng = make_rng("film", seed)
     camera, appearance = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
     scene = BallScene(camera, appearance, radius, rng)
@@ -281,7 +280,3 @@ def write_film(
     description = {get_camera_file_path(out): format_camera_file(filmed)}
     write_video(out, scene.render_frames(positions), chosen_run.times, appearance.crf, description)
     return len(positions), float(chosen_run.times[-1] - chosen_run.times[0])
-
-
-def _get_default_constant(name: str) -> float:
-    return next(c.value for c in BallSystem.constants if c.name == name)

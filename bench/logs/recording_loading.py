@@ -35,7 +35,6 @@ from sims.recording.log_formats.ros_bags import split_bag_path
 from sims.recording.recording import (
     MAX_FOLDS,
     Recording,
-    Run,
     read_recording,
     read_system_name,
     recording_of_frame,
@@ -120,6 +119,11 @@ def get_simulator_class(
             reference.path, reference.actuators, engine, free or reference.free
         )
     name = system or (source.system if isinstance(source, Recording) else read_system_name(path))
+    return _find_system(path, name)
+
+
+def _find_system(path: str | Path, name: str) -> type[Simulator]:
+    """Return a registered simulator; `path` begins the message if there is none."""
     try:
         return simulators.get(name)
     except InputError as error:
@@ -328,10 +332,7 @@ def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
             f"{name}: expected a system or model: system='NAME' or model='robot.xml'; "
             f"systems are {', '.join(simulators.names())}"
         )
-    try:
-        return simulators.get(system)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+    return _find_system(name, system)
 
 
 _INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
@@ -462,8 +463,11 @@ def load_joined(
             run,
             name=f"{name}: {run.name}",
             log=name,
-            constants={key: _get_constant(key, recording, run, default_values) for key in differing}
-            | dict(run.constants),
+            constants={
+                **{key: default_values.get(key, np.nan) for key in differing},
+                **{key: value for key, value in recording.constants.items() if key in differing},
+                **run.constants,
+            },
         )
         for name, recording in zip(names, recordings, strict=True)
         for run in recording.runs
@@ -473,19 +477,18 @@ def load_joined(
         title=f"{first_recording.title or first_recording.path.stem} and "
         + format_count(len(loaded) - 1, "more log"),
         constants=common_constants,
-        noise=_compute_rms_noise(recordings),
+        # The noise of a channel for which some recording states none is not known.
+        noise={
+            name: compute_rms([recording.noise[name] for recording in recordings])
+            for name in first_recording.noise
+            if all(name in recording.noise for recording in recordings)
+        },
         runs=tuple(runs),
         notes=tuple(note for recording in recordings for note in recording.notes),
     )
     if is_cross_validated:
         joined_recording = split_held_out(joined_recording, folds=True)
     return joined_recording, kind
-
-
-def _get_constant(
-    key: str, recording: Recording, run: Run, default_values: dict[str, float]
-) -> float:
-    return run.constants.get(key, recording.constants.get(key, default_values.get(key, np.nan)))
 
 
 def _refuse_other(
@@ -532,13 +535,3 @@ def make_log_names(paths: Sequence[Path]) -> list[str]:
     if len(set(qualified_names)) == len(qualified_names):
         return qualified_names
     return [f"{number}/{name}" for number, name in enumerate(qualified_names, start=1)]
-
-
-def _compute_rms_noise(recordings: Sequence[Recording]) -> dict[str, float]:
-    """Return the root mean square noise of each channel, if all recordings state it."""
-    shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
-    return {
-        name: compute_rms([recording.noise[name] for recording in recordings])
-        for name in recordings[0].noise
-        if name in shared
-    }

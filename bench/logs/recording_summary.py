@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.logs.quality.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
 from sims.core.plain_values import align_columns, format_count, format_run_names, format_unit
-from sims.core.simulator import Array, Channel, Simulator
+from sims.core.simulator import Channel, Simulator
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
@@ -101,7 +101,7 @@ def compute_signal_statistics(
         channel: Declaration of the signal.
         kind: input or channel.
     """
-    signals = [(run.times, _get_signal(run, channel.name)) for run in recording.runs]
+    signals = [(run.times, {**run.inputs, **run.channels}[channel.name]) for run in recording.runs]
     values = np.concatenate([v for _, v in signals])
     # An input is what was commanded, so it has no noise.
     noise = estimate_noise(signals) if kind == "channel" else NoiseEstimate(np.nan, 0.0)
@@ -162,10 +162,6 @@ def to_document(recording: Recording, kind: type[Simulator]) -> dict[str, Any]:
     }
 
 
-def _get_signal(run: Run, name: str) -> Array:
-    return run.channels[name] if name in run.channels else run.inputs[name]
-
-
 _MAX_LISTED_RUNS = 40
 """Maximum number of runs that are listed."""
 _MAX_LISTED_NAMES = 12
@@ -222,18 +218,13 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     yield from _format_constants(recording, kind)
 
 
-def _format_use(run: Run) -> str:
-    if run.fold is not None:
-        return "left out in turn"
-    return "held out" if run.held_out else "fitting"
-
-
 def _run_row(run: Run) -> tuple[str, ...]:
     """Format the statistics of a run as a table row; sampling intervals are in milliseconds."""
     statistics = compute_run_statistics(run)
+    use = "held out" if run.held_out else "fitting"
     return (
         statistics.name,
-        _format_use(run),
+        use if run.fold is None else "left out in turn",
         str(statistics.samples),
         f"{statistics.seconds:.4g}",
         f"{statistics.rate:.4g}",

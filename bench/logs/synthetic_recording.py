@@ -29,7 +29,7 @@ from sims.core.plain_values import (
     is_plausible_number,
     truncate_text,
 )
-from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.core.simulator import InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
 from sims.recording.recording import Recording, Run
@@ -216,10 +216,15 @@ class _RecordingSimulation:
         self.ranges = {**self.defaults.initial, **stated_ranges}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.defaults.inputs, **inputs}
-        self.inputs = {name: _format_signal(name, value) for name, value in inputs.items()}
+        self.inputs = {
+            name: value if isinstance(value, str) else f"{_check_number('input', name, value):.17g}"
+            for name, value in inputs.items()
+        }
         samples = _count_samples(options)
         check_simulation_size(options.runs, samples, options.seconds, self.simulator, options.force)
-        self.times = _make_sample_times(samples, options.rate)
+        # Rounded as in the table, so that the times read back are the times simulated.
+        times = (np.arange(samples) / options.rate).tolist()
+        self.times = np.array([float(f"{t:.{_TABLE_DIGITS}g}") for t in times])
 
     def make(self) -> SimulatedRecording:
         """Simulate all runs, add noise, and return the recording with its true model.
@@ -373,17 +378,6 @@ def _count_samples(options: SimulationSpec) -> int:
     return samples
 
 
-def _make_sample_times(samples: int, rate: float) -> Array:
-    """Return the sample times (T,) of a run in seconds, from zero.
-
-    Args:
-        samples: number T of samples.
-        rate: sampling rate in Hz.
-    """
-    # Round as in the table, so that the times read back are the times simulated.
-    return np.array([float(f"{t:.{_TABLE_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
-
-
 def _make_parameters(
     values: Mapping[str, float] | Sequence[float], kind: type[Simulator]
 ) -> dict[str, float]:
@@ -512,10 +506,6 @@ def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tup
     if low > high:
         raise InputError(f"initial state {name} = {low:g}:{high:g}: expected low <= high")
     return low, high
-
-
-def _format_signal(name: str, value: float | str) -> str:
-    return value if isinstance(value, str) else f"{_check_number('input', name, value):.17g}"
 
 
 def _check_number(label: str, name: str, value: object) -> float:

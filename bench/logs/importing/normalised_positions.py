@@ -6,9 +6,9 @@ a dataset.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -40,17 +40,16 @@ UNIT_REMEDY = (
 """Advice for positions that may be normalised."""
 
 
-class NormalisedPositions:
+class NormalisedPositions(NamedTuple):
     """Conversion of the normalised positions of a log to angles.
 
-    Args:
+    Attributes:
         motors: Calibrated ranges by motor; empty if only the model's ranges are known.
         source: The calibration file; None if there is none.
     """
 
-    def __init__(self, motors: Mapping[str, MotorRange], source: Path | None) -> None:
-        self.motors = motors
-        self.source = source
+    motors: Mapping[str, MotorRange]
+    source: Path | None
 
     def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
         """Return the unit of a column's positions, and their conversion to it.
@@ -112,8 +111,10 @@ def find_position_conversion(
         )
     if calibration is None and is_within and not stated_unit:
         episode = split_episode_path(log)
-        folders = _list_calibration_folders(episode[0]) if episode else []
-        calibration = find_calibration(folders)
+        if episode:
+            dataset = episode[0]
+            folders = [dataset, dataset / "meta", dataset / "calibration", dataset.parent]
+            calibration = find_calibration(folders)
         is_requested = calibration is not None
     if not is_requested:
         return None
@@ -175,8 +176,3 @@ def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool
         and split_episode_path(description.parent / folder / "frames") is not None
         for folder in folders[:1]
     )
-
-
-def _list_calibration_folders(dataset: Path) -> Sequence[Path]:
-    """Return the folders that may contain the calibration of a dataset."""
-    return [dataset, dataset / "meta", dataset / "calibration", dataset.parent]

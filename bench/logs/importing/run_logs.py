@@ -360,8 +360,18 @@ class RunLogs:
         errors: list[InputError] = []
         for file, log in logs.items():
             columns = column_guessing.list_clock_columns(_list_all_columns(file, log))
-            units = [(column, _detect_time_unit(column)) for column in columns]
-            candidates = [(column, unit) for column, unit in units if unit is not None]
+            # The unit that the file states, else the one with a plausible rate.
+            units = [
+                column.unit
+                if column.quantity == "time" and column.unit in column_guessing.TIME_UNITS
+                else column_guessing.guess_time_unit(column.values)
+                for column in columns
+            ]
+            candidates = [
+                (column, unit)
+                for column, unit in zip(columns, units, strict=True)
+                if unit is not None
+            ]
             if candidates:
                 clocks[file] = candidates
                 continue
@@ -429,10 +439,3 @@ def _list_all_columns(file: str, log: LogFile) -> list[LogColumn]:
         finite = np.where(np.isfinite(values), values, np.nan)
         columns.append(LogColumn(file, name, finite, log.units.get(name, "")))
     return columns
-
-
-def _detect_time_unit(column: LogColumn) -> str | None:
-    """Return the unit of time stamps: as in the file, else the one with a plausible rate."""
-    if column.quantity == "time" and column.unit in column_guessing.TIME_UNITS:
-        return column.unit
-    return column_guessing.guess_time_unit(column.values)

@@ -65,7 +65,13 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
     Returns:
         The recording, and a message for the user, which is empty if it is unchanged.
     """
-    rate = min((_compute_sampling_rate(run) for run in recording.runs), default=0.0)
+    rate = min(
+        (
+            float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
+            for run in recording.runs
+        ),
+        default=0.0,
+    )
     if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
         return recording, ""
     stride = next(
@@ -175,11 +181,6 @@ def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
         extra=insert(run.extra, lambda old: old[first]),
         off=insert(run.off, lambda old: old[first]),
     )
-
-
-def _compute_sampling_rate(run: Run) -> float:
-    """Return the sampling rate in Hz."""
-    return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
 
 
 def _preserves_motion(recording: Recording, stride: int) -> bool:

@@ -54,7 +54,8 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
         for t, y in signals
         if (is_recorded := np.isfinite(y)).any()
     ]
-    sigmas, step = [_estimate_sigma(runs, order) for order in (2, 3)], _find_quantisation_step(runs)
+    sigmas = [estimate_differences_sigma(runs, order) for order in (2, 3)]
+    step = _find_quantisation_step(runs)
     if not np.isfinite(sigmas).any():
         return NoiseEstimate(np.nan, step)
     # Rounding errors are uniform within half a step to either side: 1 sigma is step / sqrt(12).
@@ -73,19 +74,11 @@ def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: in
     Returns:
         Standard deviation; NaN if all runs are too short.
     """
-    return _estimate_sigma(
-        [
-            (t[is_recorded], y[is_recorded])
-            for t, y in signals
-            if (is_recorded := np.isfinite(y)).any()
-        ],
-        order,
-    )
-
-
-def _estimate_sigma(runs: list[tuple[Array, Array]], order: int) -> float:
-    """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
-    differences = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
+    differences = [
+        _compute_divided_differences(t[is_recorded], y[is_recorded], order)
+        for t, y in signals
+        if (is_recorded := np.isfinite(y)).sum() > order + 1
+    ]
     pooled = np.concatenate(differences) if differences else np.empty(0)
     return SIGMA_PER_MEDIAN * float(np.median(np.abs(pooled))) if pooled.size else np.nan
 

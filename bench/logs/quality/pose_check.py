@@ -324,11 +324,13 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
         recording: recording of a robot.
         robot: model of the robot.
     """
+    first = recording.runs[0]
     servo_signals = [
         (f"u.{a.name}", f"q.{a.joint}")
         for a in robot.actuators
-        if a.kind == "position" and a.joint is not None and _has_both(recording, a)
+        if a.kind == "position" and f"u.{a.name}" in first.inputs
     ]
+    servo_signals = [pair for pair in servo_signals if pair[1] in first.channels]
     pairs = {
         (command, position): _compare_position_with_command(recording, command, position)
         for command, _ in servo_signals
@@ -379,12 +381,6 @@ def _check_exchanged(
                 yield Anomaly(f"{subject}; are they swapped?", False)
 
 
-def _has_both(recording: Recording, actuator: Any) -> bool:
-    """Return whether an actuator's command and its joint's position are recorded."""
-    first = recording.runs[0]
-    return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
-
-
 def _compare_position_with_command(recording: Recording, command: str, position: str) -> _Pair:
     """Compute slope and correlation of a position against a command, eq. (1), over all runs.
 
@@ -402,17 +398,12 @@ def _compare_position_with_command(recording: Recording, command: str, position:
         u, q = run.inputs[command], run.channels[position]
         is_finite = np.isfinite(u) & np.isfinite(q)
         if is_finite.sum() > 1:
-            squares += _compute_centred_products(u[is_finite], q[is_finite])
+            u, q = u[is_finite] - u[is_finite].mean(), q[is_finite] - q[is_finite].mean()
+            squares += np.array([u @ u, u @ q, q @ q])
     uu, uq, qq = squares
     if min(uu, qq) <= 0 or uq == 0:
         return _Pair(slope=1.0, correlation=0.0)
     return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
-
-
-def _compute_centred_products(u: Array, q: Array) -> Array:
-    """Return the sums of squares and products (3,) of u and q about their means."""
-    u, q = u - u.mean(), q - q.mean()
-    return np.array([u @ u, u @ q, q @ q])
 
 
 def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:

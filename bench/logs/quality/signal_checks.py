@@ -206,14 +206,12 @@ def _iterate_channels(
     """
     for channel in kind.channels:
         signals = [
-            (run.times, run.channels[channel.name]) for run in _select_runs(recording, channel)
+            (run.times, run.channels[channel.name])
+            for run in recording.runs
+            if channel.name in run.channels
         ]
         if signals:
             yield channel, signals
-
-
-def _select_runs(recording: Recording, channel: Channel) -> list[Run]:
-    return [run for run in recording.runs if channel.name in run.channels]
 
 
 def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> int:
