@@ -89,14 +89,14 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
     # Beyond the hoop's plane, nothing was planned.
     last = min(
-        _find_descent_index(planned_path, setup.scene.hoop_z),
-        _find_descent_index(flown_path, setup.scene.hoop_z),
+        find_descent_index(planned_path, setup.scene.hoop_z),
+        find_descent_index(flown_path, setup.scene.hoop_z),
     )
     error = float(np.linalg.norm(planned_path - flown_path, axis=1)[: last + 1].mean())
     return ShotResult(is_hit, miss_distance, error, times, planned_path, flown_path)
 
 
-def _find_descent_index(path: Array, height: float) -> int:
+def find_descent_index(path: Array, height: float) -> int:
     """Return the index of the sample after which a path descends through a height after its bounce.
 
     The height is that of the hoop. The path before the bounce is ignored, because the ball falls
@@ -114,19 +114,6 @@ def _find_descent_index(path: Array, height: float) -> int:
     has_risen = np.logical_or.accumulate(heights[1:] > heights[:-1])
     down = np.flatnonzero(has_risen & (heights[:-1] > height) & (heights[1:] <= height))
     return int(down[0]) if down.size else len(heights) - 1
-
-
-def build_shot_rows(
-    setup: ShotSetup, settings: ShotConfig, models: Sequence[TunedModel]
-) -> list[dict[str, Any]]:
-    """Execute the shot of each method, and build the result rows.
-
-    Args:
-        setup: setup of the shot: its ball, drop, incline and hoop.
-        settings: settings of the bounce shot, from the table [shot] of the experiment.
-        models: tuned model of each method.
-    """
-    return [_build_shot_row(setup, model, execute_shot(setup, settings, model)) for model in models]
 
 
 def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
@@ -167,6 +154,8 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
 SHOTS_FOLDER = "shots"
 """Name of the folder of finished shots, in the folder of a study."""
 _DAMAGE_ADVICE = "damaged; delete it, and resume to repeat it"
+_COEFFICIENT = ColumnSpec("effects", float)
+"""Declaration of a coefficient of an effect."""
 _NULLABLE_NUMBERS = ("height", "margin", "restitution", "seconds")
 """Numbers of a model that may be missing."""
 
@@ -207,7 +196,13 @@ def store_shot(
         models: models as returned by `bench.bounce_shot.tuned_shots.tune_and_plan`.
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
-    rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]
+    rows = [
+        {
+            **_build_shot_row(setup, model, execute_shot(setup, settings, model)),
+            "seen": visible_share,
+        }
+        for model in models
+    ]
     document = to_json_value({"models": [asdict(model) for model in models], "rows": rows})
     write_atomically(
         get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -277,29 +272,14 @@ def _validate_document(document: dict[str, Any], name: str, columns: Columns) ->
     try:
         for row, table in enumerate(tables):
             select_declared_columns(list(table), columns, row)
-            if name == "models":
-                _check_effects(row, table["effects"])
+            for values in table["effects"].values() if name == "models" else ():
+                try:
+                    check_cells(_COEFFICIENT, parse_json_column(_COEFFICIENT, values))
+                except CellError as error:
+                    error.row = row
+                    raise
         for column in columns:
             check_cells(column, parse_json_column(column, [table[column.name] for table in tables]))
     except CellError as error:
         error.says = f"{name}, {(error.row or 0) + 1}: {error.says}"
         raise
-
-
-def _check_effects(row: int, effects: Any) -> None:
-    """Validate the coefficients of a model's effects.
-
-    Args:
-        row: index of the model, for the message.
-        effects: coefficients by name of the effect, as read from JSON.
-
-    Raises:
-        CellError: a coefficient is not a number.
-    """
-    coefficient = ColumnSpec("effects", float)
-    for values in effects.values():
-        try:
-            check_cells(coefficient, parse_json_column(coefficient, values))
-        except CellError as error:
-            error.row = row
-            raise

@@ -13,7 +13,7 @@ import pandas as pd
 from bench.benchmark.problem.experiment import Experiment
 from bench.bounce_shot.hit_rate_table import make_success_panel
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_execution import ShotResult, execute_shot
+from bench.bounce_shot.shot_execution import ShotResult, execute_shot, find_descent_index
 from bench.bounce_shot.shot_planner import ShotGeometry
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.tuned_shots import (
@@ -121,12 +121,6 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     return finish_chart(figure, axes[0], title, legend="outside right upper")
 
 
-def _label_methods(axis: Axes, methods: Sequence[str]) -> None:
-    """Label the vertical axis with the methods, the first one at the top."""
-    axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
-    axis.invert_yaxis()
-
-
 def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     """Draw the legend of the groups that occur, below the figure.
 
@@ -179,7 +173,9 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     error_axis.set_xscale("log")
     error_axis.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
     error_axis.minorticks_off()
-    _label_methods(miss_axis, methods)
+    # The first method is at the top.
+    miss_axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
+    miss_axis.invert_yaxis()
     for axis in (miss_axis, error_axis):
         axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
@@ -361,22 +357,12 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
 
 
 def find_path_end(path: Array, scene: ShotGeometry) -> int:
-    """Return the index of the sample at which a path is below the hoop after its bounce.
+    """Return the number of samples to draw of a path, up to 0.12 m below the hoop after its bounce.
 
-    The path is drawn up to this sample, 0.12 m below the hoop: how it continues is not of interest.
+    How it continues is not of interest.
 
     Args:
         path: positions, (T, 3).
         scene: incline and hoop.
-
-    Returns:
-        Index of the sample, or the number of samples.
     """
-    heights = path[:, 2]
-    # Before the bounce, the ball falls through the same heights.
-    has_risen = np.concatenate([[False], np.logical_or.accumulate(heights[1:] > heights[:-1])])
-    is_falling = np.concatenate([[0], np.diff(heights)]) < 0
-    indices_below = np.flatnonzero(
-        has_risen & (heights < scene.hoop_z - _MIN_DRAWN_DEPTH) & is_falling
-    )
-    return int(indices_below[0]) if indices_below.size else len(heights)
+    return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

@@ -90,23 +90,6 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
     return result
 
 
-def compute_rim_margins(path: Array, scene: ShotGeometry) -> Array:
-    """Return the distances from the crossing points to the rim of the hoop.
-
-    Args:
-        path: Centres x, y, z of the ball (n, T, 3), m.
-        scene: Geometry of the shot.
-
-    Returns:
-        Distances (n,) in m, > 0 inside the hoop; NaN for paths that do not cross its plane.
-    """
-    crossing_points = compute_hoop_crossings(path, scene)
-    result: Array = scene.hoop_radius - np.hypot(
-        crossing_points[:, 0] - scene.hoop_x, crossing_points[:, 1]
-    )
-    return result
-
-
 _FIRST_GRID_SIZE = 48
 """Number of heights of the first grid, over the whole range."""
 _GRID_COUNT = 4
@@ -191,7 +174,9 @@ def plan_shot(model: PlanningModel, scene: ShotGeometry, heights: tuple[float, f
     grid = np.linspace(low, high, _FIRST_GRID_SIZE)
     best = ShotPlan()
     for _ in range(_GRID_COUNT):
-        margins = compute_rim_margins(model.simulate_flights(scene, grid, times), scene)
+        crossings = compute_hoop_crossings(model.simulate_flights(scene, grid, times), scene)
+        # Distances from the crossing points to the rim, positive inside the hoop.
+        margins = scene.hoop_radius - np.hypot(crossings[:, 0] - scene.hoop_x, crossings[:, 1])
         if not np.isfinite(margins).any():
             break
         place = np.nanargmax(margins)

@@ -24,7 +24,7 @@ from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.figures.recording_figure import render_track_figure
 from bench.logs import film_tracking
 from sims.core.simulator import Array, Scenario
-from sims.recording.recording import Recording, Run, read_recording
+from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import Ball as BallSimulator
 from sims.vision.ball_renderer import BallScene, SceneAppearance
@@ -163,17 +163,6 @@ def draw_shots(experiment: Experiment, settings: ShotConfig, salt: str = "") -> 
         for i in range(experiment.targets)
         for kind in settings.balls
     ]
-
-
-def compute_visible_share(path: Path, experiment: Experiment) -> float:
-    """Compute the fraction of a drop's sample times at which its recording has a height.
-
-    Args:
-        path: the recording.
-        experiment: the experiment, for the number of samples.
-    """
-    z = read_recording(path, BallSimulator, whole=True).runs[0].channels["z"]
-    return float(np.isfinite(z).sum() / experiment.sampling.samples)
 
 
 def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, path: Path) -> None:

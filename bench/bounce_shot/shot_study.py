@@ -8,6 +8,8 @@ from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
@@ -43,13 +45,14 @@ from bench.bounce_shot.shot_execution import (
 from bench.bounce_shot.shot_sampling import (
     RECORDINGS_FOLDER,
     ShotSetup,
-    compute_visible_share,
     draw_shots,
     record_drop,
 )
 from bench.bounce_shot.tuned_shots import TunedModel
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
+from sims.recording.recording import read_recording
+from sims.systems.ball import Ball as BallSimulator
 from sims.vision import video_files
 
 
@@ -319,8 +322,9 @@ class _ShotStages:
             index = recorded[position]
             if isinstance(models, BaseException):
                 models = _make_failed_models(self._experiment, models)
-            visible_share = compute_visible_share(self._paths[index], self._experiment)
-            self._store(index, models, visible_share)
+            run = read_recording(self._paths[index], BallSimulator, whole=True).runs[0]
+            visible_samples = float(np.isfinite(run.channels["z"]).sum())
+            self._store(index, models, visible_samples / self._experiment.sampling.samples)
             step()
 
     def _store(self, index: int, models: Sequence[TunedModel], visible_share: float) -> None:
