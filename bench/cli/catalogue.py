@@ -7,8 +7,9 @@ references and schemas.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -99,35 +100,6 @@ def is_path_argument(action: argparse.Action) -> bool:
     return _OPTION_TYPES.get(getattr(action.type, "__name__", "")) == "path"
 
 
-def list_tuners() -> list[JsonDocument]:
-    """List every tuner: whether it learns, whether it is stochastic, and what it requires."""
-    from bench.core.plugin_registries import tuners as registry
-
-    def describe_kind(kind: Any) -> JsonDocument:
-        """Return the properties of one tuner class, `kind`, that only tuners have."""
-        return {
-            "learned": bool(kind.learned),
-            "stochastic": bool(kind.stochastic),
-            "requires": list(getattr(kind, "requires", ())),
-        }
-
-    return [_describe_part(registry, name, describe_kind) for name in registry.names()]
-
-
-def list_simulators() -> list[JsonDocument]:
-    """List every simulator with its description."""
-    from bench.core.plugin_registries import simulators as registry
-
-    return [_describe_part(registry, name, lambda _: {}) for name in registry.names()]
-
-
-def list_systems() -> list[JsonDocument]:
-    """List every simulator's declared numbers, states and signals, with units and ranges."""
-    from bench.core.plugin_registries import simulators as registry
-
-    return [_describe_part(registry, name, _describe_system) for name in registry.names()]
-
-
 def _describe_system(kind: Any) -> JsonDocument:
     """Return what a system declares: parameters, constants, inputs, states and observed channels.
 
@@ -152,15 +124,6 @@ def _describe_channels(channels: Iterable[Any]) -> list[JsonDocument]:
 def _pick(part: Any, *names: str) -> JsonDocument:
     """Return some attributes of an object by name."""
     return {name: getattr(part, name) for name in names}
-
-
-def list_effects() -> list[JsonDocument]:
-    """List every effect, with unit and plausible range of each coefficient on each system kind."""
-    from sims.effects import registry
-
-    return [
-        _describe_part(registry, name, _describe_effect_properties) for name in registry.names()
-    ]
 
 
 def _describe_effect_properties(effect: Any) -> JsonDocument:
@@ -190,16 +153,6 @@ def _describe_effect_properties(effect: Any) -> JsonDocument:
         "source": effect.source,
         "coefficients": coefficients,
     }
-
-
-def list_diagnosers() -> list[JsonDocument]:
-    """List every diagnoser: whether it learns, and what it requires."""
-    from bench.core.plugin_registries import diagnosers as registry
-
-    def describe_kind(kind: Any) -> JsonDocument:
-        return {"learned": bool(kind.learned), "requires": list(kind.requires)}
-
-    return [_describe_part(registry, name, describe_kind) for name in registry.names()]
 
 
 def list_experiments() -> list[JsonDocument]:
@@ -260,28 +213,49 @@ def list_schemas() -> list[JsonDocument]:
     return [{"name": name, "says": load_schema(name)["title"]} for name in list_schema_names()]
 
 
-def _describe_part(
-    registry: Any, name: str, describe_kind: Callable[[Any], JsonDocument]
-) -> JsonDocument:
-    """Describe a registered part (such as a tuner), or why it cannot be used here.
+def _describe_tuner(kind: Any) -> JsonDocument:
+    """Return the properties of a tuner: whether it learns, and uses random numbers; its needs."""
+    return {
+        "learned": bool(kind.learned),
+        "stochastic": bool(kind.stochastic),
+        "requires": list(getattr(kind, "requires", ())),
+    }
 
-    `describe_kind` returns the properties that only parts of this kind have, from the class.
-    """
-    from bench.core.plugin_registries import PartUnavailableError
 
-    try:
-        part = registry.get(name)
-    except PartUnavailableError as error:
-        return {"name": name, "says": None, "skipped": error.reason}
-    return {"name": name, "says": registry.describe(name), "skipped": None, **describe_kind(part)}
+_PARTS: Mapping[str, tuple[str, Callable[[Any], JsonDocument]]] = {
+    "tuners": ("tuners", _describe_tuner),
+    "simulators": ("simulators", lambda _: {}),
+    # A system is a simulator with its declared numbers, states and signals.
+    "systems": ("simulators", _describe_system),
+    "effects": ("effects", _describe_effect_properties),
+    "diagnosers": (
+        "diagnosers",
+        lambda kind: {"learned": bool(kind.learned), "requires": list(kind.requires)},
+    ),
+}
+"""Registry of the parts of a section, and the function that describes the class of a part."""
+
+
+def list_parts(section: str) -> list[JsonDocument]:
+    """List the registered parts of a section, each with the reason if it cannot be used here."""
+    from bench.core import plugin_registries
+
+    registry_name, describe_kind = _PARTS[section]
+    registry = getattr(plugin_registries, registry_name)
+    documents = []
+    for name in registry.names():
+        try:
+            kind = registry.get(name)
+        except plugin_registries.PartUnavailableError as error:
+            documents.append({"name": name, "says": None, "skipped": error.reason})
+            continue
+        properties = {"says": registry.describe(name), "skipped": None, **describe_kind(kind)}
+        documents.append({"name": name, **properties})
+    return documents
 
 
 CATALOGUE_SECTIONS: dict[str, Callable[[], list[JsonDocument]]] = {
-    "tuners": list_tuners,
-    "simulators": list_simulators,
-    "systems": list_systems,
-    "effects": list_effects,
-    "diagnosers": list_diagnosers,
+    **{section: partial(list_parts, section) for section in _PARTS},
     "experiments": list_experiments,
     "references": list_references,
     "schemas": list_schemas,
