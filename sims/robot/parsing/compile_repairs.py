@@ -12,7 +12,7 @@ import numpy as np
 from sims.core import toml_validation
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.robot.mujoco_messages import format_item_list, format_mujoco_error, format_name_list
-from sims.robot.parsing.mesh_files import OmittedShapes, remove_mesh, remove_texture
+from sims.robot.parsing.mesh_files import OmittedShapes, find_assets_of_file, remove_asset
 from sims.robot.parsing.xml_files import ModelFileReader
 
 MIN_MOMENT = 1e-9
@@ -122,7 +122,7 @@ class CompileRepairs:
         """Compile an editable model, and repair what MuJoCo rejects.
 
         MuJoCo reports one error at a time. So the model is compiled again after each repair;
-        the number of attempts is limited by two for each body, mesh and texture.
+        the number of attempts is limited by two for each body and asset.
 
         Args:
             spec: editable model (`mujoco.MjSpec`); it must not be used afterwards.
@@ -134,7 +134,8 @@ class CompileRepairs:
         Raises:
             InputError: MuJoCo rejects the model; contains MuJoCo's message.
         """
-        for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
+        assets = (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)
+        for _ in range(2 * (len(spec.bodies) + len(assets)) + 2):
             try:
                 uncompiled = spec.copy()
                 return uncompiled, spec.compile()
@@ -162,12 +163,19 @@ class CompileRepairs:
             return self._repair_triangle_inequality(spec)
         if "mass and inertia of moving bodies" in message:
             return self._set_default_mass(spec, name)
-        reason = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', message)})"
-        if TEXTURE_ERROR_PATTERN.search(reason) and remove_texture(spec, name, reason, self.left):
-            return True
-        return bool(MESH_ERROR_PATTERN.search(reason)) and remove_mesh(
-            spec, name, reason, self.left
-        )
+        missing_file = re.search(r"opening file '(.*?)'", message)
+        if missing_file:
+            assets, reason = find_assets_of_file(spec, missing_file[1]), "is absent"
+        else:
+            reason = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', message)})"
+            assets = []
+            if TEXTURE_ERROR_PATTERN.search(reason):
+                assets = [texture for texture in spec.textures if texture.name == name]
+            if not assets and MESH_ERROR_PATTERN.search(reason):
+                assets = [mesh for mesh in spec.meshes if mesh.name == name]
+        for asset in assets:
+            remove_asset(spec, asset, reason, self.left)
+        return bool(assets)
 
     def _repair_triangle_inequality(self, spec: Any) -> bool:
         """Replace principal moments that no rigid body can have, in all bodies.

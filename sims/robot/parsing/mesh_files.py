@@ -196,48 +196,52 @@ def is_moving_body(body: Any) -> bool:
     return False
 
 
-def remove_mesh(spec: Any, name: str, reason: str, omitted: OmittedShapes) -> bool:
-    """Remove a mesh that MuJoCo rejects, and the geoms that use it.
-
-    The robot then moves as before, without this shape in contacts or pictures.
+def find_assets_of_file(spec: Any, path: str) -> list[Any]:
+    """Find the meshes, height fields, skins and textures of a spec that need a file.
 
     Args:
         spec: the mujoco.MjSpec.
-        name: name of the mesh.
-        reason: why the shape or texture cannot be read.
-        omitted: record of omitted shapes.
-
-    Returns:
-        Whether the spec contains this mesh.
+        path: path of the file as in MuJoCo's messages, with the folder of the assets.
     """
-    meshes = [mesh for mesh in spec.meshes if mesh.name == name]
-    for geom in [geom for geom in spec.geoms if geom.meshname == name]:
-        omitted.leave_out(spec, geom, name, reason)
-    for mesh in meshes:
-        spec.delete(mesh)
-    return bool(meshes)
+    assets = [*spec.meshes, *spec.hfields, *spec.skins, *spec.textures]
+    files = {i: [asset.file, *getattr(asset, "cubefiles", ())] for i, asset in enumerate(assets)}
+    exact = [i for i, names in files.items() if any(n and path.endswith(n) for n in names)]
+    # With the setting strippath, MuJoCo ignores the folders in the names.
+    stripped = [
+        i for i, names in files.items() if any(n and Path(n).name == Path(path).name for n in names)
+    ]
+    return [assets[i] for i in exact or stripped]
 
 
-def remove_texture(spec: Any, name: str, reason: str, omitted: OmittedShapes) -> bool:
-    """Replace a texture that MuJoCo rejects by a single colour.
+def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> None:
+    """Remove an asset whose file is missing, or which MuJoCo rejects, and the geoms that use it.
 
-    A texture has no influence on the motion.
+    The robot then moves as before, without this shape in contacts or pictures. A texture, which has
+    no influence on the motion, is replaced by a single colour.
 
     Args:
         spec: the mujoco.MjSpec.
-        name: name of the texture.
-        reason: why the shape or texture cannot be read.
+        asset: mesh, height field, skin or texture of the spec.
+        reason: why it cannot be used.
         omitted: record of omitted shapes.
 
-    Returns:
-        Whether the spec contains this texture.
+    Raises:
+        InputError: the mass of a moving body depends on a mesh.
     """
     import mujoco
 
-    for texture in [texture for texture in spec.textures if texture.name == name]:
-        omitted.seen.setdefault(reason, []).append(texture.file or name)
-        texture.file, texture.cubefiles = "", []
-        texture.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
-        texture.width = texture.height = 1
-        return True
-    return False
+    name, label = asset.name, asset.file or asset.name
+    if isinstance(asset, mujoco.MjsTexture):
+        label = next((file for file in (asset.file, *asset.cubefiles) if file), name)
+        asset.file, asset.cubefiles = "", []
+        asset.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+        asset.width = asset.height = 1
+    elif not isinstance(asset, mujoco.MjsSkin):
+        attribute = "meshname" if isinstance(asset, mujoco.MjsMesh) else "hfieldname"
+        for geom in [geom for geom in spec.geoms if getattr(geom, attribute) == name]:
+            omitted.leave_out(spec, geom, label, reason)
+        spec.delete(asset)
+        return
+    else:
+        spec.delete(asset)
+    omitted.seen.setdefault(reason, []).append(label)

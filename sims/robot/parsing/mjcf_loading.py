@@ -1,21 +1,15 @@
-"""Prepare an MJCF for loading: omit elements with missing files where masses are specified."""
+"""Prepare an MJCF for loading: read the files that it refers to, and check its sizes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import PurePosixPath
-from typing import Any
 from xml.etree.ElementTree import Element
 
 from sims.core.files import is_existing_file
 from sims.core.plain_values import truncate_text
-from sims.robot.parsing.mesh_files import OmittedShapes
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
 
-PLACEHOLDER_MESH_VERTICES = "0 0 0 1 0 0 0 1 0 0 0 1"
-"""Vertices of a placeholder for a missing mesh; the mesh is removed after loading."""
 TEXTURE_FILE_ATTRIBUTES = (
     "file",
     "fileright",
@@ -41,64 +35,20 @@ MAX_SIZE_ATTRIBUTES = {
 """Attributes that request memory, and their maximum values."""
 
 
-@dataclass
-class MissingFiles:
-    """Missing files that a model refers to.
+def read_referenced_files(files: ModelFileReader, root: Element) -> None:
+    """Read the files that an MJCF refers to, so that a changed mesh is another model.
 
-    Attributes:
-        meshes: missing mesh files by name of the asset.
-        fields: missing height field files by name of the asset.
-        pictures: missing files of textures and skins.
-    """
-
-    meshes: dict[str, str] = field(default_factory=dict)
-    fields: dict[str, str] = field(default_factory=dict)
-    pictures: list[str] = field(default_factory=list)
-
-    def remove_from_spec(self, spec: Any, omitted: OmittedShapes) -> None:
-        """Remove the elements whose files are missing from a model.
-
-        MuJoCo would refuse a model with missing files, so it was loaded with placeholders for them.
-        These are removed here, before compilation, with all geoms (shapes) that use them.
-
-        Args:
-            spec: editable model (`mujoco.MjSpec`); it is changed in place.
-            omitted: record of omitted shapes.
-
-        Raises:
-            InputError: the mass of a moving body depends on a missing mesh.
-        """
-        reason = "is absent"
-        for geom in list(spec.geoms):
-            file = self.meshes.get(geom.meshname) or self.fields.get(geom.hfieldname)
-            if file:
-                omitted.leave_out(spec, geom, file, reason)
-        for assets, names in ((spec.meshes, self.meshes), (spec.hfields, self.fields)):
-            for asset in [asset for asset in assets if asset.name in names]:
-                spec.delete(asset)
-        if self.pictures:
-            omitted.seen.setdefault(reason, []).extend(self.pictures)
-
-
-def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles:
-    """Read the files that an MJCF refers to, and insert placeholders for missing ones.
-
-    Reading adds the files to the digest of the model, so that a changed mesh is another model. A
-    missing file is not an error yet: a robot can be simulated without a visual mesh. The folders of
-    the files are those of the element ``<compiler>``; later settings replace earlier ones.
+    A missing file is not an error yet: a robot can be simulated without a visual mesh. The folders
+    of the files are those of the element ``<compiler>``; later settings replace earlier ones.
 
     Args:
         files: reader of the model file.
-        root: root element of the MJCF; it is changed in place.
-
-    Returns:
-        The missing files.
+        root: root element of the MJCF; paths that MuJoCo would not find become absolute.
 
     Raises:
         InputError: a count, a size or a file is too large, or an attached model is missing.
     """
     _check_sizes(files, root, 1.0)
-    missing_files = MissingFiles()
     settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
     asset_folder = settings.get("assetdir", "")
     mesh_folder = settings.get("meshdir", asset_folder)
@@ -109,19 +59,14 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
         if file and _read_asset(files, mesh_folder, file, strip):
             element.set("file", str((files.path.parent / mesh_folder / file).resolve()))
     for asset in find_children(root, "asset"):
-        for element in list(asset):
-            if element.tag == "model":
-                _read_attached_model(files, element)
+        for part in asset:
+            if part.tag == "model":
+                _read_attached_model(files, part)
                 continue
-            folder = texture_folder if element.tag == "texture" else mesh_folder
-            missing = [
-                name
-                for name in _iterate_asset_files(element)
-                if not _read_asset(files, folder, name, strip)
-            ]
-            if missing:
-                _insert_placeholder(missing_files, asset, element, missing[0])
-    return missing_files
+            folder = texture_folder if part.tag == "texture" else mesh_folder
+            for key in TEXTURE_FILE_ATTRIBUTES if part.tag == "texture" else ("file",):
+                if part.get(key):
+                    _read_asset(files, folder, part.attrib[key], strip)
 
 
 def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> None:
@@ -185,12 +130,6 @@ def _read_attached_model(files: ModelFileReader, element: Element) -> None:
     element.set("file", str(path.resolve()))
 
 
-def _iterate_asset_files(element: Element) -> Iterator[str]:
-    """Return the names of the files that an asset refers to; a texture may have six."""
-    keys = TEXTURE_FILE_ATTRIBUTES if element.tag == "texture" else ("file",)
-    return (element.attrib[key] for key in keys if element.get(key))
-
-
 def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> bool:
     """Return whether an asset file exists, and read it into the digest of the model.
 
@@ -206,39 +145,3 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
         return False
     files.read_content(path, MAX_ASSET_BYTES)
     return True
-
-
-def _insert_placeholder(
-    missing_files: MissingFiles, asset: Element, element: Element, file: str
-) -> None:
-    """Replace an asset with a missing file by a placeholder that MuJoCo loads.
-
-    A mesh becomes a tetrahedron, a height field a flat square, and a texture a single colour. A
-    skin, which is only visual, is removed. Other assets are left unchanged, so that MuJoCo reports
-    the missing file.
-
-    Args:
-        missing_files: missing files found so far; the asset is added.
-        asset: section of the model with the element.
-        element: element that names the file; changed in place.
-        file: name of the missing file.
-    """
-    name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
-    if element.tag == "mesh":
-        missing_files.meshes[name] = file
-        attributes = {"name": name, "vertex": PLACEHOLDER_MESH_VERTICES}
-    elif element.tag == "hfield":
-        missing_files.fields[name] = file
-        attributes = {"name": name, "nrow": "2", "ncol": "2", "size": "1 1 1 1"}
-    elif element.tag == "texture":
-        missing_files.pictures.append(file)
-        attributes = {"name": name, "type": element.get("type", "cube"), "builtin": "flat"}
-        attributes |= {"width": "1", "height": "1"}
-    elif element.tag == "skin":
-        missing_files.pictures.append(file)
-        asset.remove(element)
-        return
-    else:
-        return
-    element.attrib.clear()
-    element.attrib.update(attributes)

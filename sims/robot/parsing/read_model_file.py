@@ -119,9 +119,8 @@ def _make_robot(
         spec = _parse_repaired_file(files, root)
         urdf_loading.stiffen_mimics(spec)
     else:
-        missing_files = mjcf_loading.load_referenced_files(files, root)
+        mjcf_loading.read_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
-        missing_files.remove_from_spec(spec, repairs.left)
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
     notes += compile_repairs.apply_engine_settings(spec, engine, source)
     notes += xml_files.name_unnamed_elements(spec)

@@ -143,7 +143,7 @@ def test_a_mesh_that_mujoco_refuses(write):
     assert robot.compiled.nmesh == 0
     note, _ = robot.notes
     assert note.startswith("shapes left out, and their contacts, since their file is refused by ")
-    assert note.endswith("is not finite): m")
+    assert note.endswith("is not finite): bad.obj")
 
 
 def test_a_picture_that_mujoco_refuses(write):

@@ -229,7 +229,7 @@ def test_a_mesh_that_mujoco_refuses(read_repaired, write):
     assert note.startswith(
         "shapes left out, and their contacts, since their file is refused by MuJoCo (vertex"
     )
-    assert note.endswith("): bad")
+    assert note.endswith("): bad.obj")
     assert robot.compiled.ngeom == 0
 
 
