@@ -14,9 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
-from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, Joint, RobotModel, cache_per_robot
 
 COUPLING_EFFECT = "joint.coupling"
@@ -72,31 +70,6 @@ def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
     )
 
 
-def name_unnamed_elements(spec: Any, robot: RobotModel) -> dict[int, Any]:
-    """Name the unnamed joints and actuators of a spec as the robot names them.
-
-    Their default names contain their numbers, which change when elements are added.
-
-    Args:
-        spec: the mujoco.MjSpec; it is changed in place.
-        robot: robot that was read from this spec.
-
-    Returns:
-        The joints of the spec by their numbers.
-    """
-    if all(element.name for element in (*spec.joints, *spec.actuators)):
-        return {robot.joint(joint.name).id: joint for joint in spec.joints}
-    # Elements have numbers only after compilation.
-    with capture_mujoco_warnings():
-        spec.compile()
-    joints = {joint.id: joint for joint in spec.joints}
-    for joint in robot.joints:
-        joints[joint.id].name = joint.name
-    for actuator in spec.actuators:
-        actuator.name = robot.actuators[actuator.id].name
-    return joints
-
-
 def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> RobotModel:
     """Make a robot with tendons in place of joint transmissions, without changing element names.
 
@@ -110,7 +83,6 @@ def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> 
     import mujoco
 
     spec = robot.spec.copy()
-    name_unnamed_elements(spec, robot)
     for name, c in coefficients.items():
         preceding_joint = find_preceding_joint(robot, name)
         assert preceding_joint is not None

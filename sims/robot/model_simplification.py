@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from sims.core.freed_memory import release_free_memory
-from sims.robot.coupled_drives import name_unnamed_elements
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing import collision_hulls
 from sims.robot.parsing.collision_hulls import (
@@ -103,7 +102,6 @@ def _strip_model(robot: RobotModel) -> RobotModel:
         spec.compile()  # Compilation assigns numbers to the elements.
     _write_inertials(spec, model)
     hull_by_mesh, geom_numbers = _reduce_geoms(spec, model)
-    name_unnamed_elements(spec, robot)
     spec.discard_visual()
     spec.compiler.discardvisual = False
     used_fields = {geom.hfieldname for geom in spec.geoms}

@@ -43,7 +43,7 @@ class Joint:
     """A joint.
 
     Attributes:
-        name: name in the model; such as ``joint3`` if it has none.
+        name: name in the model.
         kind: kind, in MuJoCo's words.
         id: number in the compiled model.
         position: address of its first position in qpos.
@@ -86,7 +86,7 @@ class Actuator:
     """An actuator.
 
     Attributes:
-        name: name in the model; such as ``actuator3`` if it has none.
+        name: name in the model.
         id: number in the compiled model.
         joint: joint that it drives; None if it drives something else.
         kind: ``motor`` (its control is a force, times the gear), ``position``, ``velocity``,
@@ -154,7 +154,8 @@ class RobotModel:
     Attributes:
         path: path of the model file.
         format: mjcf or urdf.
-        spec: repaired mujoco.MjSpec; compile a copy of it and do not change it.
+        spec: repaired mujoco.MjSpec, in which joints, actuators, bodies and sensors have names;
+            compile a copy of it and do not change it.
         notes: notes about repairs and omissions, one line each.
         aliases: body that MuJoCo compiles, by name of a link that is fused into it.
         digest: digest of everything that was read, in hexadecimal digits.
@@ -260,7 +261,7 @@ class RobotModel:
             )
             joints.append(
                 Joint(
-                    name=model.joint(joint_id).name or f"joint{joint_id}",
+                    name=model.joint(joint_id).name,
                     kind=kind,
                     id=joint_id,
                     position=int(model.jnt_qposadr[joint_id]),
@@ -316,7 +317,7 @@ class RobotModel:
         elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE):
             motion = "slide" if model.actuator_gear[i, :3].any() else "hinge"
         return Actuator(
-            name=model.actuator(i).name or f"actuator{i}",
+            name=model.actuator(i).name,
             id=i,
             joint=joint,
             kind=_detect_actuator_kind(model, i),
@@ -360,7 +361,7 @@ class RobotModel:
             # Bodies welded to the world do not move; those welded to other bodies move with them.
             if int(model.body_weldid[body_id]) == 0:
                 continue
-            name = model.body(body_id).name or f"body{body_id}"
+            name = model.body(body_id).name
             aliases = tuple(fused_names.get(name, ()))
             moving_bodies.append(Body(name, body_id, float(model.body_mass[body_id]), aliases))
         return tuple(moving_bodies)
@@ -371,7 +372,7 @@ class RobotModel:
         model = self.compiled
         rows = []
         for sensor_id in range(model.nsensor):
-            name = model.sensor(sensor_id).name or f"sensor{sensor_id}"
+            name = model.sensor(sensor_id).name
             begin, count = int(model.sensor_adr[sensor_id]), int(model.sensor_dim[sensor_id])
             # Axes, quaternion entries, or numbers.
             suffixes = {3: "xyz", 4: "wxyz"}.get(count) or map(str, range(count))

@@ -42,7 +42,6 @@ from sims.robot.coupled_drives import (
     COUPLING_PLACEHOLDER,
     list_coupling_places,
     make_coupled_robot,
-    name_unnamed_elements,
 )
 from sims.robot.dynamics.inverse_dynamics import inertia_matrix
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
@@ -131,10 +130,9 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     import mujoco
 
     spec = robot.spec.copy()
-    joints = name_unnamed_elements(spec, robot)
     inertias = _compute_joint_inertias(robot)
     for name, effects in group_by_joint(added).items():
-        first_joint = joints[robot.joint(name).id]
+        first_joint = spec.joint(name)
         # Default classes of the file apply to the first joint only.
         zero_attributes = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
         second_joint = first_joint.parent.add_joint(
