@@ -40,6 +40,8 @@ from sims.core.files import write_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
     from bench.benchmark.runner.stored_study import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
@@ -74,23 +76,15 @@ class Comparison(Study):
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
         """
-        from bench.benchmark.runner.experiment_runner import (
-            check_classes_importable,
-            prepare_experiment,
-        )
-        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
+        from bench.benchmark.runner.experiment_runner import prepare_experiment
 
         results = prepare_experiment(new.experiment, new.secret)
-        # This comes before the folder is created, so that a user error leaves no files behind.
-        if new.jobs:
-            check_classes_importable(new.experiment)
-        hashes = compute_fingerprint(new.experiment, new.plugins)
-        comparison = cls(new.create_folder(hashes, results.redraws))
+        comparison = cls(new.create_folder(results.redraws))
         comparison._attach(results)
         return comparison
 
     @classmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Comparison:
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Self:
         """Open an interrupted comparison with its finished runs; see `Study.resume`.
 
         Args:
@@ -98,11 +92,9 @@ class Comparison(Study):
             plugins: additional plugin files.
         """
         from bench.benchmark.runner.experiment_runner import prepare_experiment
-        from bench.benchmark.runner.run_fingerprint import check_resumable
 
-        comparison = cls(folder)
+        comparison = super().resume(folder, plugins)
         experiment = comparison.configuration.experiment
-        comparison.plugins = check_resumable(folder, comparison.configuration, plugins)
         comparison._attach(prepare_experiment(experiment, read_salt(folder, experiment)))
         return comparison
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,6 +56,9 @@ from sims.recording.recording import read_recording
 from sims.systems.ball import Ball as BallSimulator
 from sims.vision import video_files
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 
 class BounceShotStudy(Study):
     """Study of shots by several methods, stored in a folder; implements `study.Study`.
@@ -80,8 +84,6 @@ class BounceShotStudy(Study):
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
         """
-        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
-
         experiment = new.experiment
         if read_shot_config(experiment).filmed:
             video_files.check_installed("; or set shot.filmed = 0")
@@ -91,22 +93,17 @@ class BounceShotStudy(Study):
             )
         # Validated before the folder is created: an error of the user leaves no files.
         check_tuners(experiment)
-        if new.jobs:
-            check_classes_importable(experiment)
-        return cls(new.create_folder(compute_fingerprint(experiment, new.plugins)))
+        return cls(new.create_folder())
 
     @classmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Self:
         """Open an interrupted study to run what is missing; see `Study.resume`.
 
         Args:
             folder: result folder.
             plugins: further plugin files.
         """
-        from bench.benchmark.runner.run_fingerprint import check_resumable
-
-        study = cls(folder)
-        study.plugins = check_resumable(folder, study.configuration, plugins)
+        study = super().resume(folder, plugins)
         check_shots(folder, study.shots)
         return study
 

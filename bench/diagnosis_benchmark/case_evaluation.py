@@ -15,8 +15,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
@@ -29,7 +27,8 @@ from bench.benchmark.isolation.tuner_processes import (
     IsolatedProcess,
     TunerSpec,
 )
-from bench.benchmark.runner.tuner_process_reuse import get_fork_server, retry_if_killed
+from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_part_process
+from bench.benchmark.runner.tuner_training import read_weights
 from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process
@@ -118,11 +117,7 @@ def evaluate_case(
     rows = []
     for diagnoser in examined:
         request = {
-            "wanted": {
-                "name": diagnoser.code.name,
-                "module": diagnoser.code.module,
-                "file": diagnoser.code.file,
-            },
+            "wanted": diagnoser.code.describe(),
             "table": recording_text.table,
             "description": recording_text.description,
             "beside": recording_text.extra_files,
@@ -160,7 +155,8 @@ def _ask_diagnoser(
         "diagnoser": diagnoser.label,
         "trusted": diagnoser.trusted,
     }
-    trained_arrays = _load_trained_arrays(diagnoser.learned.get(request["system"]))
+    weights = diagnoser.learned.get(request["system"])
+    trained_arrays = read_weights(weights) if weights else {}
     started_at = perf_counter()
     try:
         if diagnoser.trusted:
@@ -292,19 +288,13 @@ def _start_process(
         hidden: folders that the process must not read.
         extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
     """
-    is_builtin = code.module.startswith("bench.")
-    child = get_fork_server().start_process(
+    child = start_part_process(
+        code,
         "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
-        [code.file] if code.file else [],
         memory,
         hidden,
         # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
-        [
-            PRELOAD_MODULE,
-            *extra_modules,
-            *code.modules,
-            *([code.module] if is_builtin and not code.file else []),
-        ],
+        [PRELOAD_MODULE, *extra_modules],
     )
     try:
         child.wait_until_ready()
@@ -312,14 +302,6 @@ def _start_process(
         child.end()
         raise
     return child
-
-
-def _load_trained_arrays(path: Path | None) -> dict[str, Array]:
-    """Load trained arrays; return an empty dictionary if there is no file."""
-    if path is None:
-        return {}
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def train_isolated(

@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_report import REPORT_FILE
-from bench.benchmark.storage.result_folder import FolderConfiguration
-from bench.diagnosis_benchmark.answer_store import SKIPPED_STATUS, AnswersByCase, build_answer_rows
-from bench.diagnosis_benchmark.case_set import CaseSpec
+from bench.diagnosis_benchmark.answer_store import SKIPPED_STATUS, build_answer_rows
 from bench.diagnosis_benchmark.diagnoser_page import (
     DiagnoserReportData,
     build_chart_tables,
@@ -45,6 +43,8 @@ from sims.core.files import write_atomically
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from bench.diagnosis_benchmark.diagnoser_study import DiagnosisStudy
 
 OUTCOME_STYLES = (
     ("right", style.BLACK, "named, alone"),
@@ -306,30 +306,7 @@ ANSWERS_TABLE_FILE = "items.csv"
 """File with one row per answer."""
 
 
-class ReportableDiagnosisStudy(Protocol):
-    """Protocol of the studies that can be reported; see `diagnoser_study.DiagnosisStudy`."""
-
-    folder: Path
-    configuration: FolderConfiguration
-
-    @property
-    def answers(self) -> AnswersByCase:
-        """All stored answers."""
-
-    @property
-    def cases(self) -> list[CaseSpec]:
-        """All cases of the experiment."""
-
-    @property
-    def usable_diagnosers(self) -> list[str]:
-        """Names of the diagnosers that can be used here."""
-
-    @property
-    def skipped_diagnosers(self) -> dict[str, str]:
-        """Diagnosers that cannot be used here, with the reason."""
-
-
-def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], None]) -> int:
+def write_report(study: DiagnosisStudy, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and HTML report from the answers that exist.
 
     Only cases that every diagnoser has answered are reported.

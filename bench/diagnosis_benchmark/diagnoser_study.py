@@ -2,40 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.runner.code_digest import (
-    compute_digest,
-    hash_class_source,
-    hash_package_versions,
-    hash_plugin_files,
-    hash_source_folders,
-)
+from bench.benchmark.runner.code_digest import hash_class_source
 from bench.benchmark.runner.experiment_runner import (
     ProgressFactory,
-    make_unreachable_error,
     no_progress,
 )
-from bench.benchmark.runner.plugin_discovery import (
-    inspect_installed_part,
-    is_external_part,
-    load_plugins_for_experiment,
-    register_plugins,
-)
-from bench.benchmark.runner.run_fingerprint import check_unchanged
+from bench.benchmark.runner.plugin_discovery import announce_installed, list_compared_parts
 from bench.benchmark.runner.stored_study import PreparedStudy, PrintLine, Study
-from bench.benchmark.runner.tuner_process_reuse import find_preloadable_packages
-from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+from bench.benchmark.runner.tuner_process_reuse import make_part_spec
+from bench.benchmark.runner.tuner_training import TrainingResult, get_weights_folder
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
@@ -57,27 +42,15 @@ from bench.diagnosis_benchmark.case_set import (
     read_config,
 )
 from bench.diagnosis_benchmark.diagnoser_training import (
-    TrainedDiagnoser,
     TrainingCost,
     train_or_load,
     write_training_costs,
 )
 from sims.core.simulator import InputError
 
-BASE_SOURCE_FOLDERS = (
-    "sims",
-    "bench/benchmark/problem",
-    "bench/benchmark/runner",
-    "bench/benchmark/isolation",
-    "bench/diagnosis",
-    "bench/logs",
-)
-"""Source folders that determine the answers, except those of the diagnosis benchmark itself."""
-SOURCE_FOLDERS = (
-    *BASE_SOURCE_FOLDERS,
-    "bench/diagnosis_benchmark/case_generation",
-    "bench/diagnosis_benchmark/diagnosers",
-)
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 MAX_TRAINING_SECONDS = 3600.0
 """Maximum training time of a diagnoser for one system, seconds."""
 _CASE_DRAW_SECONDS = 300.0
@@ -118,32 +91,19 @@ class DiagnosisStudy(Study):
         """
         settings = read_config(new.experiment)
         build_case_set(settings)
-        if new.jobs:
-            _refuse_unreachable(settings.diagnosers)
-        for name in settings.diagnosers:
-            _register_stub(name, new.experiment.trusted)
-        return cls(new.create_folder(_compute_fingerprint(new.experiment, new.plugins)))
+        _check_code_isolated(new.experiment)
+        return cls(new.create_folder())
 
     @classmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Self:
         """Open an interrupted comparison in order to run it; see `Study.resume`.
 
         Args:
             folder: result folder.
             plugins: further plugin files.
         """
-        study = cls(folder)
-        configuration = study.configuration
-        stated_paths = {str(Path(p).resolve()) for p in plugins}
-        study.plugins = configuration.plugins + sorted(stated_paths - set(configuration.plugins))
-        load_plugins_for_experiment(study.plugins, configuration.experiment)
-        for name in study.config.diagnosers:
-            _register_stub(name, configuration.experiment.trusted)
-        check_unchanged(
-            folder,
-            configuration.fingerprint,
-            _compute_fingerprint(configuration.experiment, study.plugins),
-        )
+        study = super().resume(folder, plugins)
+        _check_code_isolated(study.configuration.experiment)
         return study
 
     @cached_property
@@ -260,7 +220,7 @@ class _EvaluationRun:
         """
         self._study, self._answer_store, self._progress = study, answer_store, progress
         self._experiment = study.configuration.experiment
-        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, get_weights_folder()))
         self._salt = study.salt or PUBLIC_SALT
         self._limits = AnswerLimits(
             self._experiment.budget, self._experiment.timeout, self._experiment.memory
@@ -323,7 +283,7 @@ class _EvaluationRun:
         # The model file of a robot is not known before its case, so no diagnoser can train for it.
         required_systems = {question.system for question in self._study.cases}
         systems = sorted(required_systems & set(simulators.names()))
-        codes = {name: make_diagnoser_spec(name) for name in self._study.usable_diagnosers}
+        codes = {name: make_part_spec(diagnosers, name) for name in self._study.usable_diagnosers}
         learning_diagnosers = [name for name in codes if diagnosers.get(name).learned]
         # calls[i] is the training of trainings[i].
         trainings = [(name, system) for name in learning_diagnosers for system in systems]
@@ -348,7 +308,7 @@ class _EvaluationRun:
         step = self._progress("training", len(calls)) if calls else None
         for index, result in workers.iterate_results(calls, math.inf) if calls else ():
             name, system = trainings[index]
-            if isinstance(result, TrainedDiagnoser):
+            if isinstance(result, TrainingResult):
                 files[name][system] = result.path
                 training_costs.append(
                     TrainingCost(name, system, result.simulations, result.seconds)
@@ -435,87 +395,25 @@ def _make_failed_answers(
     return {"question": question.name, "item": {"name": question.name}, "rows": rows}
 
 
-def make_diagnoser_spec(name: str) -> TunerSpec:
-    """Return where the code of a diagnoser is, and the packages to preload for it.
+def _check_code_isolated(experiment: Experiment) -> None:
+    """Raise an error for diagnosers whose code is in this process, unless they are trusted.
 
-    The code is not imported here: only the process of the diagnoser runs it.
-
-    Args:
-        name: registered name of the diagnoser, of simgap, a plugin file or an installed package.
-    """
-    kind, place = diagnosers.get(name), diagnosers.place(name)
-    module = getattr(kind, "module", "") or kind.__module__
-    file = str(place) if place else ""
-    module_spec = importlib.util.find_spec(module) if module.startswith("bench.") else None
-    # Without preloading, packages that a diagnoser imports would be imported again for each answer.
-    preloaded: tuple[str, ...] = ()
-    if file:
-        preloaded = find_preloadable_packages(file)
-    elif module_spec:
-        preloaded = find_preloadable_packages(module_spec.origin or "")
-    return TunerSpec(name, module, file, {}, preloaded)
-
-
-def _refuse_unreachable(names: Sequence[str]) -> None:
-    """Reject diagnosers that exist in this process alone: worker processes cannot load them.
-
-    Raises:
-        InputError: a diagnoser is a class of a script or notebook.
-    """
-    for name in names:
-        registered = diagnosers.snapshot().get(name)
-        if registered is not None and registered.path is None:
-            raise make_unreachable_error("diagnoser", name, registered.part)
-
-
-def _register_stub(name: str, trusted: bool) -> None:
-    """Register a stub for a diagnoser of another package, without importing its code here.
-
-    The true causes of the cases are in the memory of this process, so foreign code must not run
-    in it unless it is trusted.
+    The true causes of the cases are in the memory of this process. Diagnosers of other packages are
+    inspected in an isolated process, and represented by stubs here.
 
     Args:
-        name: registered name of the diagnoser.
-        trusted: whether diagnosers run in this process.
+        experiment: configuration of the comparison.
 
     Raises:
-        InputError: the diagnoser does not exist, or its code is already in this process.
+        InputError: a diagnoser does not exist, or its code is already in this process.
     """
-    if not trusted and is_external_part(name, diagnosers):
-        try:
-            register_plugins([inspect_installed_part(name, "diagnoser")])
-        except PartUnavailableError:
-            return
-    try:
-        kind = diagnosers.get(name)
-    except PartUnavailableError:
-        return
-    registered = diagnosers.snapshot().get(name)
-    if not trusted and registered is not None:
-        raise InputError(
-            f"diagnoser {name}: class {kind.__qualname__} is in this process, which has the "
-            "true causes: put it into a plugin file, or use --trust"
-        )
-
-
-def _compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
-    """Compute hashes of everything that must not change while the study is incomplete.
-
-    Returns:
-        Hashes by a description for the user.
-    """
-    # A secret salt is revealed in the configuration at the end, which must not change the hash.
-    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
-    sources = []
-    for name in read_config(experiment).diagnosers:
-        try:
-            sources.append(hash_class_source(diagnosers.get(name)))
-        except PartUnavailableError:
-            sources.append("skipped")
-    return {
-        "configuration": compute_digest(experiment.name, public.document()),
-        "plugins": hash_plugin_files(plugins),
-        "code": hash_source_folders(SOURCE_FOLDERS),
-        "package versions": hash_package_versions(),
-        "diagnosers": compute_digest(sources),
-    }
+    if not experiment.trusted:
+        announce_installed(list_compared_parts(experiment))
+    for registry, name in list_compared_parts(experiment):
+        with suppress(PartUnavailableError):
+            kind = registry.get(name)
+            if not experiment.trusted and name in registry.snapshot():
+                raise InputError(
+                    f"diagnoser {name}: class {kind.__qualname__} is in this process, which has "
+                    "the true causes: put it into a plugin file, or use --trust"
+                )

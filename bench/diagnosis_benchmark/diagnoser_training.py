@@ -7,13 +7,10 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import zipfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.runner.code_digest import (
@@ -22,10 +19,16 @@ from bench.benchmark.runner.code_digest import (
     hash_source_folders,
 )
 from bench.benchmark.runner.tuner_process_reuse import retry_if_killed
-from bench.benchmark.runner.tuner_training import get_weights_folder
+from bench.benchmark.runner.tuner_training import (
+    TrainingResult,
+    WeightsError,
+    get_weights_folder,
+    read_training_cost,
+    write_weights,
+)
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark.case_evaluation import train_isolated
-from sims.core.files import atomic_replacement, write_atomically
+from sims.core.files import write_atomically
 
 CACHE_SUBFOLDER = "diagnosers"
 """Subfolder of the cache of trained weights."""
@@ -39,22 +42,6 @@ TRAINING_SOURCE_FOLDERS = (
 """Source folders that determine the result of a training."""
 
 
-class TrainedDiagnoser(NamedTuple):
-    """Result of training a diagnoser for a system.
-
-    Attributes:
-        path: file with the trained arrays.
-        simulations: number of simulations that the training used.
-        seconds: time that the training took.
-        found: whether the result was already in the cache.
-    """
-
-    path: Path
-    simulations: int
-    seconds: float
-    found: bool
-
-
 def train_or_load(
     code: TunerSpec,
     source: str,
@@ -63,11 +50,11 @@ def train_or_load(
     seconds: float,
     hidden: tuple[str, ...],
     trusted: bool,
-) -> TrainedDiagnoser:
+) -> TrainingResult:
     """Train a diagnoser for a system, or load the cached result.
 
-    The file name in the cache contains a hash of everything that determines the result. The arrays
-    are written before their cost, so that a file with a cost belongs to a complete training.
+    The file name in the cache contains a hash of everything that determines the result. A damaged
+    file is replaced.
 
     Args:
         code: where its code is.
@@ -91,11 +78,10 @@ def train_or_load(
         length=20,
     )
     path = get_weights_folder() / CACHE_SUBFOLDER / f"{code.name}-{system}-{key}.npz"
-    cost_file = path.with_suffix(".json")
-    if (cost := _read_training_cost(cost_file)) is not None and zipfile.is_zipfile(path):
-        return TrainedDiagnoser(path, *cost, found=True)
+    with suppress(WeightsError):
+        return read_training_cost(path)
     training_request: dict[str, Any] = {
-        "wanted": {"name": code.name, "module": code.module, "file": code.file},
+        "wanted": code.describe(),
         "system": system,
         "budget": budget,
         "seed": make_seed_words("diagnosis", "lesson", code.name, system).tolist(),
@@ -103,30 +89,7 @@ def train_or_load(
     arrays, used_simulations, spent_seconds = retry_if_killed(
         lambda: train_isolated(code, training_request, seconds, hidden, trusted)
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_replacement(path, keep_ending=True) as partial:
-        named_arrays: dict[str, Any] = dict(arrays)
-        np.savez_compressed(partial, **named_arrays)
-    with atomic_replacement(cost_file) as partial:
-        partial.write_text(json.dumps([used_simulations, spent_seconds]), encoding="utf-8")
-    return TrainedDiagnoser(path, used_simulations, spent_seconds, found=False)
-
-
-def _read_training_cost(path: Path) -> tuple[int, float] | None:
-    """Read the cost of a cached training.
-
-    Args:
-        path: JSON file next to the trained arrays.
-
-    Returns:
-        Number of simulations and seconds; None if the file is missing or damaged, so that the
-        diagnoser is trained again.
-    """
-    try:
-        used_simulations, seconds = json.loads(path.read_text(encoding="utf-8"))
-        return int(used_simulations), float(seconds)
-    except (OSError, ValueError, TypeError):
-        return None
+    return write_weights(path, arrays, used_simulations, spent_seconds)
 
 
 TRAINING_COSTS_FILE = "training.csv"

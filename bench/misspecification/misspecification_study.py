@@ -8,9 +8,7 @@ of comparisons.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.benchmark.comparison_study import Comparison
@@ -69,31 +67,11 @@ class MisspecificationStudy(Study):
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
         """
-        from bench.benchmark.runner.experiment_runner import (
-            check_classes_importable,
-            prepare_experiment,
-        )
-        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
+        from bench.benchmark.runner.experiment_runner import prepare_experiment
 
         # Validated before the folder is created: an error of the user leaves no files.
         prepare_experiment(make_base_experiment(new.experiment), new.secret)
-        if new.jobs:
-            check_classes_importable(new.experiment)
-        return cls(new.create_folder(compute_fingerprint(new.experiment, new.plugins)))
-
-    @classmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecificationStudy:
-        """Open an interrupted study to run what is missing; see `Study.resume`.
-
-        Args:
-            folder: result folder.
-            plugins: further plugin files.
-        """
-        from bench.benchmark.runner.run_fingerprint import check_resumable
-
-        study = cls(folder)
-        study.plugins = check_resumable(folder, study.configuration, plugins)
-        return study
+        return cls(new.create_folder())
 
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None

@@ -524,6 +524,15 @@ class TunerSpec:
     options: Mapping[str, Any] = field(default_factory=dict)
     modules: tuple[str, ...] = ()
 
+    def describe(self) -> dict[str, Any]:
+        """Return what an isolated process needs to find and build the tuner, as JSON values."""
+        return {
+            "name": self.name,
+            "module": self.module,
+            "file": self.file,
+            "options": dict(self.options),
+        }
+
 
 def relocate(tuned: TunerSpec, places: Mapping[Path, Path]) -> TunerSpec:
     """Return a specification with another path of its file.
@@ -565,13 +574,7 @@ class IsolatedTuner:
         child.wait_until_ready()
         started = perf_counter()
         deadline = started + START_TIMEOUT_SECONDS
-        description = {
-            "name": tuned.name,
-            "module": tuned.module,
-            "file": tuned.file,
-            "options": dict(tuned.options),
-        }
-        child.send(b"B", json.dumps(description).encode(), deadline=deadline)
+        child.send(b"B", json.dumps(tuned.describe()).encode(), deadline=deadline)
         child.receive(deadline=deadline)
         self.import_seconds = perf_counter() - started
         if state is not None:

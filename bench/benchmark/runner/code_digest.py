@@ -50,6 +50,17 @@ EXPLAIN_SOURCE_FOLDERS = (
     "bench/logs",
 )
 """Source folders that determine extended simulators and the runs in them."""
+DIAGNOSIS_SOURCE_FOLDERS = (
+    "sims",
+    "bench/benchmark/problem",
+    "bench/benchmark/runner",
+    "bench/benchmark/isolation",
+    "bench/diagnosis",
+    "bench/logs",
+    "bench/diagnosis_benchmark/case_generation",
+    "bench/diagnosis_benchmark/diagnosers",
+)
+"""Source folders that determine the answers of diagnosers."""
 NUMERICAL_PACKAGES = (
     "av",
     "botorch",

@@ -22,7 +22,11 @@ from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.code_digest import list_effect_names
-from bench.benchmark.runner.plugin_discovery import describe_plugins, must_build_isolated
+from bench.benchmark.runner.plugin_discovery import (
+    describe_plugins,
+    list_compared_parts,
+    must_build_isolated,
+)
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest, execute_run
 from bench.benchmark.runner.run_scoring import (
@@ -48,7 +52,7 @@ from bench.benchmark.runner.worker_pools import (
 )
 from bench.benchmark.storage.run_journal import RunJournal
 from bench.benchmark.storage.run_status import RunStatus
-from bench.core.plugin_registries import PartUnavailableError, Registry, effects, simulators, tuners
+from bench.core.plugin_registries import PartUnavailableError, effects, simulators, tuners
 from sims.core.simulator import InputError
 
 ProgressFactory = Callable[[str, int], Callable[[], None]]
@@ -195,14 +199,13 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
         workers: True if worker processes simulate; otherwise only tuners have processes.
 
     Raises:
-        InputError: the simulator, a tuner or an effect is such a class.
+        InputError: the simulator, a tuner, a diagnoser or an effect is such a class.
     """
-    tuned: list[tuple[Registry[Any], str]] = [(tuners, e.tuner) for e in experiment.tuners]
-    used_parts = tuned
+    used_parts = list_compared_parts(experiment)
     if workers:
         effect_names = list_effect_names(experiment.settings, experiment.world)
         simulated = [] if experiment.model else [(simulators, experiment.simulator)]
-        used_parts = [*simulated, *tuned, *((effects, name) for name in effect_names)]
+        used_parts = [*simulated, *used_parts, *((effects, name) for name in effect_names)]
     for registry, name in used_parts:
         registered = registry.snapshot().get(name)
         if registered is not None and registered.path is None:

@@ -129,7 +129,13 @@ def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) ->
     register_plugins(described_plugins)
     _known_plugins.update({plugin.path: plugin for plugin in described_plugins})
     if not experiment.trusted:
-        _announce_installed(entry.tuner for entry in experiment.tuners)
+        announce_installed(list_compared_parts(experiment))
+
+
+def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str]]:
+    """List the tuners or diagnosers of an experiment, each with its registry."""
+    names = [(tuners, entry.tuner) for entry in experiment.tuners]
+    return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]
 
 
 def _list_extended_names(paths: Iterable[str]) -> set[str]:
@@ -189,25 +195,32 @@ def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugi
     missing = [path for path in paths if path not in _known_plugins]
     if missing:
         load_plugins_for_experiment(missing, experiment)
-    names = {entry.tuner for entry in experiment.tuners}
-    packages = [plugin for name, plugin in _packages.items() if name in names]
+    packages = [
+        _packages[registry.kind, name]
+        for registry, name in list_compared_parts(experiment)
+        if (registry.kind, name) in _packages
+    ]
     return [_known_plugins[path] for path in paths] + packages
 
 
-_packages: dict[str, Plugin] = {}
-"""Descriptions of tuners of installed packages in this process, by name."""
+_packages: dict[tuple[str, str], Plugin] = {}
+"""Descriptions of tuners and diagnosers of installed packages, by kind and name."""
 
 
-def _announce_installed(names: Iterable[str]) -> None:
-    """Inspect tuners of other packages before they are imported in this process.
+def announce_installed(parts: Iterable[tuple[Registry[Any], str]]) -> None:
+    """Inspect tuners and diagnosers of other packages before they are imported in this process.
 
     Their code must not run here, so a stub with the properties found is registered in their place.
+
+    Args:
+        parts: registries and names of the parts.
     """
-    for name in names:
-        if is_external_part(name):
+    for registry, name in parts:
+        if is_external_part(name, registry):
             with suppress(PartUnavailableError):
-                _packages[name] = inspect_installed_part(name)
-                register_plugins([_packages[name]])
+                plugin = inspect_installed_part(name, registry.kind)
+                _packages[registry.kind, name] = plugin
+                register_plugins([plugin])
 
 
 def must_build_isolated(entry: TunerEntry) -> bool:
@@ -220,7 +233,7 @@ def must_build_isolated(entry: TunerEntry) -> bool:
         InputError: the tuner cannot be built, or its code is already in this process.
         PartUnavailableError: the tuner cannot be used here.
     """
-    _announce_installed([entry.tuner])
+    announce_installed([(tuners, entry.tuner)])
     kind, file = tuners.get(entry.tuner), tuners.place(entry.tuner)
     if not issubclass(kind, TunerStub):
         if file is not None:

@@ -15,6 +15,7 @@ from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.code_digest import (
     BOUNCE_SHOT_SOURCE_FOLDERS,
+    DIAGNOSIS_SOURCE_FOLDERS,
     EXPLAIN_SOURCE_FOLDERS,
     IRRELEVANT_KEYS,
     compute_digest,
@@ -26,7 +27,10 @@ from bench.benchmark.runner.code_digest import (
     hash_source_folders,
     select_relevant_keys,
 )
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.plugin_discovery import (
+    list_compared_parts,
+    load_plugins_for_experiment,
+)
 from bench.benchmark.storage.result_folder import FolderConfiguration
 from bench.core.plugin_registries import PartUnavailableError, tuners
 from sims.core.simulator import InputError
@@ -57,13 +61,13 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
     Returns:
         Hashes by readable name.
     """
+    # The salt is secret until the end, and then revealed in the configuration. It is blanked here,
+    # so that this does not change the hash. `salt_sha256`, the commitment to the salt, is part of
+    # the configuration from the beginning.
+    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
+    compared_parts = "diagnosers" if experiment.diagnosis else "simulator and tuners"
     return {
-        # The salt is secret until the end, and then revealed in the configuration. It is blanked
-        # here, so that this does not change the hash. `salt_sha256`, the commitment to the salt,
-        # is part of the configuration from the beginning.
-        "configuration": compute_digest(experiment.name, experiment.chosen(salt="").document())
-        if experiment.salt_sha256
-        else compute_digest(experiment.name, experiment.document()),
+        "configuration": compute_digest(experiment.name, public.document()),
         "recording": compute_digest(hash_recording(experiment)),
         **(
             {"model file": compute_digest(hash_class_source(get_simulator_class(experiment)))}
@@ -73,7 +77,7 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
         "plugins": hash_plugin_files(plugins),
         "code": hash_source_folders(_get_source_folders(experiment)),
         "package versions": hash_package_versions(),
-        "simulator and tuners": compute_digest(_hash_class_sources(experiment)),
+        compared_parts: compute_digest(_hash_class_sources(experiment)),
     }
 
 
@@ -81,19 +85,23 @@ def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
     """Return the source folders that determine the results, if more than those of a comparison."""
     if experiment.shot:
         return BOUNCE_SHOT_SOURCE_FOLDERS
+    if experiment.diagnosis:
+        return DIAGNOSIS_SOURCE_FOLDERS
     return EXPLAIN_SOURCE_FOLDERS if experiment.calibration else ()
 
 
 def _hash_class_sources(experiment: Experiment) -> list[str]:
-    """Hash the sources of the simulator and the tuners, one hash each.
+    """Hash the sources of the simulator and the tuners or diagnosers, one hash each.
 
     This covers classes that a notebook defines, which are in no plugin file.
     """
-    sources = [hash_class_source(get_simulator_class(experiment))]
-    for entry in experiment.tuners:
+    sources = []
+    if not experiment.diagnosis:
+        sources.append(hash_class_source(get_simulator_class(experiment)))
+    for registry, name in list_compared_parts(experiment):
         try:
-            sources.append(hash_class_source(tuners.get(entry.tuner)))
-        # A skipped tuner has no runs yet; its hash changes when it becomes available.
+            sources.append(hash_class_source(registry.get(name)))
+        # A skipped part has no runs yet; its hash changes when it becomes available.
         except PartUnavailableError:
             sources.append("skipped")
     return sources

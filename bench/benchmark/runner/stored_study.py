@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -27,6 +27,8 @@ from bench.benchmark.storage.run_status import (
 )
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from bench.benchmark.runner.experiment_runner import ProgressFactory
     from bench.benchmark.runner.worker_pools import Pool
 
@@ -67,8 +69,7 @@ class Study(ABC):
         """
 
     @classmethod
-    @abstractmethod
-    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Study:
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Self:
         """Open an interrupted study to complete it.
 
         Args:
@@ -78,6 +79,11 @@ class Study(ABC):
         Raises:
             InputError: the folder is damaged, or something relevant has changed since.
         """
+        from bench.benchmark.runner.run_fingerprint import check_resumable
+
+        study = cls(folder)
+        study.plugins = check_resumable(folder, study.configuration, plugins)
+        return study
 
     @abstractmethod
     def run(
@@ -176,15 +182,24 @@ class PreparedStudy(NamedTuple):
     secret: str | None
     jobs: int
 
-    def create_folder(self, hashes: Mapping[str, str], redraws: Redraws | None = None) -> Path:
-        """Create the result folder and return it.
+    def create_folder(self, redraws: Redraws | None = None) -> Path:
+        """Create the result folder with hashes of what must not change, and return it.
 
         Args:
-            hashes: hashes of everything that must not change while the study runs.
             redraws: number of targets that were drawn again, for environment.json.
+
+        Raises:
+            InputError: workers could not load a class that the study needs.
         """
+        from bench.benchmark.runner.experiment_runner import check_classes_importable
+        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
+
+        # This comes before the folder is created, so that a user error leaves no files behind.
+        if self.jobs:
+            check_classes_importable(self.experiment)
+        hashes = compute_fingerprint(self.experiment, self.plugins)
         layers = () if self.experiment.trusted else list_active_isolation_layers()
-        configuration = FolderConfiguration(self.experiment, list(self.plugins), dict(hashes))
+        configuration = FolderConfiguration(self.experiment, list(self.plugins), hashes)
         create_folder(self.folder, configuration, self.jobs, self.secret, layers, redraws)
         return self.folder
 

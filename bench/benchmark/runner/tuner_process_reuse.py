@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -14,9 +14,14 @@ from typing import Any, TypeVar
 from numpy.typing import NDArray
 
 from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
-from bench.benchmark.isolation.tuner_processes import ForkServerClient, IsolatedTuner, TunerSpec
+from bench.benchmark.isolation.tuner_processes import (
+    ForkServerClient,
+    IsolatedProcess,
+    IsolatedTuner,
+    TunerSpec,
+)
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.core.plugin_registries import tuners
+from bench.core.plugin_registries import Registry, tuners
 from sims.core.simulator import InputError
 
 Result = TypeVar("Result")
@@ -144,15 +149,57 @@ class RepeatedRequests:
 
 def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
     """Return where the code of a tuner is, and what its isolated process preloads."""
-    kind = tuners.get(entry.tuner)
-    file = tuners.place(entry.tuner)
+    return make_part_spec(tuners, entry.tuner, entry.options)
+
+
+def make_part_spec(
+    registry: Registry[Any], name: str, options: Mapping[str, Any] | None = None
+) -> TunerSpec:
+    """Return where the code of a tuner or diagnoser is, and what its isolated process preloads.
+
+    The code is not imported here. Without preloading, the packages that it imports would be
+    imported again for each run.
+
+    Args:
+        registry: registry of the part.
+        name: registered name.
+        options: options with which it is built.
+    """
+    kind, file = registry.get(name), registry.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     preloaded = (
         find_preloadable_packages(str(file) if file else _find_source_file(module))
         if file or module
         else ()
     )
-    return TunerSpec(kind.name, module, str(file or ""), dict(entry.options), preloaded)
+    return TunerSpec(kind.name, module, str(file or ""), dict(options or {}), preloaded)
+
+
+def start_part_process(
+    part: TunerSpec,
+    service: str,
+    memory: int = 0,
+    hidden: tuple[str, ...] = (),
+    modules: Iterable[str] = (),
+) -> IsolatedProcess:
+    """Start an isolated process that can load a tuner or diagnoser.
+
+    Args:
+        part: specification of the part.
+        service: module and function that the process runs, see `ForkServerClient.start_process`.
+        memory: memory limit in MiB; 0 for no limit.
+        hidden: folders that the process must not access.
+        modules: modules that the fork server loads first, in addition to those of the part.
+    """
+    is_builtin = not part.file and part.module.startswith(("bench.", "methods."))
+    own_module = [part.module] if is_builtin else []
+    return get_fork_server().start_process(
+        service,
+        [part.file] if part.file else [],
+        memory,
+        hidden,
+        [*modules, *part.modules, *own_module],
+    )
 
 
 def _find_source_file(module: str) -> str:
@@ -243,13 +290,8 @@ def start_isolated_tuner(
     if tuner is not None:
         tuner.import_seconds = 0.0
     if tuner is None or not tuner.child.is_alive:
-        own_module = [tuned.module] if tuned.module.startswith("methods.") else []
-        child = get_fork_server().start_process(
-            "bench.benchmark.isolation.tuner_server:serve_requests",
-            [tuned.file] if tuned.file else [],
-            memory,
-            hidden,
-            [*tuned.modules, *own_module],
+        child = start_part_process(
+            tuned, "bench.benchmark.isolation.tuner_server:serve_requests", memory, hidden
         )
         try:
             tuner = IsolatedTuner(child, tuned, state)

@@ -383,10 +383,10 @@ def _train_or_read_weights(
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
     if path.exists() and not trains_anew:
-        simulations, seconds = _read_checked_arrays(path, name)[_COST_ARRAY]
+        cached = read_training_cost(path)
         # Weights that do not fit must be reported now, and not in every run.
         _check_weights(request, path)
-        return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
+        return cached
     problem = TuningProblem(experiment)
     # Tuners with the same `trains_as` share a random stream, so that they have the same network.
     stream = make_seed_words(
@@ -402,13 +402,7 @@ def _train_or_read_weights(
     problem.close()
     if randomised_simulator is not None:
         randomised_simulator.close()
-    # The key is stored with the weights, so that an exchanged file is detected.
-    metadata = {
-        _COST_ARRAY: np.array([simulator.used, seconds]),
-        _KEY_ARRAY: np.frombuffer(name.encode(), dtype=np.uint8),
-    }
-    _write_atomically(path, {**state, **metadata})
-    return TrainingResult(path, simulator.used, seconds)
+    return write_weights(path, state, simulator.used, seconds)
 
 
 def _train(
@@ -433,14 +427,7 @@ def _train(
         trusted_tuner.fit(simulator, np.random.default_rng(stream), simulator.budget)
         return trusted_tuner.state()
     with start_isolated_tuner(request.tuned, request.seed, "run", request.hidden) as tuner:
-        state = train_remotely(tuner.child, simulator, stream, callback)
-    # These names are arguments of `np.savez` or reserved in the file.
-    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY_ARRAY} & set(state)
-    if reserved:
-        raise RunEndedError(
-            "crashed", f"the tuner's state has arrays with the reserved names {reserved}"
-        )
-    return state
+        return train_remotely(tuner.child, simulator, stream, callback)
 
 
 def _check_weights(request: TrainingRequest, path: Path) -> None:
@@ -468,16 +455,35 @@ def _make_weights_error(path: Path, entry: TunerEntry, reason: object) -> Weight
     return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {_RETRAIN_ADVICE}")
 
 
-def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
+def write_weights(
+    path: Path, state: Mapping[str, Array], simulations: int, seconds: float
+) -> TrainingResult:
     """Write a file atomically, because several processes may train the same tuner.
 
     Args:
-        path: path of the NumPy archive.
-        arrays: arrays by name.
+        path: path of the NumPy archive, named by the training key.
+        state: weights by name.
+        simulations: number of simulations of the training.
+        seconds: duration of the training in seconds.
+
+    Raises:
+        RunEndedError: an array has a name that is reserved.
     """
+    # These names are arguments of `np.savez` or reserved in the file.
+    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY_ARRAY} & set(state)
+    if reserved:
+        raise RunEndedError(
+            "crashed", f"the trained state has arrays with the reserved names {reserved}"
+        )
+    # The key is stored with the weights, so that an exchanged file is detected.
+    metadata = {
+        _COST_ARRAY: np.array([simulations, seconds]),
+        _KEY_ARRAY: np.frombuffer(path.stem.encode(), dtype=np.uint8),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replacement(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, **state, **metadata)
+    return TrainingResult(path, simulations, seconds)
 
 
 def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
@@ -500,19 +506,29 @@ def read_weights(path: Path) -> dict[str, Array]:
     Raises:
         WeightsError: the file is missing, damaged, or of another training.
     """
-    state = _read_checked_arrays(path, path.stem)
+    state = _read_checked_arrays(path)
     del state[_COST_ARRAY], state[_KEY_ARRAY]
     return state
 
 
-def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
-    """Read and check the arrays of a weights file.
-
-    The file has the weights, the cost of the training (two numbers) and its key, which must be
-    `name`. Nothing is unpickled.
+def read_training_cost(path: Path) -> TrainingResult:
+    """Read the cost of the training whose weights a file has.
 
     Raises:
-        WeightsError: the file is missing, damaged, or of another training than `name`.
+        WeightsError: the file is missing, damaged, or of another training.
+    """
+    simulations, seconds = _read_checked_arrays(path)[_COST_ARRAY]
+    return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
+
+
+def _read_checked_arrays(path: Path) -> dict[str, Array]:
+    """Read and check the arrays of a weights file.
+
+    The file has the weights, the cost of the training (two numbers) and its key, which must be the
+    name of the file. Nothing is unpickled.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or of another training.
     """
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -541,9 +557,9 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
             f"{_RETRAIN_ADVICE}"
         )
     stored_name = stored_key.tobytes().decode("utf-8", "replace")
-    if stored_name != name:
+    if stored_name != path.stem:
         raise WeightsError(
-            f"{path}: expected the weights of {name}, found those of {stored_name:.80}; "
+            f"{path}: expected the weights of {path.stem}, found those of {stored_name:.80}; "
             f"{_RETRAIN_ADVICE}"
         )
     return arrays
