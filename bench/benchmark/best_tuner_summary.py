@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,22 +52,119 @@ class TunerRanking(NamedTuple):
     failed: list[str]
 
 
-def rank_at_checkpoints(statistics: ComparisonStatistics, kind: str) -> list[TunerRanking]:
-    """List the verdicts after 1, 3, 10 and all simulations in one range.
+@dataclass(frozen=True)
+class RangeResult:
+    """Verdicts on the tuners in one range of targets, and sentences about them.
 
-    Args:
-        statistics: Statistics of the comparison.
-        kind: Range of the targets.
+    Attributes:
+        statistics: statistics of the comparison.
+        kind: range of the targets, such as ``in``.
     """
-    ranking = _select_range(statistics, kind)
-    return [
-        _sort_by_verdict(statistics, k, ranking[ranking["simulations"] == k])
-        for k in sorted(set(ranking["simulations"].astype(int)))
-    ]
 
+    statistics: ComparisonStatistics
+    kind: str
 
-def _select_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
-    return statistics.ranking[statistics.ranking["range"] == kind]
+    @cached_property
+    def _ranking(self) -> pd.DataFrame:
+        """Rows of the ranking for this range."""
+        ranking = self.statistics.ranking
+        return ranking[ranking["range"] == self.kind]
+
+    @property
+    def where(self) -> str:
+        """The range in words, for the middle of a sentence."""
+        return RANGE_PHRASES[self.kind]
+
+    @property
+    def title(self) -> str:
+        """The range with its number of targets, for the beginning of a sentence."""
+        return f"{self.where[0].upper()}{self.where[1:]} ({self.targets})"
+
+    @property
+    def targets(self) -> str:
+        """Number of targets of the range: ``10 targets``, or how many of them decide.
+
+        A target decides between tuners if its data determine at least one direction of the
+        parameters.
+        """
+        count = self.statistics.target_counts[self.kind]
+        unit = ("starting point" if self.kind == "real" else "target") + ("" if count == 1 else "s")
+        if self._deciding_count == count:
+            return f"{count} {unit}"
+        return f"{self._deciding_count} of {count} {unit} decide"
+
+    @property
+    def _deciding_count(self) -> int:
+        return int(self._ranking["targets"].max()) if len(self._ranking) else 0
+
+    @cached_property
+    def rankings(self) -> list[TunerRanking]:
+        """Verdicts after 1, 3, 10 and all simulations."""
+        groups = self._ranking.groupby("simulations")
+        return [_sort_by_verdict(self.statistics, int(str(k)), part) for k, part in groups]
+
+    @property
+    def running_times(self) -> list[dict[Hashable, Any]]:
+        """Rows of expected running times (ERT) of the best tuners, in their order.
+
+        The ERT is the expected number of simulations until the error stays below the reference
+        threshold (`reference_level`); tuners that never reach it are left out.
+        """
+        statistics, ranking = self.statistics, self._ranking
+        final_rows = ranking[ranking["simulations"] == ranking["simulations"].max()]
+        best = list(final_rows.loc[final_rows["verdict"].isin((BEST, EQUAL)), "tuner"])
+        table = statistics.running_times
+        rows = table[
+            (table["range"] == self.kind)
+            & (table["threshold"] == statistics.reference_level)
+            & (table["successes"] > 0)
+            & table["tuner"].isin(best)
+        ]
+        return sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
+
+    @property
+    def failed_runs(self) -> str:
+        """Sentence on the tuners with failed runs and their numbers; empty for none."""
+        texts = [
+            f"{row['tuner']} {row['failures']} of {row['runs']}"
+            for row in self._ranking.drop_duplicates("tuner").to_dict("records")
+            if row["failures"]
+        ]
+        return f"failed runs, which count as infinite errors: {', '.join(texts)}" if texts else ""
+
+    @property
+    def _comparison_count(self) -> int:
+        """Number of tuners that the best one is tested against."""
+        part = self._ranking
+        return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
+
+    @property
+    def explanation(self) -> str:
+        """Sentence on the test of the ranking and the notation; empty if none was made."""
+        count = self._comparison_count
+        if not count:
+            return ""
+        return (
+            f"Nx (k/n): median error N times the best one's, larger on k of n targets. Worse: "
+            f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected "
+            f"for {count} comparison{'s' if count > 1 else ''}."
+        )
+
+    @property
+    def warning(self) -> str:
+        """Sentence on too few targets for any significant difference; empty otherwise.
+
+        With few targets even a tuner that wins on all of them may do so under the null hypothesis.
+        """
+        count, targets = self._comparison_count, self._deciding_count
+        required_targets = compute_min_targets(count) if count else 0
+        if targets >= required_targets:
+            return ""
+        return (
+            f"{targets} target{'s' if targets != 1 else ''} cannot decide between "
+            f"{count + 1} tuners: at least {required_targets} are needed "
+            f"(--targets {required_targets})."
+        )
 
 
 def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> TunerRanking:
@@ -116,87 +216,6 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
-def format_target_count(statistics: ComparisonStatistics, kind: str) -> str:
-    """Format the number of targets of a range: ``10 targets``, or how many of them decide.
-
-    A target decides between tuners if its data determine at least one direction of the parameters.
-    """
-    count = statistics.target_counts[kind]
-    deciding_counts = _select_range(statistics, kind)["targets"]
-    deciding_count = int(deciding_counts.max()) if len(deciding_counts) else 0
-    unit = ("starting point" if kind == "real" else "target") + ("" if count == 1 else "s")
-    if deciding_count == count:
-        return f"{count} {unit}"
-    return f"{deciding_count} of {count} {unit} decide"
-
-
 def format_error_floor(statistics: ComparisonStatistics) -> str:
     """State which errors count as equal."""
     return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
-
-
-def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
-    """Explain the test of the ranking and the notation; empty if no tuners were compared.
-
-    Args:
-        statistics: Statistics of the comparison.
-        kind: Range of the targets.
-    """
-    comparison_count = _count_tested_tuners(statistics, kind)
-    if not comparison_count:
-        return ""
-    return (
-        f"Nx (k/n): median error N times the best one's, larger on k of n targets. Worse: "
-        f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
-        f"{comparison_count} comparison{'s' if comparison_count > 1 else ''}."
-    )
-
-
-def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
-    """Return the number of tuners that the best one is tested against.
-
-    Args:
-        statistics: statistics of the comparison.
-        kind: range of the targets, such as ``in``.
-    """
-    part = _select_range(statistics, kind)
-    return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
-
-
-def warn_about_target_count(statistics: ComparisonStatistics, kind: str) -> str:
-    """Warn if there are too few targets for any significant difference; empty otherwise.
-
-    With few targets even a tuner that wins on all of them may do so under the null hypothesis.
-
-    Args:
-        statistics: Statistics of the comparison.
-        kind: Range of the targets.
-    """
-    comparison_count = _count_tested_tuners(statistics, kind)
-    if not comparison_count:
-        return ""
-    targets = int(_select_range(statistics, kind)["targets"].max())
-    required_targets = compute_min_targets(comparison_count)
-    if targets >= required_targets:
-        return ""
-    return (
-        f"{targets} target{'s' if targets != 1 else ''} cannot decide between "
-        f"{comparison_count + 1} tuners: at least {required_targets} are needed "
-        f"(--targets {required_targets})."
-    )
-
-
-def list_failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
-    """List the tuners with failed runs in a range and their numbers; empty for none.
-
-    Args:
-        statistics: Statistics of the comparison.
-        kind: Range of the targets.
-    """
-    part = _select_range(statistics, kind).drop_duplicates("tuner")
-    texts = [
-        f"{row['tuner']} {row['failures']} of {row['runs']}"
-        for row in part.to_dict("records")
-        if row["failures"]
-    ]
-    return f"failed runs, which count as infinite errors: {', '.join(texts)}" if texts else ""

@@ -17,7 +17,6 @@ from bench.benchmark.statistics.error_curves import (
     select_checkpoints,
     select_distance_checkpoints,
 )
-from bench.benchmark.statistics.expected_running_time import build_ert_table
 from bench.benchmark.statistics.training_amortisation import (
     AT_ONCE,
     NEVER,
@@ -370,9 +369,7 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
         view: Comparison with its statistics, experiment and styles of tuners.
     """
     statistics = view.statistics
-    table = statistics.sort_rows(
-        build_ert_table(statistics.curves, statistics.levels, view.experiment.budget)
-    )
+    table = statistics.sort_rows(statistics.running_times)
     x_axis = Axis(f"error to be reached{view.unit_of_levels}", "log")
     y_axis = Axis("expected simulations (ERT)", "log")
     panels = []

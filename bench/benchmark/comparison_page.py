@@ -7,17 +7,15 @@ import shlex
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
-from bench.benchmark import best_tuner_summary
+from bench.benchmark.best_tuner_summary import RangeResult, format_error_floor
 from bench.benchmark.comparison_charts import CHARTS, ComparisonView
 from bench.benchmark.comparison_figures import FIGURE_FILES, format_threshold_caption
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
-from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import TRUSTED_TUNERS_NOTE
@@ -54,80 +52,6 @@ class ComparisonReportData:
         return shlex.join(words)
 
 
-class RangeResult(NamedTuple):
-    """Verdicts on the tuners in one range of targets.
-
-    Attributes:
-        where: The range in words, for the middle of a sentence.
-        targets: Its number of targets, in words.
-        rankings: Verdicts after 1, 3, 10 and all simulations.
-        running_times: Rows of the table of expected running times, for the best tuners that reach
-            the reference threshold.
-        failed_runs: Sentence on failed runs.
-        explanation: Sentence on how the verdicts were decided.
-        warning: Sentence on too few targets.
-    """
-
-    where: str
-    targets: str
-    rankings: list[best_tuner_summary.TunerRanking]
-    running_times: list[dict[Hashable, Any]]
-    failed_runs: str
-    explanation: str
-    warning: str
-
-    @property
-    def title(self) -> str:
-        """The range with its number of targets, for the beginning of a sentence."""
-        return f"{self.where[0].upper()}{self.where[1:]} ({self.targets})"
-
-
-def list_range_results(results: ComparisonReportData) -> list[RangeResult]:
-    """List the verdicts on the tuners by range of targets.
-
-    Args:
-        results: Comparison with its statistics and tables.
-    """
-    statistics = results.view.statistics
-    return [
-        RangeResult(
-            best_tuner_summary.RANGE_PHRASES[kind],
-            best_tuner_summary.format_target_count(statistics, kind),
-            best_tuner_summary.rank_at_checkpoints(statistics, kind),
-            _list_running_times(statistics, results.tables["ert"], kind),
-            best_tuner_summary.list_failed_runs(statistics, kind),
-            best_tuner_summary.explain_ranking(statistics, kind),
-            best_tuner_summary.warn_about_target_count(statistics, kind),
-        )
-        for kind in results.view.ranges
-    ]
-
-
-def _list_running_times(
-    statistics: ComparisonStatistics, table: pd.DataFrame, kind: str
-) -> list[dict[Hashable, Any]]:
-    """List the expected running times (ERT) of the best tuners of a range, in their order.
-
-    The ERT is the expected number of simulations until the error stays below the reference
-    threshold (`reference_level`); tuners that never reach it are left out.
-
-    Args:
-        statistics: statistics of the comparison.
-        table: table of ERT.
-        kind: range of the targets, such as ``in``.
-    """
-    ranking = statistics.ranking[statistics.ranking["range"] == kind]
-    final_rows = ranking[ranking["simulations"] == ranking["simulations"].max()]
-    best = list(final_rows.loc[final_rows["verdict"].isin((BEST, EQUAL)), "tuner"])
-    rows = table[
-        (table["range"] == kind)
-        & (table["threshold"] == statistics.reference_level)
-        & (table["successes"] > 0)
-        & table["tuner"].isin(best)
-    ]
-    return sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
-
-
 def explain_first(worse: Sequence[str]) -> list[str]:
     """Write out the first of several worse tuners, which explains the format of the others."""
     first = [
@@ -160,8 +84,8 @@ def collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
     return {
         "results": results,
         "view": view,
-        "range_results": list_range_results(results),
-        "floor_text": best_tuner_summary.format_error_floor(view.statistics),
+        "range_results": [RangeResult(view.statistics, kind) for kind in view.ranges],
+        "floor_text": format_error_floor(view.statistics),
         "shown_label": view.format_metric_label(view.shown_metric),
         "trust_note": TRUSTED_TUNERS_NOTE if view.experiment.trusted else "",
         "target_count": sum(view.statistics.target_counts.values()),

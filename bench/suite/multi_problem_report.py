@@ -18,11 +18,9 @@ import pandas as pd
 from bench.benchmark.comparison_charts import make_simulations_axis
 from bench.benchmark.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
-from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.expected_running_time import (
-    build_ert_table,
     compute_solved_fraction,
 )
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
@@ -141,8 +139,8 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
         stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
         if stored.runs.empty:
             raise InputError(f"{folder}: contains no runs")
-        comparisons.append(LoadedComparison(ComparisonStatistics(stored), stored.experiment))
-    first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in comparisons)
+        comparisons.append(ComparisonStatistics(stored))
+    first_labels, *other_labels = (part.curves.list_tuners() for part in comparisons)
     tuners = [t for t in first_labels if all(t in labels for labels in other_labels)]
     if not tuners:
         raise InputError(f"{', '.join(map(str, folders))}: have no tuner in common")
@@ -150,28 +148,15 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
 
 
 @dataclass(frozen=True)
-class LoadedComparison:
-    """One of several comparisons.
-
-    Attributes:
-        statistics: statistics of the comparison.
-        experiment: configuration of the comparison.
-    """
-
-    statistics: ComparisonStatistics
-    experiment: Experiment
-
-
-@dataclass(frozen=True)
 class ComparisonCollection:
     """Several comparisons.
 
     Attributes:
-        parts: comparisons, each with one problem per range.
+        parts: statistics of the comparisons, each with one problem per range.
         tuners: labels of the tuners that all comparisons have.
     """
 
-    parts: Sequence[LoadedComparison]
+    parts: Sequence[ComparisonStatistics]
     tuners: Sequence[str]
 
     @cached_property
@@ -181,10 +166,7 @@ class ComparisonCollection:
         Common tuners are those that every comparison has.
         """
         problem_errors = pd.concat(
-            [
-                compute_problem_ranks(part.statistics.curves, part.statistics.floor)
-                for part in self.parts
-            ]
+            [compute_problem_ranks(part.curves, part.floor) for part in self.parts]
         )
         # Ranks among all tuners have gaps if some tuners are left out.
         return problem_errors[list(self.tuners)].rank(axis=1)
@@ -210,12 +192,9 @@ class ComparisonCollection:
         """
         ert, paired = [], []
         for part in self.parts:
-            curves, levels = part.statistics.curves, part.statistics.levels
-            times = build_ert_table(curves, levels, part.experiment.budget)
-            ert.append(add_trust_column(times, part.experiment))
-            paired.append(
-                add_trust_column(compare_all_pairs(curves, part.statistics.floor), part.experiment)
-            )
+            ert.append(add_trust_column(part.running_times, part.experiment))
+            pairs = compare_all_pairs(part.curves, part.floor)
+            paired.append(add_trust_column(pairs, part.experiment))
         frames = {
             "ert": pd.concat(ert),
             "pairs": pd.concat(paired),
@@ -287,9 +266,7 @@ class ComparisonCollection:
         distributions = [
             problem
             for part in self.parts
-            for problem in _compute_runtime_shares(
-                part.statistics.curves, part.statistics.runtime_thresholds
-            )
+            for problem in _compute_runtime_shares(part.curves, part.runtime_thresholds)
         ]
         return {t: np.mean([problem[t] for problem in distributions], axis=0) for t in self.tuners}
 
@@ -355,11 +332,10 @@ def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], p
     frames, panels = [], []
     counts: Counter[str] = Counter()
     for part in collection.parts:
-        experiment, statistics = part.experiment, part.statistics
-        metric = statistics.metric
+        experiment, metric = part.experiment, part.metric
         x_axis = make_simulations_axis(experiment.budget)
-        for kind in dict.fromkeys(statistics.curves.keys["range"]):
-            medians = statistics.compute_median_curves(metric, str(kind))
+        for kind in dict.fromkeys(part.curves.keys["range"]):
+            medians = part.compute_median_curves(metric, str(kind))
             medians = medians[medians["tuner"].isin(collection.tuners)]
             problem = f"{experiment.name} {kind}"
             counts[problem] += 1
@@ -372,7 +348,7 @@ def _make_error_panels(collection: ComparisonCollection) -> tuple[list[Panel], p
             series = make_method_series(
                 styles, "tuner", "median", where=where, low="low", high="high"
             )
-            targets = statistics.target_counts[str(kind)]
+            targets = part.target_counts[str(kind)]
             title = f"{experiment.title or experiment.name}. {PANEL_TITLES[str(kind)]} ({targets})"
             y_axis, facets = Axis(_METRIC_LABELS[metric], "log"), {"problem": problem}
             panels.append(Panel(title, "errors", "simulations", series, x_axis, y_axis, facets))

@@ -52,6 +52,7 @@ class ComparisonStatistics:
     """Statistics of one comparison: the deciding metric, rankings, medians and costs.
 
     Attributes:
+        experiment: configuration of the comparison.
         metric: name of the deciding metric, see `select_primary_metric`.
         runs: runs that have the deciding metric.
         curves: deciding metric of every run.
@@ -72,7 +73,7 @@ class ComparisonStatistics:
         """
         self.metric, self.runs, in_widths = select_primary_metric(stored.runs)
         self._statuses, self._costs = stored.statuses, stored.costs
-        self._budget = stored.experiment.budget
+        self.experiment, self._budget = stored.experiment, stored.experiment.budget
         self._rows = self._make_run_rows(self.runs)
         self.curves = self._rows.build_curves(self.metric)
         self.runtime_thresholds, self.levels = select_thresholds(self.curves, in_widths)
@@ -246,6 +247,11 @@ class ComparisonStatistics:
         return build_runtime_table(self.curves, self.runtime_thresholds)
 
     @cached_property
+    def running_times(self) -> pd.DataFrame:
+        """Expected running times of every range; see `expected_running_time.build_ert_table`."""
+        return build_ert_table(self.curves, self.levels, self._budget)
+
+    @cached_property
     def tuning_costs(self) -> dict[float, dict[str, dict[str, TuningCost]]]:
         """Cost of every tuner by threshold (the first `PRICED_LEVEL_COUNT`), by range, by tuner."""
         return {
@@ -341,9 +347,7 @@ def build_tables(
     lines = build_error_table(stored.runs, stored.statuses, experiment.budget, stored.costs)
     frames = {
         "table": statistics.sort_rows(add_salt_column(lines, experiment)),
-        "ert": statistics.sort_rows(
-            build_ert_table(statistics.curves, statistics.levels, experiment.budget)
-        ),
+        "ert": statistics.sort_rows(statistics.running_times),
         "ranking": statistics.ranking,
         "pairs": compare_all_pairs(statistics.curves, statistics.floor),
         "break_even": _build_break_even_rows(experiment.name, statistics),

@@ -14,7 +14,6 @@ from bench.figures.figure_output import render_all_formats
 from bench.figures.style import make_panel_grid
 from bench.suite.multi_problem_report import (
     ComparisonCollection,
-    LoadedComparison,
     render_multi_problem_page,
 )
 from tests.bench.figures.sample_comparisons import stored
@@ -45,7 +44,7 @@ def page_of(count, tmp_path, drop=None):
     whole = with_third(stored())
     if drop:
         whole = whole._replace(runs=whole.runs[whole.runs["tuner"] != drop])
-    one = LoadedComparison(ComparisonStatistics(whole), whole.experiment)
+    one = ComparisonStatistics(whole)
     together = ComparisonCollection([one] * count, one.statistics.curves.list_tuners())
     frames = together.build_tables()
     pictures = dict.fromkeys(["runtime-distribution", "critical-difference"], drawn())
