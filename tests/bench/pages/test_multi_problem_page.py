@@ -45,7 +45,7 @@ def page_of(count, tmp_path, drop=None):
     if drop:
         whole = whole._replace(runs=whole.runs[whole.runs["tuner"] != drop])
     one = ComparisonStatistics(whole)
-    together = ComparisonCollection([one] * count, one.statistics.curves.list_tuners())
+    together = ComparisonCollection([one] * count, one.curves.list_tuners())
     frames = together.build_tables()
     pictures = dict.fromkeys(["runtime-distribution", "critical-difference"], drawn())
     page = render_multi_problem_page(together, frames, pictures, ["simgap", "plot", "a <b>"])
