@@ -5,7 +5,7 @@ The printed figures are readable in greyscale.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,13 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_report import REPORT_FILE
-from bench.diagnosis_benchmark.answer_store import SKIPPED_STATUS, build_answer_rows
+from bench.benchmark.problem.experiment import Experiment
+from bench.diagnosis_benchmark.answer_store import (
+    SKIPPED_STATUS,
+    build_answer_rows,
+    read_answers,
+)
+from bench.diagnosis_benchmark.case_set import build_case_set, read_config
 from bench.diagnosis_benchmark.diagnoser_page import (
     DiagnoserReportData,
     build_chart_tables,
@@ -43,8 +49,6 @@ from sims.core.files import write_atomically
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from bench.diagnosis_benchmark.diagnoser_study import DiagnosisStudy
 
 OUTCOME_STYLES = (
     ("right", style.BLACK, "named, alone"),
@@ -306,18 +310,30 @@ ANSWERS_TABLE_FILE = "items.csv"
 """File with one row per answer."""
 
 
-def write_report(study: DiagnosisStudy, print_line: Callable[[str], None]) -> int:
+def write_report(
+    folder: Path,
+    experiment: Experiment,
+    skipped_diagnosers: Mapping[str, str],
+    print_line: Callable[[str], None],
+) -> int:
     """Write tables, figures and HTML report from the answers that exist.
 
     Only cases that every diagnoser has answered are reported.
 
+    Args:
+        folder: result folder.
+        experiment: configuration of the comparison.
+        skipped_diagnosers: diagnosers that cannot be used here, by name, with the reason.
+        print_line: prints one line.
+
     Returns:
         Number of failed answers.
     """
-    for name, reason in study.skipped_diagnosers.items():
+    for name, reason in skipped_diagnosers.items():
         print_line(f"skipped: {name}: {reason}")
-    order = study.usable_diagnosers
-    all_rows = build_answer_rows(study.answers, order)
+    config, answers = read_config(experiment), read_answers(folder)
+    order = [name for name in config.diagnosers if name not in skipped_diagnosers]
+    all_rows = build_answer_rows(answers, order)
     if all_rows.empty:
         print_line("no answers yet")
         return 0
@@ -325,28 +341,28 @@ def write_report(study: DiagnosisStudy, print_line: Callable[[str], None]) -> in
     if rows.empty:
         print_line("no case has been given to every diagnoser yet")
         return 0
-    training = read_training_costs(study.folder)
-    write_atomically(study.folder / ANSWERS_TABLE_FILE, format_csv(rows))
+    training = read_training_costs(folder)
+    write_atomically(folder / ANSWERS_TABLE_FILE, format_csv(rows))
     left_out = rows[rows["status"] == SKIPPED_STATUS]
     rows = rows[rows["status"] != SKIPPED_STATUS]
     tables = build_all_tables(rows, order, training)
     for name, frame in {**tables, "failures": build_failure_table(rows, order)}.items():
-        write_atomically(study.folder / f"{name}.csv", format_csv(frame))
+        write_atomically(folder / f"{name}.csv", format_csv(frame))
     report_data = DiagnoserReportData(
-        study.configuration.experiment,
-        str(study.folder),
+        experiment,
+        str(folder),
         order,
         rows,
         tables,
         training,
         {},
-        study.skipped_diagnosers,
-        len(study.cases),
+        skipped_diagnosers,
+        len(build_case_set(config)),
         left_out,
     )
     report_data = replace(report_data, pictures=draw_figures(report_data))
-    write_figures(study.folder, report_data.pictures)
-    write_atomically(study.folder / REPORT_FILE, render_page(report_data))
+    write_figures(folder, report_data.pictures)
+    write_atomically(folder / REPORT_FILE, render_page(report_data))
     failed = rows[rows["status"] != "done"]
     lines = render_text(
         _TEMPLATE,
@@ -355,9 +371,9 @@ def write_report(study: DiagnosisStudy, print_line: Callable[[str], None]) -> in
         columns=list(_SUMMARY_METRICS.values()),
         costs=index_by_diagnoser(tables["costs"]),
         unsupported=summarise_unsupported(left_out),
-        undetectable_count=sum(not answer["item"] for answer in study.answers.values()),
+        undetectable_count=sum(not answer["item"] for answer in answers.values()),
         answers_file=ANSWERS_TABLE_FILE,
-        report_path=study.folder / REPORT_FILE,
+        report_path=folder / REPORT_FILE,
         failed=failed.to_dict("records"),
         max_failures=_MAX_LISTED_FAILURES,
     )

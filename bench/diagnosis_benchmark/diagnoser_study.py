@@ -199,7 +199,8 @@ class DiagnosisStudy(Study):
         """
         from bench.diagnosis_benchmark.diagnoser_report import write_report
 
-        return write_report(self, print_line)
+        experiment = self.configuration.experiment
+        return write_report(self.folder, experiment, self.skipped_diagnosers, print_line)
 
 
 class _EvaluationRun:
