@@ -23,6 +23,7 @@ from bench.benchmark.problem.robot_experiment import (
     make_robot_experiment,
 )
 from bench.benchmark.runner.comparison_resources import check_comparison_size
+from bench.benchmark.runner.dask_cluster import ClusterPool
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.statistics.comparison_statistics import build_tables
 from bench.benchmark.storage.csv_reader import CsvTable
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from bench.benchmark.runner.stored_study import Study
-    from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.run_status import StudyOutcome
 
 _SHOT_TABLE_COLUMNS = {
@@ -111,7 +111,7 @@ def compare(
         )
     if chosen_experiment.experiments:
         raise InputError(f"experiment {chosen_experiment.name} names several: use simgap.sweep")
-    pool = _connect_to_cluster(options.cluster)
+    pool = None if options.cluster is None else ClusterPool(options.cluster)
     (started_study,) = begin_studies(chosen_experiment, options)
     with pdf_figures(options.pdf):
         return _report_study(started_study, started_study.run(options.jobs, options.progress, pool))
@@ -157,15 +157,30 @@ def build_experiment(
             compared as well.
 
     Raises:
-        InputError: The experiment, a tuner or a plugin does not exist or cannot be used.
+        InputError: The experiment, a tuner or a plugin does not exist or cannot be used, or the
+            options do not name either an experiment or a robot.
     """
+    stated_options = [name for name in ("model", "recording", "free") if getattr(options, name)]
+    if experiment is None:
+        if not stated_options:
+            raise InputError(
+                "expected an experiment (see `simgap list experiments`), or --resume DIR, or a "
+                "robot: --model FILE --free A,B"
+            )
+        experiment = make_robot_experiment(options.model, options.recording, options.free)
+    elif stated_options:
+        raise InputError(
+            f"experiment {experiment} states what it tunes: leave out "
+            f"{', '.join(stated_options)}, or leave out the experiment"
+        )
+    loaded = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
     # Without worker processes tuners are not isolated, and an isolated process cannot start the
     # user's command of a language model.
     is_trusted = options.trust or not options.jobs or options.model_command is not None
-    requested = resolve_experiment(experiment, options)
-    complete = load_experiment_plugins(
-        requested, _list_plugin_files(options), is_trusted, options.isolation
-    )
+    loaded = loaded.chosen(trusted=loaded.trusted or is_trusted, isolation=options.isolation)
+    load_plugins_for_experiment(_list_plugin_files(options), loaded)
+    # The robot's default commands are filled in, so that the result folder contains them.
+    complete = complete_robot_experiment(loaded)
     labels = (
         None if options.tuners is None else [get_tuner_label(tuner) for tuner in options.tuners]
     )
@@ -217,67 +232,6 @@ def begin_studies(
     jobs, files = options.jobs, _list_plugin_files(options)
     check_comparison_size(experiment, folder, jobs, options.cluster is not None, options.force)
     return study.begin_studies(experiment, files, folder, jobs, options.salt)
-
-
-def resolve_experiment(
-    experiment: str | Path | Experiment | None, options: ComparisonOptions
-) -> str | Path | Experiment:
-    """Return the named experiment, or the one described by a model file and a recording.
-
-    Args:
-        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
-        options: Options with the model file, the recording and the numbers to tune.
-
-    Raises:
-        InputError: Neither or both are given.
-    """
-    stated_options = [name for name in ("model", "recording", "free") if getattr(options, name)]
-    if experiment is not None:
-        if stated_options:
-            raise InputError(
-                f"experiment {experiment} states what it tunes: leave out "
-                f"{', '.join(stated_options)}, or leave out the experiment"
-            )
-        return experiment
-    if not stated_options:
-        raise InputError(
-            "expected an experiment (see `simgap list experiments`), or --resume DIR, or a robot: "
-            "--model FILE --free A,B"
-        )
-    return make_robot_experiment(options.model, options.recording, options.free)
-
-
-def load_experiment_plugins(
-    experiment: str | Path | Experiment,
-    plugins: Sequence[str | Path],
-    trust: bool,
-    isolation: str | None = None,
-) -> Experiment:
-    """Load an experiment and its plugins into this process.
-
-    Args:
-        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
-        plugins: Python files with further parts.
-        trust: Whether to run tuners without isolation.
-        isolation: As in `compare`.
-
-    Raises:
-        InputError: The experiment does not exist, or a plugin cannot be used.
-    """
-    loaded = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
-    loaded = loaded.chosen(trusted=loaded.trusted or trust, isolation=isolation)
-    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], loaded)
-    # The robot's default commands are filled in, so that the result folder contains them.
-    return complete_robot_experiment(loaded)
-
-
-def _connect_to_cluster(address: str | None) -> Pool | None:
-    """Connect to the Dask cluster at an address; None without one, for worker processes here."""
-    if address is None:
-        return None
-    from bench.benchmark.runner.dask_cluster import ClusterPool
-
-    return ClusterPool(address)
 
 
 def _report_study(started_study: Study, outcome: StudyOutcome) -> ComparisonResult:

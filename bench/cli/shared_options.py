@@ -87,13 +87,6 @@ def add_recordings_argument(parser: argparse.ArgumentParser, text: str) -> None:
     )
 
 
-def add_system_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the system that a recording is of, ``--system`` and ``--model``."""
-    from bench.logs.recording_loading import FrameDescription
-
-    add_options(parser, FrameDescription)
-
-
 def add_out_option(
     parser: argparse.ArgumentParser, text: str, metavar: str = "DIR", required: bool = False
 ) -> None:
@@ -125,16 +118,6 @@ def add_plugin_option(parser: argparse.ArgumentParser, parts: str) -> None:
     )
 
 
-def add_model_option(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add the option ``--model FILE``.
-
-    Args:
-        parser: parser of the command.
-        text: help text.
-    """
-    parser.add_argument("--model", type=parse_path, metavar="FILE", help=text)
-
-
 def add_force_option(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--force``."""
     parser.add_argument(
@@ -149,16 +132,6 @@ def add_pdf(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--pdf``, which `bench.cli.main` handles for every command that has it."""
     parser.add_argument(
         "--pdf", action="store_true", help="write every figure as PDF too (default: PNG only)"
-    )
-
-
-def add_trust_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--trust``."""
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="run the tuners without isolation: faster, but they could read the true parameters, "
-        "and the results are marked",
     )
 
 

@@ -19,7 +19,7 @@ unknown S absorbs (g is gravity):
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -93,7 +93,7 @@ def compute_heights_by_camera(track: BallTrack, filmed: FilmDescription) -> Ball
         sizes = f"the camera's picture has {camera.size} px, the film {track.size}"
         raise InputError(f"{sizes}; expected the same shape")
     # The film may have been resized, so the camera is resized with it.
-    camera = camera.with_size(*track.size)
+    camera = replace(camera, size=track.size)
     z = camera.estimate_heights(
         np.stack([track.u, track.v], axis=1), filmed.x, filmed.y, filmed.radius
     )

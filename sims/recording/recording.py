@@ -201,9 +201,7 @@ class Recording:
         return tuple(sorted({run.fold for run in self.runs if run.fold is not None}))
 
 
-def read_recording(
-    path: str | Path, declared: DeclaredSignals, whole: bool = False, folds: bool = False
-) -> Recording:
+def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = False) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system.
 
     Channels, inputs, constants and states must be those of the system. The description decides how
@@ -215,8 +213,6 @@ def read_recording(
         declared: System, or simulator of it; `read_system_name` reads which system the recording
             states.
         whole: Whether to hold out only the marked runs, and not to split a single run.
-        folds: Whether to number two or three unmarked runs as cross-validation folds instead of
-            holding one of them out.
 
     Raises:
         InputError: The recording is malformed; the message is one line.
@@ -236,7 +232,7 @@ def read_recording(
     recording = _assemble_recording(table, parts, description, description_path, model)
     if whole:
         return recording
-    return replace(recording, runs=_split_runs(description_path, recording.runs, folds))
+    return replace(recording, runs=_split_runs(description_path, recording.runs, folds=False))
 
 
 def _assemble_recording(

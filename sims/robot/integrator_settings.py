@@ -203,23 +203,10 @@ def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]
     return (2.0 * timestep, 1.0)
 
 
-def get_friction_solref_of_batch(fields: Fields, robot: RobotModel) -> tuple[float, float]:
-    """Return `solref` of stiff dry friction for a batch.
-
-    Time step and integrator are taken from the fields if they contain them, else from the file.
-
-    Args:
-        fields: model fields of the batch elements.
-        robot: robot with the model file.
-    """
-    option = robot.compiled.opt
-    step = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
-    kind = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
-    return get_friction_solref(float(step), int(kind))
-
-
 def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, dofs: Any) -> None:
     """Set the solver parameters of dry friction that effects add, in the form of the robot.
+
+    Time step and integrator are taken from the fields if they contain them, else from the file.
 
     Args:
         fields: model fields of the batch elements, changed in place.
@@ -229,7 +216,11 @@ def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, d
     """
     if robot.friction_form == "soft":
         return
-    fields["dof_solref"][batch_indices, dofs] = get_friction_solref_of_batch(fields, robot)
+    option = robot.compiled.opt
+    timestep = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
+    integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    solref = get_friction_solref(float(timestep), int(integrator))
+    fields["dof_solref"][batch_indices, dofs] = solref
     fields["dof_solimp"][batch_indices, dofs] = FRICTION_SOLIMP
 
 

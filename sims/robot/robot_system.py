@@ -157,10 +157,7 @@ class RobotSystem(System):
                 existing ones.
         """
         effect_name, _, place = name.partition("@")
-        try:
-            registered = library.get_effect(effect_name)
-        except PartUnavailableError:
-            raise
+        registered = library.get_effect(effect_name)
         cls.placed(registered)
         if name in cls.left_out:
             raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")

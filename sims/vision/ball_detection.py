@@ -435,7 +435,18 @@ class BallDetector:
         cos, sin = _compute_ray_directions()
         along_u = (u + cos * distances).astype(np.float32)
         along_v = (v + sin * distances).astype(np.float32)
-        profiles = [_interpolate_window(window, along_u, along_v) for window in windows]
+        cv2 = import_package("cv2")
+        profiles = [
+            cv2.remap(
+                window,
+                along_u,
+                along_v,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=_PADDING_VALUE,
+            )
+            for window in windows
+        ]
         # Last pixels inside the edge, except those affected by blur.
         is_inner = distances > min(_INNER_SHARES[0] * radius, radius - _INNER_MARGINS[0])
         is_inner &= distances < max(_INNER_SHARES[1] * radius, radius - _INNER_MARGINS[1])
@@ -562,26 +573,6 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
     ranked = np.partition(picture[rows, columns], median_index, axis=0)
     colour: Array = ranked[median_index].astype(np.float64)
     return colour
-
-
-def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
-    """Interpolate a window at subpixel positions; `_PADDING_VALUE` outside it.
-
-    Args:
-        window: (height, width) grey levels.
-        u: horizontal positions, any shape, pixels.
-        v: vertical positions of the same shape.
-    """
-    cv2 = import_package("cv2")
-    result: GreyLevels = cv2.remap(
-        window,
-        u,
-        v,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=_PADDING_VALUE,
-    )
-    return result
 
 
 @lru_cache(maxsize=1)

@@ -482,9 +482,9 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
         hiding = _list_hiding_circles(detections)
         shadow_masks = None
         if detector.shadows:
-            shadow_masks = _find_shadows(
-                [detector.find_missing_shadow(picture) for picture in pictures]
-            )
+            # Pictures where the shadow in the background is missing; it hides it in the others.
+            is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
+            shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= _MIN_EMPTY_FRAMES)
         background = background_model.compute_masked_background(
             pictures, hiding, background, shadow_masks
         )
@@ -531,17 +531,6 @@ def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Cir
             if not is_missing:
                 circles.append(ghost_circle)
     return balls
-
-
-def _find_shadows(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Return where a shadow hides the background in each picture (n, height, width).
-
-    Args:
-        lit: Masks (height, width) where the shadow in the background is missing, one per picture.
-    """
-    stack = np.stack(lit)
-    result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _MIN_EMPTY_FRAMES)
-    return result
 
 
 def _is_same_object(a: Circle, b: Circle) -> bool:

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -110,15 +110,6 @@ class PinholeCamera:
         high = 2 * math.pi, 10.0, 8.0
         azimuth, distance, height = rng.uniform(low, high).tolist()
         return cls(azimuth, distance, height, size=(pixels, pixels))
-
-    def with_size(self, width: int, height: int) -> PinholeCamera:
-        """Return this camera with another picture size and the same vertical field of view.
-
-        Args:
-            width: Width of the picture, pixels.
-            height: Height of the picture, pixels.
-        """
-        return replace(self, size=(width, height))
 
     @cached_property
     def position(self) -> Array:

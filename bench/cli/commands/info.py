@@ -38,7 +38,9 @@ def collect_info() -> JsonDocument:
     import platform
 
     from bench import __version__
+    from bench.benchmark.runner.tuner_training import get_weights_folder
     from bench.core.resource_estimates import count_available_cores
+    from bench.datasets.dataset_catalogue import get_user_folder
 
     return {
         "simgap": __version__,
@@ -51,8 +53,8 @@ def collect_info() -> JsonDocument:
         "memory": _read_memory_size(),
         "paths": {
             "simgap": str(_PACKAGES_FOLDER),
-            "cache": str(_get_cache_folder()),
-            "data sets": str(_get_data_set_folder()),
+            "cache": str(get_weights_folder()),
+            "data sets": str(get_user_folder()),
             "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
             "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
         },
@@ -63,18 +65,6 @@ def collect_info() -> JsonDocument:
 
 _PACKAGES_FOLDER = Path(__file__).resolve().parents[3]
 """Folder that contains simgap's packages."""
-
-
-def _get_cache_folder() -> Path:
-    from bench.benchmark.runner.tuner_training import get_weights_folder
-
-    return get_weights_folder()
-
-
-def _get_data_set_folder() -> Path:
-    from bench.datasets.dataset_catalogue import get_user_folder
-
-    return get_user_folder()
 
 
 def _read_git_revision() -> str | None:

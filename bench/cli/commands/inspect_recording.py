@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
 from bench.cli.shared_options import (
+    add_options,
     add_out_option,
     add_pdf,
     add_plugin_option,
-    add_system_options,
     parse_name_list,
     parse_path,
 )
@@ -26,13 +26,15 @@ if TYPE_CHECKING:
 
 def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap inspect`."""
+    from bench.logs.recording_loading import FrameDescription
+
     parser.add_argument(
         "recording",
         metavar="FILE.csv",
         type=parse_path,
         help="table of the recording; its .toml is in the same folder",
     )
-    add_system_options(parser)
+    add_options(parser, FrameDescription)
     parser.add_argument(
         "--fix-base",
         action="store_true",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bench.cli.output import CommandResult, PrintLine, format_json
-from bench.cli.shared_options import add_model_option, add_plugin_option
+from bench.cli.shared_options import add_plugin_option, parse_path
 
 _LISTS = (
     "tuners", "simulators", "systems", "effects", "diagnosers", "experiments", "references",
@@ -21,7 +21,12 @@ def add_list_arguments(listing: argparse.ArgumentParser) -> None:
         nargs="?",
         help="which list (default, with --json: all but the last)",
     )
-    add_model_option(listing, "model file (MJCF or URDF) whose places are listed")
+    listing.add_argument(
+        "--model",
+        type=parse_path,
+        metavar="FILE",
+        help="model file (MJCF or URDF) whose places are listed",
+    )
     add_plugin_option(listing, "entries")
     listing.set_defaults(command=_run_list)
 

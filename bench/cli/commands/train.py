@@ -10,7 +10,6 @@ from bench.cli.shared_options import (
     add_force_option,
     add_pdf,
     add_plugin_option,
-    add_trust_option,
     parse_path,
     parse_positive_int,
 )
@@ -57,7 +56,12 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_pdf(parser)
     add_plugin_option(parser, "tuners and simulators")
-    add_trust_option(parser)
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="run the tuners without isolation: faster, but they could read the true parameters, "
+        "and the results are marked",
+    )
     add_force_option(parser)
     parser.set_defaults(command=_run_train)
 

@@ -97,6 +97,8 @@ def _check_actuator_table(
     Raises:
         InputError: the model cannot have this actuator.
     """
+    import mujoco
+
     for key in ("joint", "kind"):
         if key not in table:
             raise InputError(f"{source}: {table_name} states no {key}")
@@ -104,7 +106,8 @@ def _check_actuator_table(
     if kind not in GAIN_KEYS_BY_KIND:
         error = make_unknown_name_error("kind", kind, list(GAIN_KEYS_BY_KIND))
         raise InputError(f"{source}: {table_name}: {error}")
-    joints = [joint.name for joint in spec.joints if _has_one_degree_of_freedom(joint)]
+    one_axis_types = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    joints = [joint.name for joint in spec.joints if joint.type in one_axis_types]
     if table["joint"] not in joints:
         error = make_unknown_name_error("joint", table["joint"], joints or ["none"])
         raise InputError(f"{source}: {table_name}: {error}")
@@ -128,13 +131,6 @@ def _check_actuator_table(
             value = toml_validation.check_finite(source, f"{table_name}.{key}", table[key])
             if value < 0 and key != "gear":
                 raise toml_validation.make_error(source, f"{table_name}.{key}", "0 or more", value)
-
-
-def _has_one_degree_of_freedom(joint: Any) -> bool:
-    """Return whether a joint of a spec has one degree of freedom."""
-    import mujoco
-
-    return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
