@@ -9,13 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from sims.core.simulator import Scenario
 from sims.extended_simulator import FittedValue
 from sims.robot.export.round_trip_check import check_written_files, simulate_test_motion
 from sims.robot.export.write_model_file import write_model_files
 from sims.robot.parsing.read_model_file import read_robot
+from sims.robot.robot_simulator import make_robot_simulator
 from tests.sims.robot.sample_arms import ARM, robot, write_and_check
 from tests.sims.robot.test_model_changes import MOVING, number, one
 
+TIMES = np.linspace(0.0, 0.5, 501)
 CAUSES = {
     "friction.coulomb@*": {
         "coefficient@elbow": number(0.3, "N*m"),
@@ -284,28 +287,36 @@ def test_a_urdf_body_without_any_inertial_is_said(tmp_path):
     assert "states no inertial" in line
 
 
-def test_a_delay_is_that_of_the_simulator(tmp_path):
-    """In both, a control delayed by a fraction of a step is the mean over the step."""
-    from sims.core.simulator import Scenario
-    from sims.robot.robot_simulator import make_robot_simulator
+def simulate_elbow(arm, effect, value, command, activation=()):
+    """Return the elbow with an effect, without it, and in MuJoCo with the written file.
 
-    arm = robot(tmp_path)
-    times = np.linspace(0.0, 0.5, 501)
-    command = np.where(times > 0.05, np.sin(9.0 * times), 0.0)
-    simulator = make_robot_simulator(arm)(effects=["input.delay@m_elbow"])
-    scenario = Scenario(times=times, inputs={"u.m_elbow": command})
-    (shown,) = simulator.simulate_batch(np.array([[0.0123]]), [scenario])
-    done = write_model_files(arm, {"input.delay@m_elbow": {"coefficient": number(0.0123, "s")}})
+    Args:
+        arm: robot.
+        effect: effect on the command of the elbow.
+        value: its coefficient, s.
+        command: command at each step.
+        activation: initial activation of filters in the written file.
+    """
+    simulator = make_robot_simulator(arm)(observe=["q.elbow"], effects=[effect])
+    scenario = Scenario(times=TIMES, inputs={"u.m_elbow": command})
+    shown, direct = simulator.simulate_batch(np.array([[value], [0.0]]), [scenario] * 2)
+    done = write_model_files(arm, {effect: {"coefficient": number(value, "s")}})
     model = mujoco.MjModel.from_xml_string(done.xml)
-    data = mujoco.MjData(model)
-    elbow = []
-    for u in command[:-1]:
-        elbow.append(data.qpos[1])
+    data, positions = mujoco.MjData(model), []
+    data.act[:] = activation
+    for u in command:
+        positions.append(data.qpos[1])
         data.ctrl[1] = u
         mujoco.mj_step(model, data)
-    place = [channel.name for channel in simulator.channels].index("q.elbow")
-    np.testing.assert_allclose(shown[:-1, place], elbow, rtol=0, atol=1e-9)
-    assert np.ptp(elbow) > 0.1
+    return shown[:, 0], direct[:, 0], np.array(positions)
+
+
+def test_a_delay_is_that_of_the_simulator(tmp_path):
+    """In both, a control delayed by a fraction of a step is the mean over the step."""
+    command = np.where(TIMES > 0.05, np.sin(9.0 * TIMES), 0.0)
+    shown, _, written = simulate_elbow(robot(tmp_path), "input.delay@m_elbow", 0.0123, command)
+    np.testing.assert_allclose(shown, written, rtol=0, atol=1e-9)
+    assert np.ptp(written) > 0.1
 
 
 NAMELESS = """<mujoco>
@@ -339,28 +350,15 @@ def test_an_actuator_without_a_name_keeps_none(tmp_path):
 
 def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path):
     """If MuJoCo's filter begins at the first command, the motion is close to the simulator's."""
-    from sims.core.simulator import Scenario
-    from sims.robot.robot_simulator import make_robot_simulator
-
-    arm = robot(tmp_path)
-    times = np.linspace(0.0, 0.5, 501)
-    command = 0.3 + np.sin(9.0 * times)
-    simulator = make_robot_simulator(arm)(effects=["input.lag@m_elbow"])
-    scenario = Scenario(times=times, inputs={"u.m_elbow": command})
-    shown, direct = simulator.simulate_batch(np.array([[0.05], [0.0]]), [scenario] * 2)
-    done = write_model_files(arm, {"input.lag@m_elbow": {"coefficient": number(0.05, "s")}})
-    model = mujoco.MjModel.from_xml_string(done.xml)
-    data = mujoco.MjData(model)
-    data.act[:] = command[0]
-    for u in command[:-1]:
-        data.ctrl[1] = u
-        mujoco.mj_step(model, data)
-    place = [channel.name for channel in simulator.channels].index("q.elbow")
+    command = 0.3 + np.sin(9.0 * TIMES)
+    shown, direct, written = simulate_elbow(
+        robot(tmp_path), "input.lag@m_elbow", 0.05, command, command[0]
+    )
     # The simulator uses the mean over each step, MuJoCo the value at its start: half a step
     # difference.
-    effect = abs(shown[-1, place] - direct[-1, place])
+    effect = abs(shown[-1] - direct[-1])
     assert effect > 0.1
-    assert abs(data.qpos[1] - shown[-1, place]) < 0.02 * effect
+    assert abs(written[-1] - shown[-1]) < 0.02 * effect
 
 
 def test_actuators_of_a_recording_are_written_into_the_file(tmp_path):

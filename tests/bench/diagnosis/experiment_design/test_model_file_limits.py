@@ -56,18 +56,20 @@ def kind_of(folder, text, name="arm.urdf", **options):
 
 
 def simulated(kind, command, effect=None, coefficient=0.0, begin=0.0):
-    """Return the hip positions under a command of the only actuator, and all inputs."""
+    """Return the positions by joint under a command of the only actuator, and all inputs."""
     (name,) = (one.name for one in kind.inputs if one.name.startswith("u."))
     inputs = {channel.name: np.zeros(TIMES.size) for channel in kind.inputs} | {name: command}
-    simulator = kind(observe=["q.hip"], effects=[effect] if effect else [])
+    names = list(kind.system.coordinates)
+    simulator = kind(observe=names, effects=[effect] if effect else [])
     theta = np.array([[coefficient]]) if effect else np.empty((1, 0))
-    return simulator.simulate(theta, Scenario(TIMES, {"q.hip": begin}, inputs))[0][:, 0], inputs
+    seen = simulator.simulate(theta, Scenario(TIMES, {"q.hip": begin}, inputs))[0]
+    return dict(zip(names, seen.T, strict=True)), inputs
 
 
 def world_of(kind, command, begin=0.0):
     """Return the run evaluator of one run and a model with its true parameters."""
     seen, inputs = simulated(kind, command, begin=begin)
-    run = Run("1", TIMES, {"q.hip": seen}, inputs, {}, {}, held_out=False)
+    run = Run("1", TIMES, seen, inputs, {}, {}, held_out=False)
     recording = RunEvaluator(
         kind, Recording("x.csv", kind.name, "", {}, {}, (run,)), (run,), None, candidates=()
     )
@@ -83,7 +85,7 @@ def log(folder, kind, effect, coefficient, size, noise):
     for number in range(3):
         command = size * np.sin(2.0 * TIMES + number)
         seen, inputs = simulated(kind, command, effect, coefficient, 0.05 * number)
-        runs.append((TIMES, command, seen + noise * rng.standard_normal(seen.size)))
+        runs.append((TIMES, command, seen["q.hip"] + noise * rng.standard_normal(TIMES.size)))
     (name,) = (one for one in inputs if one.startswith("u."))
     (unit,) = (one.unit for one in kind.inputs if one.name == name)
     tables = "".join(

@@ -1,20 +1,22 @@
 """Tests of run plans and of the limits of an experimental setup, by simulation."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
 from bench.diagnosis.experiment_design.safety_limits import SPEED_AND_FORCE_FACTOR, RigLimits
-from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from sims.systems.servo import Servo
+from tests.bench.diagnosis.experiment_design.test_model_file_limits import (
+    MOTOR,
+    TIMES,
+    kind_of,
+    world_of,
+)
 
-TIMES = np.arange(100) / 50.0
 URDF = """<robot name="arm"><link name="base"/>
 <link name="leg"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -36,22 +38,9 @@ def arm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
 
     def make_arm(speed):
-        path = folder / f"arm{speed:g}.urdf"
-        path.write_text(URDF.replace("SPEED", f"{speed:g}"))
-        actuators = {"m": {"joint": "hip", "kind": "motor"}}
-        kind = make_robot_simulator(path, actuators=actuators)
-        inputs = {c.name: np.zeros(TIMES.size) for c in kind.inputs}
-        inputs["u.m"] = 1.5 * np.sin(3 * TIMES)
-        simulator = kind(observe=["q.hip", "q.knee"])
-        seen = simulator.simulate(np.empty((1, 0)), Scenario(TIMES, {}, inputs))[0]
-        channels = dict(zip(("q.hip", "q.knee"), seen.T, strict=True))
-        run = Run("1", TIMES, channels, inputs, {}, {}, held_out=False)
-        recording = Recording(Path("x.csv"), kind.name, "", {}, {}, (run,))
-        evaluator = RunEvaluator(kind, recording, (run,), None, candidates=())
-        fit = SimpleNamespace(
-            theta=evaluator.get_nominal_theta(), initial_states=evaluator.initial_state_guesses
-        )
-        return evaluator, SimpleNamespace(fit=fit, effects=())
+        text = URDF.replace("SPEED", f"{speed:g}")
+        kind = kind_of(folder, text, f"arm{speed:g}.urdf", actuators=MOTOR)
+        return world_of(kind, 1.5 * np.sin(3 * TIMES))
 
     return make_arm
 
