@@ -13,7 +13,6 @@ from bench.diagnosis.pipeline import base_model
 from bench.diagnosis.verdict import Verdict
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import InputError, Scenario
-from sims.extended_simulator import load_extended
 from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis import verdict_schema
 from tests.bench.diagnosis.report_tables import swing, table
@@ -271,10 +270,6 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     scenario = Scenario(TIMES, {"q": 0.7})
     np.testing.assert_array_equal(
         kind().simulate(theta, scenario), by_hand.simulate(theta, scenario)
-    )
-    np.testing.assert_array_equal(
-        load_extended(model, simulators.get)().simulate(theta, scenario),
-        by_hand.simulate(theta, scenario),
     )
     np.testing.assert_array_equal(
         found.extended.simulator().simulate(theta, scenario), by_hand.simulate(theta, scenario)

@@ -41,18 +41,28 @@ def fitted(there, theta=None, sigma=1e-3, iterations=30, states=None, effects=()
     ]
 
 
-def test_parameters_and_initial_states_of_noiseless_runs_come_back():
-    there = evaluator(swings())
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_parameters_and_initial_states_of_noiseless_runs_come_back(share):
+    """A share of the samples is missing."""
+    rng = np.random.default_rng(3)
+
+    def lose(values):
+        return np.where(rng.random(values.size) < share, np.nan, values)
+
+    runs = tuple(changed(run, q=lose, qd=lose) for run in swings().runs)
+    there = evaluator(replace(swings(), runs=runs))
     fit = fitted(there)
     assert there.observed.shape == (3, 130, 2)
     assert fit.theta[0] == pytest.approx(TRUE_RATE, rel=2e-5)
     released = [[0.7, 0], [-1.2, 0], [2.2, 0]]
     np.testing.assert_allclose(fit.initial_states, released, atol=1e-3)
+    np.testing.assert_allclose(fit.initial_states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
     seen = np.isfinite(there.observed)
     # The deviation is below the assumed noise, in rad and rad/s.
     assert np.abs(fit.simulated - there.observed)[seen].max() < 1e-3
     assert fit.cost < 60, "sum of squares over 560 samples in units of a noise of 1e-3"
     assert not seen[0, 60:].any()
+    assert seen.sum() == pytest.approx((1 - share) * 560, abs=40)
 
 
 def test_an_effect_is_fitted_with_the_parameters():
@@ -103,20 +113,6 @@ def test_several_models_in_one_call_equal_one_by_one():
         np.testing.assert_allclose(a.theta, b.theta, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(a.initial_states, b.initial_states, rtol=1e-9, atol=1e-12)
         assert a.cost == pytest.approx(b.cost, rel=1e-6, abs=1e-9)
-
-
-def test_missing_samples_change_nothing_but_what_is_known():
-    rng = np.random.default_rng(3)
-    runs = []
-    for run in swings().runs:
-        lost = {name: rng.random(run.times.size) < 0.4 for name in ("q", "qd")}
-        q, qd = (np.where(lost[name], np.nan, run.channels[name]) for name in ("q", "qd"))
-        runs.append(changed(run, q=lambda _, q=q: q, qd=lambda _, qd=qd: qd))
-    there = evaluator(replace(swings(), runs=tuple(runs)))
-    fit = fitted(there)
-    assert np.isnan(there.observed).sum() > 200
-    assert fit.theta[0] == pytest.approx(TRUE_RATE, rel=2e-5)
-    np.testing.assert_allclose(fit.initial_states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
 
 
 def test_only_the_first_share_counts():
