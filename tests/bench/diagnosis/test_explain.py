@@ -266,6 +266,8 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     load_plugins([model])
     kind = simulators.get("pendulum_extended")
     theta = np.array([[p.nominal for p in kind.parameters]])
+    numbers = found.answer.parameters["inertia"], found.causes[0].coefficients["coefficient"]
+    assert theta[0].tolist() == [number.value for number in numbers]
     by_hand = Pendulum(found.extended.constants, engine="batch", effects=["drag.linear"])
     scenario = Scenario(TIMES, {"q": 0.7})
     np.testing.assert_array_equal(

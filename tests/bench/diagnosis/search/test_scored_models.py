@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.search_control import SearchControl, SilentListener
+from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from tests.bench.cli.test_search_progress import Events
 from tests.bench.diagnosis.explained_samples import recording, searched
 
 
@@ -100,17 +101,6 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
 
 
 def test_a_survey_of_several_models_reports_each_of_them():
-    class Events(SilentListener):
-        def __init__(self):
-            self.finished = {}
-
-        def stage(self, name, total=None):
-            self.now = name, total
-            self.finished[self.now] = 0
-
-        def advance(self, count=1):
-            self.finished[self.now] += count
-
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     candidates = ["friction.coulomb", "spring.linear", "drag.linear"]
     search, _ = searched(recorded, 0.01, candidates=candidates)
@@ -119,4 +109,5 @@ def test_a_survey_of_several_models_reports_each_of_them():
     heard = Events()
     search.evaluator.search_control = SearchControl(listener=heard)
     search.refit_extensions([search.models[frozenset(one)] for one in names], 0)
-    assert heard.finished["testing 2 effects added to each of 2 models", 2] == 2
+    stage = heard.stages.index(("testing 2 effects added to each of 2 models", 2))
+    assert heard.finished[stage] == 2
