@@ -234,7 +234,7 @@ class _Course:
             if start is None:
                 self.sliding_direction[joint], self.stuck[joint] = 0.0, True
                 return now
-            when = brentq(speed, start, span, xtol=1e-15)
+            when = brentq(speed, start, span, xtol=1e-12)
             if when < first:
                 first, stops = when, joint
         if loose > 0:
