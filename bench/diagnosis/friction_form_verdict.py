@@ -136,14 +136,17 @@ def choose_friction_form(
         model: One of these models, for which `has_dry_friction` is true.
         other_evaluator: Run evaluator of the same runs and parameters, with a simulator of the
             other form.
-        margin: Minimum gain in twice the log-likelihood.
+        margin: Minimum gain in twice the log-likelihood. The sum of squares must be lower, too.
 
     Returns:
         The model in the other form; None if the present form is kept.
     """
     refitted_model = _refit_with_other_form(other_evaluator, models, model)
     gain = refitted_model.likelihood.value - model.likelihood.value
-    return refitted_model if gain >= margin else None
+    # Of two models that leave much more than noise, the likelihood with autocorrelated noise may
+    # prefer the one with the larger residual, because it is smoother.
+    is_residual_smaller = refitted_model.fit.cost < model.fit.cost
+    return refitted_model if gain >= margin and is_residual_smaller else None
 
 
 def _refit_with_other_form(

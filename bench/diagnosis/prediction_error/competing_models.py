@@ -226,7 +226,8 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
     """Follow the runs with each proposed effect in addition to a set, and rank the larger sets.
 
     The effects with the largest gains by regression are tried first. If one of them replaces a
-    missing force, the others, which a regression may have missed, are not tried.
+    missing force, the others, which a regression may have missed, are not tried. The result is
+    cached, because sets that grow from different effects may become equal.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -236,6 +237,20 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
         The larger sets, the likeliest (after the penalty of its effect) first; empty if no effect
         gains.
     """
+    key = frozenset(current.names), len(context.columns.library.probes)
+    if key in context.extended_sets:
+        extended, larger_sets = context.extended_sets[key]
+        gain = context.filters.compute_gain(current.followed)
+        margin = compute_comparison_margin(gain)
+        if gain < context.filters.compute_gain(extended.followed) + margin:
+            return larger_sets
+    larger_sets = _compare_larger_sets(context, current)
+    context.extended_sets[key] = current, larger_sets
+    return larger_sets
+
+
+def _compare_larger_sets(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
+    """Return the sets with one more effect, with improved coefficients, ranked by likelihood."""
     starts = context.proposals.of(current)
     context.evaluator.search_control.begin_stage(
         "testing the effects of the model one by one", len(starts)

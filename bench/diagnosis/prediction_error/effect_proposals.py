@@ -18,6 +18,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     get_bounds_by_index,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
@@ -363,12 +364,20 @@ class SearchContext:
         filters: filters with effects in the model.
         columns: columns of regressions.
         proposals: effects that a set may lack.
+        extended_sets: sets that were extended by one effect, each with the larger sets, by their
+            effects and the size of the library.
+        filtered_fits: models fitted from the coefficients of a filter, by their effects and these
+            coefficients.
     """
 
     search: EffectSearch
     filters: ModelFilters
     columns: LibraryColumns
     proposals: EffectProposals
+    extended_sets: dict[tuple[frozenset[str], int], tuple[FilteredSet, list[FilteredSet]]] = field(
+        default_factory=dict
+    )
+    filtered_fits: dict[tuple[tuple[str, ...], bytes], FittedModel] = field(default_factory=dict)
 
     @classmethod
     def of(cls, search: EffectSearch) -> SearchContext:

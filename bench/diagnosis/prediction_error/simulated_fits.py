@@ -115,14 +115,19 @@ def make_filtered_start(context: SearchContext, current: FilteredSet) -> FitStar
 
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
-    """Fit a set by simulation, starting from the coefficients of its filter.
+    """Fit a set by simulation, starting from the coefficients of its filter; the fit is cached.
 
     Args:
         context: search, filters and regressions of the recording.
         current: the set.
     """
-    start = make_filtered_start(context, current)
-    return fit_by_simulation(context, start, current.followed.has_missing_force)
+    key = current.names, current.followed.theta.tobytes()
+    if key not in context.filtered_fits:
+        start = make_filtered_start(context, current)
+        context.filtered_fits[key] = fit_by_simulation(
+            context, start, current.followed.has_missing_force
+        )
+    return context.filtered_fits[key]
 
 
 def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedModel:
