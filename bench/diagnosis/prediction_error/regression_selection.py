@@ -59,6 +59,8 @@ MIN_BETTER_RUN_SHARE = 0.5
 """Minimum share of the left-out runs that a larger set must predict better."""
 MIN_LEFT_OUT_GAIN = 1.0
 """Minimum gain in left-out runs, in twice the log-likelihood, of a set that predicts better."""
+MIN_SHRUNK_GAIN_SHARE = 0.5
+"""Minimum share of the gain in all runs that shrunk coefficients keep in left-out runs."""
 MIN_VISIBLE_GAIN = 7.0
 """Minimum gain of a column in twice the log-likelihood to be visible in the data."""
 RIDGE = 1e-10
@@ -297,7 +299,9 @@ class Regression:
         """Return whether a larger set predicts left-out runs better.
 
         Each run is left out in turn (cross-validation; M. Stone, J. R. Stat. Soc. B 36(2), 111,
-        1974).
+        1974). If only the left-out run determines a coefficient well, that of the other runs is
+        arbitrary. So the prediction with coefficients that are shrunk where the others determine
+        them badly counts as well, if it keeps much of the gain in all runs together.
 
         Args:
             smaller: the smaller set.
@@ -305,18 +309,48 @@ class Regression:
         """
         if len(self.products.totals) < 2:
             return True
-        before, after = self._compute_left_out_rss(smaller), self._compute_left_out_rss(larger)
-        # An effect that acts in one run only predicts nothing in it from the others.
-        remaining = max(float(after.sum()), SMALLEST_RSS * self.total)
-        gain = self.compute_log_ratio(float(before.sum()), remaining)
-        return bool(gain > MIN_LEFT_OUT_GAIN and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
+        if self._compute_left_out_gain(smaller, larger) > MIN_LEFT_OUT_GAIN:
+            return True
+        gain = self.compute_log_ratio(self.solve(smaller)[0], self.solve(larger)[0])
+        shrunk_gain = self._compute_left_out_gain(smaller, larger, is_shrunk=True)
+        return shrunk_gain > max(MIN_LEFT_OUT_GAIN, MIN_SHRUNK_GAIN_SHARE * gain)
 
-    def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
+    def _compute_left_out_gain(
+        self,
+        smaller: Sequence[DirectionGroup],
+        larger: Sequence[DirectionGroup],
+        is_shrunk: bool = False,
+    ) -> float:
+        """Return the gain of a larger set in left-out runs, in twice the log-likelihood.
+
+        It is minus infinity if the larger set predicts too few of the runs better: an effect that
+        acts in one run only predicts nothing in it from the others.
+
+        Args:
+            smaller: the smaller set.
+            larger: the larger set.
+            is_shrunk: whether coefficients are shrunk.
+        """
+        before = self._compute_left_out_rss(smaller, is_shrunk)
+        after = self._compute_left_out_rss(larger, is_shrunk)
+        if (after < before).mean() < MIN_BETTER_RUN_SHARE:
+            return -np.inf
+        remaining = max(float(after.sum()), SMALLEST_RSS * self.total)
+        return self.compute_log_ratio(float(before.sum()), remaining)
+
+    def _compute_left_out_rss(
+        self, chosen: Sequence[DirectionGroup], is_shrunk: bool = False
+    ) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs.
 
         The products of eq. (1) of a run are subtracted from those of all runs, which gives the fit
         without that run: rss = e'e - 2 c'h + c'G c with the products G, h of the run and
-        coefficients c of the others.
+        coefficients c of the others. Shrunk coefficients are those of a fit in which the run is not
+        left out, but has zero innovations.
+
+        Args:
+            chosen: the groups.
+            is_shrunk: whether coefficients are shrunk.
         """
         residual_squares = []
         groups = [*chosen, self._nuisance]
@@ -325,6 +359,12 @@ class Regression:
         for run, total in enumerate(self.products.totals):
             _, parts = self._fit_groups(groups, left_out=run)
             coefficients = np.concatenate(parts) if parts else np.zeros(0)
+            used = coefficients != 0
+            if is_shrunk and used.any():
+                normal, scale = _normalise_gram(grams[:, used][:, :, used].sum(axis=0))
+                cross = self.products.crosses[:, columns[used]].sum(axis=0)
+                cross = cross - self.products.crosses[run][columns[used]]
+                coefficients[used] = np.linalg.solve(normal, cross / scale) / scale
             residual_squares.append(
                 total
                 - 2.0 * coefficients @ self.products.crosses[run][columns]

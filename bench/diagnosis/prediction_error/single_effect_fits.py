@@ -37,6 +37,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     select_lowest_of_each,
     select_more_likely,
 )
+from sims.core.effect import members_of
 from sims.robot.dynamics.series_joints import is_series_effect
 
 SCANNED_FACTORS = (0.5, 2.0, 4.0)
@@ -45,6 +46,9 @@ CLOSER_FACTORS = ((0.7, 0.84, 1.2, 1.4), (0.92, 0.96, 1.04, 1.09))
 """Factors of the best scanned coefficient that are simulated next, in two rounds."""
 MAX_SINGLE_SQUARES_SHARE = 0.3
 """Maximum share of the squared residual that a single likely effect leaves before any fit."""
+MIN_FAMILY_SQUARES_SHARE = 0.05
+"""Minimum share of its squared residual by which an effect at all places beats one of its places.
+"""
 MAX_SCANNED_FITS = 2
 """Maximum number of likely effects that are fitted alone."""
 MAX_NEARBY = 5
@@ -77,7 +81,29 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     if not has_noise_like_cost(context, costs):
         costs = _try_scaled(context, costs, SCANNED_FACTORS)
     limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
-    return [(cost, start) for cost, start in costs if cost < limit]
+    return _drop_families(context, [(cost, start) for cost, start in costs if cost < limit])
+
+
+def _drop_families(context: SearchContext, rated_starts: Sequence[RatedStart]) -> list[RatedStart]:
+    """Drop effects at all places that leave hardly less than the same effect at one place.
+
+    Their fits take longer, because they have a coefficient for each place.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        rated_starts: costs and starts with one effect each.
+    """
+    costs = {start.effects[0]: cost for cost, start in rated_starts}
+    effects = context.evaluator.available_effects
+    return [
+        (cost, start)
+        for cost, start in rated_starts
+        if not any(
+            member.name != start.effects[0]
+            and costs.get(member.name, np.inf) < (1.0 + MIN_FAMILY_SQUARES_SHARE) * cost
+            for member in members_of(effects[start.effects[0]])
+        )
+    ]
 
 
 def _try_scaled(
