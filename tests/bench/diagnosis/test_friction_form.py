@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from bench.diagnosis import friction_form_verdict
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
@@ -173,6 +174,23 @@ def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
     assert read_extended(paths["extended.toml"]).robot.friction_form == "soft"
     assert "solreffriction=" not in paths["extended.xml"].read_text()
     assert score_model(paths["extended.xml"], path)["normalised_rmse"] < 1.1
+
+
+@pytest.mark.parametrize(("soft_cost", "is_soft"), [(90.0, True), (110.0, False)])
+def test_a_soft_form_that_is_likelier_must_leave_a_smaller_residual(
+    monkeypatch, soft_cost, is_soft
+):
+    """With autocorrelated noise, a smoother residual may be likelier although it is larger."""
+
+    def make_model(cost, log_likelihood):
+        return SimpleNamespace(
+            fit=SimpleNamespace(cost=cost), likelihood=SimpleNamespace(value=log_likelihood)
+        )
+
+    soft = make_model(soft_cost, 50.0)
+    monkeypatch.setattr(friction_form_verdict, "_refit_with_other_form", lambda *_: soft)
+    chosen = friction_form_verdict.choose_friction_form(None, make_model(100.0, 0.0), None, 10.0)
+    assert (chosen is soft) == is_soft
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,15 @@ def test_effects_that_regression_missed_are_tried_unless_a_force_is_replaced(
             penalty=lambda _: 10.0,
             compute_gain=lambda followed: 2.0 * followed.log_likelihood,
         ),
+        columns=SimpleNamespace(library=SimpleNamespace(probes=())),
+        extended_sets={},
     )
     compared = competing_models.try_one_more_effect(context, _follow((), 0.0, 1.0))
     assert compared[0].names == ("b",)
     assert set(tried) == set(expected)
+    # A filter that is hardly likelier has the same extensions; one that is much likelier has not.
+    count = len(tried)
+    assert competing_models.try_one_more_effect(context, _follow((), 5.0, 1.0)) is compared
+    assert len(tried) == count
+    competing_models.try_one_more_effect(context, _follow((), 100.0, 1.0))
+    assert len(tried) > count

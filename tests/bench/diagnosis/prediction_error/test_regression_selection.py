@@ -98,6 +98,18 @@ def test_what_helps_one_run_alone_is_not_selected(rows):
     assert not regression.generalises([], [singles()[2]])
 
 
+def test_an_effect_generalises_although_one_run_alone_determines_a_coefficient(rows):
+    """In the other runs, a small imitation makes that coefficient ten times too large."""
+    rows[:3, :, 1] *= 0.01
+    target = rows[:, :, 0] + 0.5 * rows[:, :, 1] + 0.1 * noise()
+    target[:3] += 5.0 * rows[:3, :, 1]
+    effect = DirectionGroup("effect", (0, 1), (False, False))
+    regression = regression_of(rows, target, [effect])
+    others = regression._compute_left_out_rss([effect])
+    assert others[3] > 5.0 * regression._compute_left_out_rss([])[3]
+    assert regression.generalises([], [effect])
+
+
 def test_an_effect_of_the_model_is_put_back(rows):
     """Without the model's own effect, the regression is that about the base model."""
     whole = rows[:, :, 0]
