@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +25,11 @@ from sims.core.effect import (
     Sensor,
 )
 from sims.core.simulator import Array, InputError, Scenario, Simulator
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from sims.robot.robot_simulator import RobotSimulator
 
 NO_PLACE = NotApplicable("a robot has no place for it")
 _TESTED_RANGE_SHARES = (0.3, 0.9)
@@ -84,7 +91,10 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
     do.
     """
     classes = list_effect_places(effect)
+    if not classes:
+        return NO_PLACE
     kind = make_arm_simulator(effect)
+    base_observations = _simulate_arm(kind, np.empty((1, 0)))
     for effect_class in classes:
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         c = np.zeros((len(effect_class.coefficients), 2, 1))
@@ -95,19 +105,14 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
         lanes = np.concatenate(
             [_make_coefficients(effect_class, 0.0), _make_coefficients(effect_class, 0.7)]
         )
-        observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
-            lanes, make_scenario()
-        )
-        base_observations = kind(observe=OBSERVED_CHANNELS).simulate(
-            np.empty((1, 0)), make_scenario()
-        )
+        observations = _simulate_arm(kind, lanes, [effect_class])
         check(
             is_bitwise_equal(observations[:1] + 0.0, base_observations + 0.0),
             "the plain motion at zero",
             "other",
             location,
         )
-    return None if classes else NO_PLACE
+    return None
 
 
 def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | None:
@@ -116,52 +121,58 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     The observations must be finite at 0.9 of the plausible range.
     """
     classes = list_effect_places(effect)
+    if not classes:
+        return NO_PLACE
     kind = make_arm_simulator(effect)
+    base_observations = _simulate_arm(kind, np.empty((1, 0)))
     fields_by_part = {}
     for effect_class in classes:
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         thetas = np.concatenate(
             [_make_coefficients(effect_class, share) for share in (0.05, *_TESTED_RANGE_SHARES)]
         )
-        observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
-            thetas, make_scenario()
-        )
-        base_observations = kind(observe=OBSERVED_CHANNELS).simulate(
-            np.empty((1, 0)), make_scenario()
-        )
+        observations = _simulate_arm(kind, thetas, [effect_class])
         # Only the last element is tested: at the low end of its range, a force may destabilise a
         # joint.
         check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", location)
-        is_observable = effect_class.signal in ("", *OBSERVED_CHANNELS) or not issubclass(
-            effect_class, Sensor
-        )
+        signal = effect_class.signal if issubclass(effect_class, Sensor) else ""
+        is_observable = signal in ("", *OBSERVED_CHANNELS)
+        changed = (observations != base_observations).any(axis=(0, 1))
         check(
-            bool((observations != base_observations).any()) == is_observable,
+            bool(changed.any()) == is_observable,
             "a change in the channels it affects",
             "none",
             location,
         )
-        if issubclass(effect_class, Sensor) and effect_class.signal in OBSERVED_CHANNELS:
-            other_channels = [
-                i for i, name in enumerate(OBSERVED_CHANNELS) if name != effect_class.signal
-            ]
-            is_same = bool(
-                (
-                    observations[:, :, other_channels] == base_observations[:, :, other_channels]
-                ).all()
-            )
-            check(is_same, "other channels unchanged", "changes", location)
+        if signal and is_observable:
+            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != signal]
+            check(not changed[others].any(), "other channels unchanged", "changes", location)
         for part, coefficients in effect_class().parts(
             np.ones((len(effect_class.coefficients), 2, 1))
         ):
             fields_by_part[part.name] = _acts_on(part, coefficients, kind)
-    are_disjoint = len(
-        {changed_fields for changed_fields in fields_by_part.values() if changed_fields}
-    ) == sum(map(bool, fields_by_part.values()))
+    changing = [fields for fields in fields_by_part.values() if fields]
     check(
-        are_disjoint, "each place to be changed by one effect only", fields_by_part, effect.__name__
+        len(set(changing)) == len(changing),
+        "each place to be changed by one effect only",
+        fields_by_part,
+        effect.__name__,
     )
-    return None if classes else NO_PLACE
+    return None
+
+
+def _simulate_arm(
+    kind: type[RobotSimulator], parameter_sets: Array, effects: Sequence[type[Effect]] = ()
+) -> Array:
+    """Simulate observations (n, T, C) of the arm.
+
+    Args:
+        kind: simulator class of the arm.
+        parameter_sets: (n, P) parameters of the effects.
+        effects: effects that the arm has.
+    """
+    simulator = kind(observe=OBSERVED_CHANNELS, effects=effects)
+    return simulator.simulate(parameter_sets, make_scenario())
 
 
 def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
@@ -178,16 +189,13 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
     ]
     for family in families:
         members = [type(member) for member in family.members]
-        effect_class = kind(observe=OBSERVED_CHANNELS, effects=[family])
-        members_simulator = kind(observe=OBSERVED_CHANNELS, effects=members)
         # A family with one coefficient applies it at every place.
-        shared = len(effect_class.parameters) < len(members_simulator.parameters)
+        shared = len(family.coefficients) < sum(len(member.coefficients) for member in members)
         theta = _make_coefficients(family, 0.3)
         member_theta = np.tile(theta, len(members)) if shared else theta
         check(
             is_bitwise_equal(
-                effect_class.simulate(theta, make_scenario()),
-                members_simulator.simulate(member_theta, make_scenario()),
+                _simulate_arm(kind, theta, [family]), _simulate_arm(kind, member_theta, members)
             ),
             "the motion of all members of the family together",
             "another",
@@ -290,16 +298,12 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
 
     native = MODEL_FIELD_EFFECTS[effect.of]
     robot = add_elements(kind.robot, list_added_elements(effect))  # type: ignore[attr-defined]
-    fields, changes = {}, []
-    for name in native.fields:
-        owner, _, field = name.rpartition(".")
-        field_value = getattr(robot.compiled.opt if owner else robot.compiled, field)
-        fields[name] = np.repeat(np.array(field_value)[None], 2, axis=0)
-    values_before = {name: values.copy() for name, values in fields.items()}
-    native.write(fields, robot, effect.place, c[:, :, 0])
-    for name, values in fields.items():
-        places = np.nonzero(values != values_before[name])[1]
-        changes += [(name, int(place)) for place in np.unique(places)]
+    changed = _compare_fields(
+        robot.compiled,
+        native.fields,
+        lambda fields: native.write(fields, robot, effect.place, c[:, :, 0]),
+    )
+    changes = [(name, place) for name, places in changed.items() for place in places]
     # Fields indexed by place must change at one place; fields of the world are indexed by axis.
     if effect.place and len({place for _, place in changes}) > 1:
         raise CheckError(f"expected one place; found {changes}; see {effect.name}")
@@ -319,15 +323,34 @@ def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[obj
     if not c.any():
         return ()
     robot = series_joints.add_series_joints(kind.robot, ((effect.place, effect.of),))  # type: ignore[attr-defined]
-    model = robot.compiled
-    fields = {
-        name: np.repeat(np.array(getattr(model, name))[None], 2, 0)
-        for name in series_joints.USED_FIELDS
-    }
-    values_before = {name: values.copy() for name, values in fields.items()}
-    series_joints.write_series_effects(fields, robot, ((effect, c),))
-    changed = [name for name, values in fields.items() if (values != values_before[name]).any()]
+    changed = _compare_fields(
+        robot.compiled,
+        series_joints.USED_FIELDS,
+        lambda fields: series_joints.write_series_effects(fields, robot, ((effect, c),)),
+    )
     return tuple((name, effect.place) for name in changed)
+
+
+def _compare_fields(
+    model: mujoco.MjModel, names: Sequence[str], write: Callable[[dict[str, Array]], None]
+) -> dict[str, list[int]]:
+    """Return the fields of a model that a function changes, with the indices that it changes.
+
+    Args:
+        model: model with the initial values.
+        names: names of the fields that may change, such as ``dof_damping`` or ``opt.gravity``.
+        write: changes fields (2, ...) of two batch elements.
+    """
+    values_before = {
+        name: np.repeat(np.array(attrgetter(name)(model))[None], 2, axis=0) for name in names
+    }
+    fields = {name: values.copy() for name, values in values_before.items()}
+    write(fields)
+    changed = {
+        name: np.unique(np.nonzero(fields[name] != values)[1]).tolist()
+        for name, values in values_before.items()
+    }
+    return {name: places for name, places in changed.items() if places}
 
 
 def _find_forced_coordinates(

@@ -38,7 +38,6 @@ from bench.conformance.sample_subjects import (
     make_task,
     make_trained_tuner,
     run_tuner,
-    simulate_toy_problem,
 )
 from methods.tuner import Evaluation, Proposal, Task, Tuner, TunerGenerator
 from sims.core.simulator import Array
@@ -201,42 +200,73 @@ def check_budget_is_exact(kind: type[Tuner]) -> None:
         check(is_exact, f"{budget} simulations", used_simulations, f"{kind.__name__}.tune")
 
 
-def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
-    """Check that the tuner does not write to the task and the evaluations of the harness.
+class _InspectedTuner(Tuner):
+    """Tuner under test, whose proposals and received arrays are kept.
 
-    The tuner runs for up to ten steps. Every array that it receives is copied before and compared
-    afterwards.
+    The harness would clip the proposals, and its arrays are read-only: a tuner that writes to them
+    would crash before the check could report it. Here it receives copies.
 
-    Args:
-        kind: Tuner class under test.
+    Attributes:
+        proposals: (n, dim) proposed and recommended points.
+        received: arrays that the tuner received, each with its original.
     """
-    task, _ = make_task(2, 20)
-    task = replace(
-        task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy()
-    )
-    # Writable copies: with read-only arrays, the tuner would crash before the check could report
-    # it.
-    arrays = [task.start, task.observed, task.scale, task.training]
-    copies = [array.copy() for array in arrays]
-    steps = make_trained_tuner(kind, 2).tune(task, np.random.default_rng(0))
-    try:
-        proposal = next(steps)
-        for _ in range(10):
-            points = np.array(
-                proposal[0] if isinstance(proposal, Proposal) else proposal,
-                dtype=np.float64,
-                ndmin=2,
-            ).clip(0.0, 1.0)
-            observations = simulate_toy_problem(points)
-            losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
-            received = [points, observations, losses]
-            arrays, copies = arrays + received, copies + [array.copy() for array in received]
-            proposal = steps.send(Evaluation(points, observations, losses))
-    except StopIteration:
-        pass
-    finally:
-        steps.close()
-    changed = [a.shape for a, b in zip(arrays, copies, strict=True) if not is_bitwise_equal(a, b)]
+
+    def __init__(self, tuner: Tuner) -> None:
+        """Wrap a trained tuner."""
+        self.tuner = tuner
+        self.proposals: list[Array] = []
+        self.received: list[tuple[Array, Array]] = []
+
+    def _copy(self, original: Array) -> Array:
+        copied = original.copy()
+        self.received.append((copied, original))
+        return copied
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Run the tuner unchanged, and keep what it proposes and receives.
+
+        Args:
+            task: number of parameters and budget.
+            rng: random numbers of the tuner.
+        """
+        copied_task = replace(
+            task,
+            start=self._copy(task.start),
+            observed=self._copy(task.observed),
+            scale=self._copy(task.scale),
+            training=self._copy(task.training),
+        )
+        steps = self.tuner.tune(copied_task, rng)
+        try:
+            proposal = next(steps)
+            while True:
+                points, recommended = (
+                    proposal if isinstance(proposal, Proposal) else (proposal, None)
+                )
+                self.proposals += [np.atleast_2d(p) for p in (points, recommended) if p is not None]
+                # Let the harness simulate the points, and pass the result on to the tuner.
+                evaluation = yield proposal
+                proposal = steps.send(Evaluation(*map(self._copy, evaluation)))
+        except StopIteration as stop:
+            return str(stop.value)
+        finally:
+            steps.close()
+
+
+def _inspect_run(kind: type[Tuner]) -> _InspectedTuner:
+    """Run the tuner under test on the toy problem with 30 simulations, and return what it did."""
+    inspected = _InspectedTuner(make_trained_tuner(kind, 2))
+    run_tuner(inspected, 2, 30)
+    return inspected
+
+
+def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
+    """Check that the tuner does not write to the task and the evaluations of the harness."""
+    changed = [
+        original.shape
+        for copied, original in _inspect_run(kind).received
+        if not is_bitwise_equal(copied, original)
+    ]
     check(
         not changed,
         "unchanged arguments",
@@ -250,40 +280,7 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
 
     The harness would clip others without informing the tuner.
     """
-    proposals: list[Array] = []
-
-    # A wrapper around the tuner, because the harness's loop clips what it records.
-    class Watched(Tuner):
-        def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-            """Run the tuner unchanged, and collect its proposals and recommendations.
-
-            They are appended to `proposals`, where the check reads them after the run.
-
-            Args:
-                task: number of parameters and budget.
-                rng: random numbers of the tuner.
-            """
-            # The tuner under test, trained for two parameters.
-            steps = make_trained_tuner(kind, 2).tune(task, rng)
-            try:
-                proposal = next(steps)
-                while True:
-                    points, recommended = (
-                        proposal if isinstance(proposal, Proposal) else (proposal, None)
-                    )
-                    proposals.extend(
-                        np.atleast_2d(p) for p in (points, recommended) if p is not None
-                    )
-                    # Let the harness simulate the points, and pass the result on to the tuner.
-                    evaluation = yield proposal
-                    proposal = steps.send(evaluation)
-            except StopIteration as stop:
-                return str(stop.value)
-            finally:
-                steps.close()
-
-    run_tuner(Watched(), 2, 30)
-    all_points = np.concatenate(proposals)
+    all_points = np.concatenate(_inspect_run(kind).proposals)
     outside = all_points[~((all_points >= 0.0) & (all_points <= 1.0)).all(axis=1)]
     check(not len(outside), "points inside the unit cube", outside[:1], f"{kind.__name__}.tune")
 
