@@ -14,7 +14,7 @@ from bench.diagnosis_benchmark.result_tables import (
     P_VALUE_LEVELS,
     PRIMARY_METRIC,
     REFERENCE_DIAGNOSER,
-    SET_SIZE_LABELS,
+    SET_SIZE_BINS,
     TARGET_FALSE_ALARM_RATE,
     build_failure_table,
     index_by_diagnoser,
@@ -152,7 +152,7 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     shares = table[table["metric"].isin(metric_position)]
     levels = pd.DataFrame({"diagnoser": "", "level": P_VALUE_LEVELS, "share": P_VALUE_LEVELS})
     calibration, sets = data.tables["calibration"], data.tables["sets"]
-    sizes = {label: position for position, label in enumerate(SET_SIZE_LABELS)}
+    sizes = {label: position for position, label in enumerate(SET_SIZE_BINS)}
     return {
         "board": leaderboard.dropna(subset="alarms"),
         "shares": shares.assign(place=shares["metric"].map(metric_position)),
@@ -260,7 +260,7 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
     Args:
         data: graded answers and result tables of all diagnosers.
     """
-    x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
+    x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_BINS))
     correct = data.make_interval_series(is_shifted=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)
     share_axis = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)

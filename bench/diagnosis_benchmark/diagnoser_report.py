@@ -114,19 +114,17 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
     # Width and height in inches, with the space for each diagnoser.
     figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
-    bar_positions = np.arange(len(order))[::-1]
+    styles = {outcome: look for outcome, *look in OUTCOME_STYLES}
+    counts = pd.crosstab(rows["diagnoser"], rows["outcome"]).reindex(
+        index=list(order), columns=list(styles), fill_value=0
+    )
+    total = max(int(counts.sum(axis=1).max()), 1)
     bar_starts = np.zeros(len(order))
-    total = max(int((rows["diagnoser"] == name).sum()) for name in order)
-    for outcome, colour, label in OUTCOME_STYLES:
-        counts = [
-            int(((rows["diagnoser"] == name) & (rows["outcome"] == outcome)).sum())
-            for name in order
-        ]
-        if not any(counts):
-            continue
-        widths = 100.0 * np.array(counts) / max(total, 1)
-        axis.barh(
-            bar_positions,
+    for outcome in counts.columns[counts.any()]:
+        colour, label = styles[outcome]
+        widths = 100.0 * counts[outcome].to_numpy() / total
+        bars = axis.barh(
+            list(order),
             widths,
             left=bar_starts,
             color=colour,
@@ -134,23 +132,17 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
             linewidth=0.5,
             label=label,
         )
-        for bar_position, width, bar_start, count in zip(
-            bar_positions, widths, bar_starts, counts, strict=True
-        ):
+        is_dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
+        axis.bar_label(
+            bars,
             # A narrower part has no room for its number.
-            if width > 4:
-                is_dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
-                axis.text(
-                    bar_start + width / 2,
-                    bar_position,
-                    str(count),
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if is_dark else style.NEUTRAL_MARK,
-                )
+            [str(n) if width > 4 else "" for n, width in zip(counts[outcome], widths, strict=True)],
+            label_type="center",
+            fontsize=8,
+            color="white" if is_dark else style.NEUTRAL_MARK,
+        )
         bar_starts += widths
-    axis.set_yticks(bar_positions, order)
+    axis.invert_yaxis()
     axis.set_xlim(0, 100)
     axis.set_xlabel("recordings with one hidden effect of at least one noise [%]")
     style.style_axis(axis)

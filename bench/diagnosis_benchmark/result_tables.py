@@ -31,8 +31,6 @@ REFERENCE_DIAGNOSER = "simgap"
 """Diagnoser with which all others are compared."""
 SET_SIZE_BINS = {"1": (1, 1), "2": (2, 2), "3 to 4": (3, 4), "5 or more": (5, 10**6)}
 """Bins of set sizes, as inclusive (low, high), by label."""
-SET_SIZE_LABELS = tuple(SET_SIZE_BINS)
-"""Labels of the bins of set sizes."""
 CONDITIONS = ("system", "noise", "stated", "rate", "runs", "source", "driven")
 """Recording conditions by which answers are counted."""
 
@@ -143,26 +141,6 @@ PAIR_METRICS = (
 """Metrics by which each diagnoser is compared with simgap."""
 
 
-def _build_diagnoser_table(
-    rows: pd.DataFrame,
-    order: Sequence[str],
-    list_lines: Callable[[pd.DataFrame], Iterator[TableRow]],
-) -> pd.DataFrame:
-    """Build a table from the lines of each diagnoser; its first column is the diagnoser's name.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-        list_lines: lists the lines of one diagnoser from its rows.
-    """
-    lines = [
-        {"diagnoser": name, **line}
-        for name in order
-        for line in list_lines(rows[rows["diagnoser"] == name])
-    ]
-    return pd.DataFrame(lines)
-
-
 def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of table.csv for one diagnoser: the fraction of each metric.
 
@@ -249,15 +227,15 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
         rows: one row per answer.
         order: names of the diagnosers.
     """
-    graded_rows = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
+    graded_rows = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)]
     # Cases without an effect of the library are counted under their kind, as "(clean)".
-    graded_rows["hidden"] = graded_rows["hidden"].where(
+    hidden = graded_rows["hidden"].where(
         graded_rows["kind"] == "single", "(" + graded_rows["kind"] + ")"
     )
     answers = zip(graded_rows["verdict"].astype(str), graded_rows["named"].astype(str), strict=True)
-    graded_rows["said"] = [
-        _get_confusion_column(verdict, named_effects) for verdict, named_effects in answers
-    ]
+    graded_rows = graded_rows.assign(
+        hidden=hidden, said=[_get_confusion_column(*answer) for answer in answers]
+    )
     counted = graded_rows.groupby(["diagnoser", "hidden", "said"]).size()
     counts: pd.DataFrame = counted.rename("count").reset_index()
     return counts
@@ -292,7 +270,6 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     """
     columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
     lines = []
-    other_diagnosers = [name for name in order if name != REFERENCE_DIAGNOSER]
     for metric in PAIR_METRICS:
         part = metric.select(rows)
         results_by_diagnoser = part.assign(right=metric.predicate(part)).pivot(
@@ -300,13 +277,13 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
         )
         if REFERENCE_DIAGNOSER not in results_by_diagnoser:
             continue
-        for name in other_diagnosers:
-            if name not in results_by_diagnoser:
+        for name in order:
+            if name == REFERENCE_DIAGNOSER or name not in results_by_diagnoser:
                 continue
             # Cases without a result of either of the two are left out.
-            pairs = results_by_diagnoser[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
-            only_simgap = int((pairs[REFERENCE_DIAGNOSER] & ~pairs[name]).sum())
-            only_other = int((~pairs[REFERENCE_DIAGNOSER] & pairs[name]).sum())
+            pairs = results_by_diagnoser[[REFERENCE_DIAGNOSER, name]].dropna().astype(int)
+            advantages = pairs[REFERENCE_DIAGNOSER] - pairs[name]
+            only_simgap, only_other = int((advantages > 0).sum()), int((advantages < 0).sum())
             p_value = compute_mcnemar_p_value(only_simgap, only_other)
             lines.append((metric.name, name, len(pairs), only_simgap, only_other, p_value))
     frame = pd.DataFrame(lines, columns=columns)
@@ -368,32 +345,34 @@ def build_all_tables(
         order: names of the diagnosers.
         training: rows of training.csv.
     """
-    costs = _build_diagnoser_table(rows, order, _list_costs)
-    for column, kind in (("simulations", int), ("seconds", float)):
-        costs[f"training_{column}"] = [
-            sum(
-                kind(training_cost[column])
-                for training_cost in training
-                if training_cost["diagnoser"] == name
-            )
-            for name in order
-        ]
-    calibration = _build_diagnoser_table(rows, order, _list_calibration)
-    if calibration.empty:
-        names = ["diagnoser", "level", "count", "of", "share", "low", "high"]
-        calibration = pd.DataFrame(columns=names)
+    lines: dict[str, list[TableRow]] = {name: [] for name in _LINES_OF_TABLES}
+    for name in order:
+        diagnoser_rows = rows[rows["diagnoser"] == name]
+        for table, list_lines in _LINES_OF_TABLES.items():
+            lines[table] += [{"diagnoser": name, **line} for line in list_lines(diagnoser_rows)]
+    for line in lines["costs"]:
+        costs = [cost for cost in training if cost["diagnoser"] == line["diagnoser"]]
+        line["training_simulations"] = sum(int(cost["simulations"]) for cost in costs)
+        line["training_seconds"] = sum(float(cost["seconds"]) for cost in costs)
     return {
-        "table": _build_diagnoser_table(rows, order, _list_metrics),
-        "groups": _build_diagnoser_table(rows, order, _list_groups),
-        "power": _build_diagnoser_table(rows, order, _list_power),
+        **{
+            table: pd.DataFrame(part, columns=[column.name for column in TABLE_COLUMNS[table]])
+            for table, part in lines.items()
+        },
         "confusion": build_confusion_table(rows, order),
-        "calibration": calibration,
-        "sets": _build_diagnoser_table(rows, order, _list_set_sizes),
-        "costs": costs,
         "pairs": build_pair_table(rows, order),
     }
 
 
+_LINES_OF_TABLES: dict[str, Callable[[pd.DataFrame], Iterator[TableRow]]] = {
+    "table": _list_metrics,
+    "groups": _list_groups,
+    "power": _list_power,
+    "calibration": _list_calibration,
+    "sets": _list_set_sizes,
+    "costs": _list_costs,
+}
+"""Functions that list the lines of one diagnoser in a table, from its rows, by table."""
 FAILURE_COLUMNS = (
     "diagnoser",
     "question",
@@ -421,13 +400,9 @@ def is_correct(rows: pd.DataFrame) -> pd.Series[bool]:
     most two, equivalent effects counted once; for an unmodelled cause, the statement that no effect
     of the library explains it.
     """
-    by_kind = {
-        "clean": ~rows["alarm"].astype(bool),
-        "foreign": rows["outcome"] == "right",
-    }
     is_right = rows["found_class"].astype(bool)
-    for kind, is_right_for_kind in by_kind.items():
-        is_right = is_right.where(rows["kind"] != kind, is_right_for_kind)
+    is_right = is_right.where(rows["kind"] != "clean", ~rows["alarm"].astype(bool))
+    is_right = is_right.where(rows["kind"] != "foreign", _is_right(rows))
     return is_right & (rows["status"] == "done")
 
 
