@@ -42,9 +42,20 @@ class Question(ABC):
             UndrawableError: there is none.
         """
 
+    def restore(self, saved):
+        """Return the `Case` of an earlier drawing, from the result of `Case.save`."""
+        raise NotImplementedError
+
 
 class Case(ABC):
     """A recording with a known cause."""
+
+    def save(self):
+        """Return a dictionary for `Question.restore`; empty if drawing is fast.
+
+        Other versions then need not draw the case again.
+        """
+        return {}
 
     @abstractmethod
     def write(self, folder):

@@ -74,7 +74,12 @@ def run_exam(questions, folder, call, version, seed=0, jobs=2, fresh=False, agai
         is_poor = row["case"] is not None and not row["mark"]["equivalent"]
         return not own or not (fresh or (again and is_poor))
 
-    rows = [row for row in read_rows(path) if is_kept(row)]
+    rows = read_rows(path)
+    # Drawing a case may take as long as answering it, so it is done once for all versions.
+    saved = {
+        row["item"]: row["saved"] for row in rows if (row.get("saved") or {}).get("seed") == seed
+    }
+    rows = [row for row in rows if is_kept(row)]
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     answered = {row["item"] for row in rows if row["version"] == version}
     os.environ.update(ONE_THREAD)
@@ -84,7 +89,9 @@ def run_exam(questions, folder, call, version, seed=0, jobs=2, fresh=False, agai
     with pool, path.open("a") as file:
         futures = {
             pool.schedule(
-                answer_question, [q, seed, call, work], timeout=WALL_FACTOR * call.cpu_limit
+                answer_question,
+                [q, seed, call, work, saved.get(q.name)],
+                timeout=WALL_FACTOR * call.cpu_limit,
             ): q
             for q in questions
             if q.name not in answered
@@ -103,6 +110,15 @@ def run_exam(questions, folder, call, version, seed=0, jobs=2, fresh=False, agai
     return [row for row in read_rows(path) if row["item"] in names]
 
 
+def list_saved(rows, seed):
+    """Return the cases that a version has drawn with a seed, by question.
+
+    Drawing a case may take as long as answering it, so it is done once for all versions.
+    """
+    drawn = [(row["item"], row["saved"]) for row in rows if "saved" in row]
+    return {item: saved for item, saved in drawn if saved["seed"] == seed}
+
+
 def _row_of(future, question):
     try:
         return future.result()
@@ -118,8 +134,16 @@ def _identity(question):
     return names | {"system": question.system, "effect": question.effect}
 
 
-def answer_question(question, seed, call, work):
-    """Draw the case, write and explain its recording, grade the answer, and return the row."""
+def answer_question(question, seed, call, work, saved=None):
+    """Draw the case, write and explain its recording, grade the answer, and return the row.
+
+    Args:
+        question: the question.
+        seed: seed of the case.
+        call: `ExplainCall`.
+        work: folder for recordings and answers.
+        saved: seed and case of an earlier drawing, which is used; None to draw.
+    """
     row = _identity(question)
     place = work / question.name.replace("/", "-").replace(" ", "-")
     shutil.rmtree(place, ignore_errors=True)
@@ -128,13 +152,15 @@ def answer_question(question, seed, call, work):
         # MuJoCo warns about deprecated attributes in old model files.
         warnings.simplefilter("ignore")
         try:
-            case = question.draw(seed)
+            case = question.restore(saved["case"]) if saved else question.draw(seed)
             recording = case.write(place / "recording")
         except UndrawableError as error:
             return row | {"case": None, "message": str(error)}
         outcome = case.answer(recording, place / "answer", call)
         mark = case.mark(outcome)
     row |= {"case": case.describe(), "digest": digest(place / "recording")}
+    if fields := case.save():
+        row |= {"saved": {"seed": seed, "case": fields}}
     return row | {"mark": mark.to_json()} | outcome.to_json()
 
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -112,6 +113,54 @@ def test_an_interrupted_exam_continues_and_versions_share_a_folder(tmp_path, cap
     assert main([*clean, "--version", "one", "--count", "1", "--fresh"]) == 1
     failed = {path.name for path in out.iterdir()}
     assert failed == {"items.jsonl", "items.csv", "summary.csv", "README.md", "figures"}
+
+
+class SavedCase(exam.Case):
+    """A case that answers itself and can be saved."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def save(self):
+        return {"number": self.number}
+
+    def write(self, folder):
+        (folder / "log.csv").write_text(str(self.number))
+
+    def describe(self):
+        return {"hidden": str(self.number), "size": "1", "noise": "white", "conditions": ""}
+
+    def mark(self, outcome):
+        return Mark("right")
+
+    def answer(self, recording, out, call):
+        return explain_calls.Outcome(ADEQUATE, 0)
+
+
+class SavedQuestion(exam.Question):
+    """A question whose case is another one whenever it is drawn."""
+
+    name, kind, system, effect = "single/a", "single", "a", "drag.linear"
+    numbers = count()
+
+    def draw(self, seed):
+        return SavedCase(next(self.numbers))
+
+    def restore(self, saved):
+        return SavedCase(**saved)
+
+
+def test_a_case_is_drawn_once_for_all_versions(tmp_path):
+    """The case depends on the seed, so that another seed is drawn."""
+    question = SavedQuestion()
+    first = runner.answer_question(question, 0, None, tmp_path)
+    again = runner.answer_question(question, 0, None, tmp_path, saved=first["saved"])
+    assert (first["case"], first["digest"]) == (again["case"], again["digest"])
+    assert first["saved"] == again["saved"] == {"seed": 0, "case": {"number": 0}}
+    assert runner.answer_question(question, 0, None, tmp_path)["case"]["hidden"] == "1"
+    rows = [first | {"version": "one"}]
+    assert runner.list_saved(rows, seed=0) == {"single/a": first["saved"]}
+    assert runner.list_saved(rows, seed=1) == {}
 
 
 def test_an_unknown_case_name_is_refused(tmp_path, capsys):

@@ -7,7 +7,7 @@ of this folder make the recordings, not MuJoCo, which explains them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -77,6 +77,10 @@ class RobotQuestion(Question):
                 return case
         raise UndrawableError("these commands and this machine do not show the cause")
 
+    def restore(self, saved):
+        effects = {name: tuple(values) for name, values in saved["effects"].items()}
+        return RobotCase(**saved | {"effects": effects, "channels": tuple(saved["channels"])})
+
 
 @dataclass(frozen=True)
 class RobotCase(Case):
@@ -111,6 +115,9 @@ class RobotCase(Case):
     numerics: float
     step: float
     integrator: str
+
+    def save(self):
+        return asdict(self)
 
     def write(self, folder):
         return write_setting(self, setting_of(self.name), folder)

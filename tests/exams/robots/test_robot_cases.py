@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
 from sims.core.root_mean_square import compute_rms
+from tests.exams import runner
 from tests.exams.robots import planted_effects, robot_cases
 from tests.exams.robots.cause_sizing import CompetingCauses
 from tests.exams.robots.reference_world import Run, World
@@ -35,6 +37,15 @@ def test_a_case_is_determined_by_its_name(item):
         assert {name: u.tolist() for name, u in run.commands.items()} == {
             name: u.tolist() for name, u in other.commands.items()
         }
+
+
+def test_a_saved_case_has_the_same_recording(item, tmp_path):
+    question = robot_cases.RobotQuestion("single", "arm2-servo", "friction.coulomb", 0)
+    restored = question.restore(json.loads(json.dumps(item.save())))
+    assert restored == item
+    item.write(tmp_path / "drawn")
+    restored.write(tmp_path / "restored")
+    assert runner.digest(tmp_path / "drawn") == runner.digest(tmp_path / "restored")
 
 
 def test_a_hidden_cause_has_the_stated_size(item):
