@@ -20,9 +20,9 @@ from bench.benchmark.statistics.comparison_statistics import (
     IDENTIFIABILITY_COLUMNS,
     ComparisonStatistics,
 )
-from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.benchmark.storage.result_folder import StoredComparison
+from bench.benchmark.storage.table_schemas import ERROR_FLOOR
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,

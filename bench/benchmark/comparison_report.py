@@ -1,10 +1,14 @@
-"""Write the tables, figures and report page of a comparison, and print a summary."""
+"""Write the tables, figures and report page of a comparison, and print a summary.
+
+The figures can also be drawn again with reference results in grey behind the error curves.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -20,6 +24,7 @@ from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE, without_i
 from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.error_curves import build_summary
+from bench.benchmark.storage.reference_results import ReferenceResult
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     StoredComparison,
@@ -28,9 +33,15 @@ from bench.benchmark.storage.result_folder import (
 )
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
+from bench.figures.figure_output import (
+    FigureFiles,
+    render_all_formats,
+    write_figure,
+    write_figures,
+)
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
+from sims.core.simulator import InputError
 
 REQUIRED_RUN_COLUMNS = (
     "run",
@@ -108,6 +119,49 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
         print_line(line)
     # A tuner that cannot be used here does not count as a failure of the comparison.
     return int((failed["status"] != "skipped").sum())
+
+
+def draw_with_references(
+    folder: Path,
+    references: Sequence[ReferenceResult],
+    out: Path,
+    print_line: Callable[[str], None],
+    before: str = "",
+) -> list[dict[str, Any]]:
+    """Draw a comparison's figures again with references behind them, as separate files.
+
+    Args:
+        folder: folder of the comparison.
+        references: reference results to draw.
+        out: folder in whose subfolder ``figures`` the files are written.
+        print_line: callback that prints one line; it gets differences of the references, and files.
+        before: prefix of the file names.
+
+    Returns:
+        JSON document of each reference, with its differences and the files.
+
+    Raises:
+        InputError: a reference belongs to another problem, or there are too many.
+    """
+    stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
+    if stored.runs.empty:
+        raise InputError(f"{folder}: contains no runs")
+    comparison_figures.check_references_allowed(
+        stored, comparison_figures.OVERLAYABLE_FIGURES[0], references
+    )
+    labels = make_axis_labels(stored.experiment)
+    for reference in references:
+        print_line(f"behind  {reference.provenance_text}")
+        for line in reference.find_mismatches(stored.experiment):
+            print_line(f"differs {line}")
+    files = []
+    for name in comparison_figures.list_figure_names(stored):
+        if name in comparison_figures.OVERLAYABLE_FIGURES:
+            figure = comparison_figures.draw_figure(stored, labels, name, references=references)
+            file_name = f"{before}{comparison_figures.FIGURE_FILES[name]}-behind"
+            files += write_figure(figure, out / "figures" / file_name)
+            print_line(f"figure  {files[-2]}")
+    return [reference.to_document(stored.experiment, files) for reference in references]
 
 
 def _render_figures(view: ComparisonView) -> dict[str, FigureFiles]:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.benchmark.statistics.error_floor import ERROR_FLOOR
+from bench.benchmark.storage.table_schemas import ERROR_FLOOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,9 @@ paper. `simgap verify` checks whether an archive made elsewhere is consistent.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
+import shutil
 import stat
 import zipfile
 import zlib
@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from bench import __version__
 from bench.benchmark.storage.provenance import (
@@ -105,8 +105,7 @@ def write_archive(
                     place.open("rb") as source,
                     packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
                 ):
-                    while block := source.read(_BLOCK_BYTES):
-                        target.write(block)
+                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
     except OSError as error:
         raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
 
@@ -153,9 +152,11 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
             for entry in entries:
                 path = Path(folder, *PurePosixPath(entry.filename).parts)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                sizes_and_hashes[entry.filename.removeprefix(f"{top_folder}/")] = _unpack_file(
-                    archive, packed, entry, path
-                )
+                # No more bytes are read than the entry states, however many it contains.
+                with packed.open(entry) as source, path.open("wb") as target:
+                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
+                name = entry.filename.removeprefix(f"{top_folder}/")
+                sizes_and_hashes[name] = path.stat().st_size, compute_sha256(path)
             del sizes_and_hashes[MANIFEST_FILE]
             yield UnpackedArchive(
                 Path(folder, top_folder),
@@ -267,41 +268,6 @@ def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str
         raise InputError(f"{archive}: {MANIFEST_FILE}: {violations[0]}")
     checked: dict[str, Any] = manifest
     return checked
-
-
-def _unpack_file(
-    archive: Path, packed: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path
-) -> tuple[int, str]:
-    """Unpack one file to `path`; return its size in bytes and its SHA-256.
-
-    The size is checked while it is written, because a compressed file may be far larger than the
-    archive says and fill the disk.
-
-    Args:
-        archive: path of the archive, for messages.
-        packed: archive, open for reading.
-        entry: entry of the file.
-        path: path to which it is written.
-
-    Raises:
-        InputError: the file is longer than its entry states.
-    """
-    digest, size = hashlib.sha256(), 0
-    with packed.open(entry) as source, path.open("wb") as target:
-        for block in _read_blocks(source):
-            size += len(block)
-            if size > entry.file_size:
-                raise _make_refusal(
-                    archive, f"{entry.filename!r} has more bytes than its entry states"
-                )
-            digest.update(block)
-            target.write(block)
-    return size, digest.hexdigest()
-
-
-def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
-    while block := source.read(_BLOCK_BYTES):
-        yield block
 
 
 def _compare_with_manifest(

@@ -27,9 +27,8 @@ from bench.benchmark.statistics.bootstrap import (
     compute_resampled_means,
     compute_resampled_medians,
 )
-from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.benchmark.storage.run_status import FAILED_STATUSES
-from bench.benchmark.storage.table_schemas import ERROR_METRICS
+from bench.benchmark.storage.table_schemas import ERROR_FLOOR, ERROR_METRICS
 from sims.core.simulator import Array
 
 

@@ -27,6 +27,8 @@ ERROR_METRICS = (
     "heldout_error",
 )
 """Error metrics in table.csv, which are columns of runs.parquet."""
+ERROR_FLOOR = 1e-9
+"""Errors below this value count as equal to it; they are smaller than rounding in observations."""
 
 
 class EmptyCellRule(Enum):

@@ -164,6 +164,6 @@ def _draw_with_references(
     """
     if not references:
         return []
-    from bench.benchmark.reference_overlay import draw_with_references
+    from bench.benchmark.comparison_report import draw_with_references
 
     return draw_with_references(folder, references, output_folder, print_line, name)
