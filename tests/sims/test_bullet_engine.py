@@ -1,6 +1,4 @@
-"""Tests specific to Bullet: silent import, lifetime of its worlds, interrupted rollouts, memory
-leaks.
-"""
+"""Tests specific to Bullet: silent import, lifetime of its worlds, memory leaks."""
 
 import gc
 import subprocess
@@ -85,28 +83,6 @@ def test_worlds_are_opened_late_and_closed(kind, settings):
     del simulator
     gc.collect()
     assert connected() == before
-
-
-@pytest.mark.parametrize(("kind", "settings"), KINDS)
-def test_an_interrupted_rollout_leaves_nothing_behind(kind, settings, monkeypatch):
-    simulator, theta = make_simulator(kind, settings), theta_for(kind)
-    scenario = Scenario(SCENARIO.times, inputs={c.name: np.ones(50) for c in kind.inputs})
-    step, calls = bullet_world.import_pybullet().stepSimulation, []
-
-    def interrupted(client):
-        calls.append(client)
-        if len(calls) > 20:
-            raise KeyboardInterrupt
-        step(client)
-
-    monkeypatch.setattr(bullet_world.import_pybullet(), "stepSimulation", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        simulator.simulate(theta, scenario)
-    monkeypatch.undo()
-    np.testing.assert_array_equal(
-        simulator.simulate(theta, scenario),
-        make_simulator(kind, settings).simulate(theta, scenario),
-    )
 
 
 GROWTH = """

@@ -15,6 +15,7 @@ import pytest
 from sims import effects
 from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
+from sims.engines.external import bullet_world, mujoco_bodies
 from sims.engines.external.external_engine import equalise_steps
 from tests.sims.engine_agreement import (
     COEFFICIENTS,
@@ -328,6 +329,34 @@ def test_a_copy_has_a_world_of_its_own(system, engine, settings, copied):
     np.testing.assert_array_equal(twin.simulate(theta, run), first)
     simulator.close()
     np.testing.assert_array_equal(twin.simulate(theta, run), first)
+
+
+IMPORTS = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
+STEPPERS = {"pybullet": "stepSimulation", "mujoco": "mj_step"}
+"""Function of each engine's library that makes a step."""
+
+
+@pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
+def test_an_interrupted_rollout_leaves_nothing_behind(system, engine, settings, monkeypatch):
+    kind, library, calls = SIMULATORS[system], IMPORTS[engine](), []
+    make_step = getattr(library, STEPPERS[engine])
+
+    def interrupted(*arguments):
+        calls.append(arguments)
+        if len(calls) > 20:
+            raise KeyboardInterrupt
+        make_step(*arguments)
+
+    # An effect makes MuJoCo step in Python.
+    simulator, fresh = (
+        kind(engine=engine, fixed={"drag.linear": 0.01}, **settings) for _ in range(2)
+    )
+    theta, run = theta_for(kind), scenario(system)
+    with monkeypatch.context() as patch:
+        patch.setattr(library, STEPPERS[engine], interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulator.simulate(theta, run)
+    np.testing.assert_array_equal(simulator.simulate(theta, run), fresh.simulate(theta, run))
 
 
 FINGERPRINT = """

@@ -110,11 +110,6 @@ def load_kernel():
     return array_functions.load_stored(kernel.__name__, "COMPILED", "the batch engine", 1, {})
 
 
-def test_compiled_code_is_loaded_without_numba(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "numba", None)
-    assert load_kernel() is not None
-
-
 def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path))
     monkeypatch.setattr(kernel_build, "_START", "raise ImportError('Numba needs an older NumPy')")

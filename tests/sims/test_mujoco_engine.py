@@ -49,33 +49,6 @@ def test_instability_is_silent_and_writes_no_file(tmp_path, monkeypatch):
     assert list(Path(tmp_path).iterdir()) == []
 
 
-def test_an_interrupted_rollout_leaves_nothing_behind(monkeypatch):
-    mujoco = pytest.importorskip("mujoco")
-    step, calls = mujoco.mj_step, []
-
-    def interrupted(*arguments):
-        calls.append(arguments)
-        if len(calls) > 20:
-            raise KeyboardInterrupt
-        step(*arguments)
-
-    for kind, theta in ((Ball, [[0.7]]), (Servo, [[0.5, 4.0, 2e-3]])):
-        calls.clear()
-        theta, scenario = (
-            np.array(theta),
-            Scenario(np.arange(50) / 50, {"vx": 1.0} if kind is Ball else {"q": 1.0}),
-        )
-        simulator = kind(engine="mujoco", fixed={"drag.linear": 0.01})
-        with monkeypatch.context() as patch:
-            patch.setattr(mujoco, "mj_step", interrupted)
-            with pytest.raises(KeyboardInterrupt):
-                simulator.simulate(theta, scenario)
-        fresh = kind(engine="mujoco", fixed={"drag.linear": 0.01})
-        np.testing.assert_array_equal(
-            simulator.simulate(theta, scenario), fresh.simulate(theta, scenario)
-        )
-
-
 @pytest.mark.parametrize("effects", [{}, {"friction.stribeck": [0.3, 0.2, 0.1], "wind": 0.2}])
 @pytest.mark.parametrize("threads", [2, 3])
 def test_the_number_of_threads_changes_no_bit(effects, threads):

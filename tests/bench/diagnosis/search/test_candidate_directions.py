@@ -171,17 +171,6 @@ def test_what_modifies_an_effect_is_tried_with_it():
     assert found.responses[0, -1, x, along[0]] > 0, "it blows the ball along x"
 
 
-def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
-    there, fit = swing
-    changed = simulate_with_effect(
-        there, fit, [("drag.linear", np.array([0.0])), ("sensor.bias", np.array([0.25]))]
-    )
-    seen = np.isfinite(there.observed)
-    np.testing.assert_allclose(changed[0][seen], fit.simulated[seen], atol=1e-4)
-    q = there.channels.index("q")
-    np.testing.assert_allclose((changed[1] - fit.simulated)[..., q], 0.25, atol=1e-4)
-
-
 def test_a_diverging_change_counts_as_zero_and_multiplies_without_a_warning(swing, monkeypatch):
     there, fit = swing
 
