@@ -17,13 +17,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array
 from sims.robot.mujoco_messages import format_name_list
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 MIN_FACES = 200
 """Minimum number of faces of a mesh that is replaced by its hull to save memory."""
