@@ -306,7 +306,8 @@ class MujocoBatch:
         """
         from mujoco.batch import MODEL_FIELDS
 
-        if not elements_are_equal:
+        # MuJoCo before 4.0, the newest for Python 3.10, does not tell which fields it has changed.
+        if not elements_are_equal or not hasattr(self.batch, "expanded"):
             self.batch.set_const()
             return
         self.batch.set_const([0])

@@ -9,6 +9,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from bench.core.plugin_registries import make_robot_simulator as simulator_of
 from sims.core.simulator import Scenario
@@ -195,3 +196,21 @@ def test_batches_in_series_that_take_too_much_are_dropped(tmp_path):
     assert one in cache.batches
     other = cache.get_batch(second, True, 8, settings)
     assert cache.batches == [own, other]
+
+
+@pytest.mark.skipif(not hasattr(Batch, "expanded"), reason="MuJoCo before 4.0 has one way only")
+def test_constants_of_equal_elements_are_computed_once(tmp_path, monkeypatch):
+    """MuJoCo before 4.0, on Python 3.10, computes those of each element."""
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    kind = simulator_of(path)
+    robot, (effect,) = kind.robot, kind(effects=["mass.scale@fore"]).effects
+    settings = read_integrator_settings(robot).to_model_options()
+    constants = []
+    for _ in range(2):
+        mujoco_batch = MujocoBatch(robot, True, settings, 3)
+        mujoco_batch.write_effects(((effect, np.full((1, 3, 1), 0.4)),))
+        constants.append(mujoco_batch.batch.expand("dof_invweight0").copy())
+        monkeypatch.delattr(Batch, "expanded", raising=False)
+    np.testing.assert_array_equal(*constants)
+    assert (constants[0] != robot.compiled.dof_invweight0).any()
