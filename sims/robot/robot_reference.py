@@ -21,9 +21,9 @@ from sims.core.toml_validation import (
     get_subtable,
     make_error,
 )
-from sims.robot.robot_model import FRICTION_FORMS, FrictionForm
 
 if TYPE_CHECKING:
+    from sims.robot.robot_model import FrictionForm
     from sims.robot.robot_simulator import RobotSimulator
 
 ROBOT_KEYS = ("model", "digest", "free", "actuators", "engine", "numerics", "friction_form")
@@ -137,6 +137,9 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
     """
     if "system" in document:
         raise InputError(f"{source}: expected system or model, found both; leave one out")
+    # Other descriptions are read without the modules of robots.
+    from sims.robot.robot_model import FRICTION_FORMS
+
     digest = document.get("digest")
     friction_form = document.get("friction_form", "stiff")
     if friction_form not in FRICTION_FORMS:
