@@ -171,8 +171,24 @@ def read_statuses(folder: Path) -> dict[int, RunStatus]:
     Raises:
         InputError: The journal is damaged.
     """
+    _refuse_earlier_files(folder / SEGMENTS_FOLDER)
     path = folder / SEGMENTS_FOLDER / JOURNAL_FILE
     return parse_statuses(path, [record.head for record in read_records(path)])
+
+
+def _refuse_earlier_files(folder: Path) -> None:
+    """Refuse the finished runs of a version that wrote several files, which would be repeated.
+
+    Raises:
+        InputError: there are such files.
+    """
+    names = sorted(p.name for p in folder.glob("[0-9]*") if p.suffix in (".journal", ".parquet"))
+    if names:
+        raise InputError(
+            f"{folder / names[0]}: expected finished runs in {JOURNAL_FILE}, found a file of an "
+            "earlier version; finish the comparison with that version, or move the file elsewhere: "
+            "its runs are repeated"
+        )
 
 
 def write_plan(folder: Path, ids: Sequence[str]) -> None:
@@ -204,7 +220,8 @@ class RunJournal:
         statuses: Statuses of all finished runs, by index in the plan.
 
     Raises:
-        InputError: Another process is working in the folder, or the journal is damaged.
+        InputError: Another process is working in the folder, the journal is damaged, or the folder
+            has runs of an earlier version.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -224,6 +241,7 @@ class RunJournal:
                 f"{self.folder}: expected a folder, found a file; move it elsewhere"
             ) from None
         self.path = self.folder / JOURNAL_FILE
+        _refuse_earlier_files(self.folder)
         self._lock = open_locked(self.folder / "lock", self.folder.parent)
         places: list[tuple[int, int]] = []
         heads: list[bytes] = []

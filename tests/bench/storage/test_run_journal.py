@@ -118,6 +118,16 @@ def test_zeros_that_a_crash_of_the_machine_left_are_dropped(tmp_path):
     assert path.read_bytes() == whole
 
 
+@pytest.mark.parametrize("name", ["000001.journal", "000001.parquet"])
+def test_runs_of_an_earlier_version_are_not_repeated_unasked(tmp_path, name):
+    (tmp_path / SEGMENTS_FOLDER).mkdir()
+    (tmp_path / SEGMENTS_FOLDER / name).write_bytes(b"run\n")
+    for read in (RunJournal, read_statuses):
+        with pytest.raises(InputError, match=f"{name}: expected .* earlier version"):
+            read(tmp_path)
+    assert {path.name for path in (tmp_path / SEGMENTS_FOLDER).iterdir()} == {name}
+
+
 def test_two_processes_never_write_one_folder(tmp_path):
     journal = RunJournal(tmp_path)
     with pytest.raises(InputError, match="another simgap process uses"):
