@@ -19,7 +19,7 @@ from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as SHOT_COLUMNS
 from bench.bounce_shot.shot_config import read_shot_config
-from bench.bounce_shot.shot_execution import build_shot_rows
+from bench.bounce_shot.shot_execution import get_shot_path, read_shot, store_shot
 from bench.bounce_shot.shot_sampling import draw_shots
 from bench.bounce_shot.tuned_shots import TunedModel
 from sims.core.toml_validation import read_toml
@@ -157,14 +157,17 @@ def test_several_comparisons(folder, tmp_path):
     assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(list_documented_names("### `break_even.csv`"))
 
 
-def test_the_tables_of_the_bounce_shot():
+def test_the_tables_of_the_bounce_shot(tmp_path):
     assert list_documented_names("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
     experiment = load_experiment("bounce-shot")
     settings = read_shot_config(experiment)
     # A shot without a plan is not executed, but its row has all columns.
     nothing = TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan")
-    (row,) = build_shot_rows(draw_shots(experiment, settings)[0], settings, [nothing])
-    assert [*row, "seen", "trusted"] == list_documented_names("### `shots.csv`")
+    setup = draw_shots(experiment, settings)[0]
+    get_shot_path(tmp_path, setup).parent.mkdir()
+    store_shot(tmp_path, setup, settings, [nothing], 1.0)
+    (row,) = read_shot(tmp_path, setup)["rows"]
+    assert [*row, "trusted"] == list_documented_names("### `shots.csv`")
 
 
 def test_the_losses_of_a_training(tmp_path, monkeypatch, spring):

@@ -20,7 +20,8 @@ from bench.core.resource_estimates import (
     check_feasible,
     get_machine_resources,
 )
-from bench.logs.quality.log_quality import check_recording_plausible, find_anomalies
+from bench.logs.quality.clock_checks import find_anomalies
+from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording as recorded
 from sims.core.simulator import InputError
 from tests.command_output import run_command
