@@ -16,7 +16,7 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from sims.core.effect import Effect, Friction, members_of
+from sims.core.effect import Effect, is_dry_friction, members_of
 from sims.core.simulator import Array
 from sims.system_simulator import SystemSimulator
 
@@ -47,7 +47,7 @@ def has_dry_friction(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
     freed_effects: list[type[Effect]] = list(robot.system.freed_effects)
     plain_names = [get_stateless_friction(evaluator, name) for name in names]
     effects = [*(type(evaluator.available_effects[name]) for name in plain_names), *freed_effects]
-    return any(_is_dry_friction(effect) for effect in effects)
+    return any(is_dry_friction(effect) for effect in effects)
 
 
 def has_soft_form(evaluator: RunEvaluator) -> bool:
@@ -63,7 +63,7 @@ def get_friction_form(evaluator: RunEvaluator, name: str) -> str | None:
         evaluator: Run evaluator with the effect.
         name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
-    is_soft = has_soft_form(evaluator) and _is_dry_friction(type(evaluator.available_effects[name]))
+    is_soft = has_soft_form(evaluator) and is_dry_friction(evaluator.available_effects[name])
     return "soft" if is_soft else None
 
 
@@ -90,11 +90,6 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
     sentence, bracket, place = description.partition(" (at ")
     sentence = sentence.removesuffix(_STICTION_TEXT)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
-
-
-def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> bool:
-    """Return whether `refit_if_likelier_soft` finds a likelier model; arguments as there."""
-    return refit_if_likelier_soft(models, model, margin) is not None
 
 
 def refit_if_likelier_soft(
@@ -184,12 +179,6 @@ def _refit_with_other_form(
     return other_models.fit_one(refitted_model.fit.make_start())
 
 
-def _is_dry_friction(effect: type[Effect]) -> bool:
-    """Return whether an effect, or a member of a family, acts through `frictionloss`."""
-    members = getattr(effect, "members", ())
-    return issubclass(effect, Friction) or any(isinstance(member, Friction) for member in members)
-
-
 def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
     """Return the dry friction that an effect with a state contains, or else the effect itself.
 
@@ -201,7 +190,7 @@ def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
     if effect.hook != "hidden":
         return name
     contained = [n for n in effect.contains if n in evaluator.available_effects]
-    friction = [n for n in contained if _is_dry_friction(type(evaluator.available_effects[n]))]
+    friction = [n for n in contained if is_dry_friction(evaluator.available_effects[n])]
     return friction[0] if friction else name
 
 

@@ -15,7 +15,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.code_digest import hash_class_source
 from bench.benchmark.runner.experiment_runner import (
     ProgressFactory,
-    make_unreachable_error,
+    check_classes_importable,
     no_progress,
 )
 from bench.benchmark.runner.plugin_discovery import announce_installed, list_compared_parts
@@ -410,14 +410,13 @@ def _check_code_isolated(experiment: Experiment) -> None:
         InputError: a diagnoser does not exist, or its code is already in this process.
     """
     if not experiment.trusted:
+        # Classes of a script could not be loaded with trust either.
+        check_classes_importable(experiment)
         announce_installed(list_compared_parts(experiment))
     for registry, name in list_compared_parts(experiment):
         with suppress(PartUnavailableError):
-            kind, registered = registry.get(name), registry.snapshot().get(name)
-            if not experiment.trusted and registered is not None:
-                # With trust, worker processes could not load it either.
-                if registered.path is None:
-                    raise make_unreachable_error("diagnoser", name, registered.part)
+            kind = registry.get(name)
+            if not experiment.trusted and name in registry.snapshot():
                 raise InputError(
                     f"diagnoser {name}: class {kind.__qualname__} is in this process, which has "
                     "the true causes: put it into a plugin file, or use --trust"

@@ -267,6 +267,12 @@ def members_of(effect: Effect | type[Effect]) -> Sequence[Any]:
     return members
 
 
+def is_dry_friction(effect: Effect | type[Effect]) -> bool:
+    """Return whether an effect, or a member of a family, is dry friction."""
+    kinds = (member if isinstance(member, type) else type(member) for member in members_of(effect))
+    return any(issubclass(kind, Friction) for kind in kinds)
+
+
 class Force(Effect):
     """Generalised force, added to the others."""
 

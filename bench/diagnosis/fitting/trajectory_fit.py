@@ -32,7 +32,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_step import (
     compute_gauss_newton_step,
     is_finite_response,
 )
-from sims.core.effect import Friction, members_of
+from sims.core.effect import is_dry_friction
 from sims.core.simulator import Array
 
 MIN_ITERATIONS_BEFORE_ELIMINATION = 4
@@ -777,11 +777,7 @@ def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:
     """Return whether one of some effects is, or contains, dry friction that can hold a joint."""
     available = evaluator.available_effects
     parts = {part for name in names for part in (name, *available[name].contains)}
-    return any(
-        isinstance(member, Friction)
-        for part in parts & available.keys()
-        for member in members_of(available[part])
-    )
+    return any(is_dry_friction(available[part]) for part in parts & available.keys())
 
 
 def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:

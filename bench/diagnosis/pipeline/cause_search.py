@@ -11,8 +11,8 @@ from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
-    is_likelier_soft,
     make_soft_kind,
+    refit_if_likelier_soft,
 )
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.recording_errors import RecordingErrorCheck
@@ -79,8 +79,11 @@ class CauseSearch:
                 and not result.errors
                 and not runs.context.search_control.is_over()
             )
-            if not is_comparison_needed or not is_likelier_soft(
-                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            if not is_comparison_needed or (
+                refit_if_likelier_soft(
+                    search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+                )
+                is None
             ):
                 return result
             return self._search_with_soft_friction(base, search)

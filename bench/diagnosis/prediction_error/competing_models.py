@@ -296,9 +296,7 @@ def _improve_likeliest(
         if larger_set.names in known:
             larger_set = known[larger_set.names]
         elif not compared or not _is_settled(context, compared[0], larger_set):
-            larger_set = context.filters.follow_with_effects(
-                larger_set.followed.theta, larger_set.names
-            )
+            larger_set = context.filters.improve(larger_set)
         compared.append(larger_set)
         compared.sort(key=compute_criterion)
     return compared

@@ -12,7 +12,6 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
-    is_likelier_soft,
     refit_if_likelier_soft,
     replace_by_stateless_friction,
 )
@@ -214,7 +213,8 @@ def check_fit(context: SearchContext, model: FittedModel) -> None:
     Raises:
         SoftFrictionError: the soft form is likelier.
     """
-    if is_likelier_soft(context.search, model, _compute_margin(context, model)):
+    margin = _compute_margin(context, model)
+    if refit_if_likelier_soft(context.search, model, margin) is not None:
         raise SoftFrictionError
 
 

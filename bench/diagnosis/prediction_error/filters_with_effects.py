@@ -284,8 +284,6 @@ def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) 
 
 RELINEARISATION_THRESHOLD = 100.0
 """Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
-MAX_CACHED_FILTERS = 12
-"""Maximum number of cached filters of tried effects."""
 GAUSS_NEWTON_STEPS = 2
 """Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
 SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
@@ -335,7 +333,6 @@ class ModelFilters:
     numerics: float = 0.0
     _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
-    _of_tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _newest: FollowedRuns | None = None
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
     _soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
@@ -485,19 +482,26 @@ class ModelFilters:
     ) -> FilteredSet:
         """Follow the runs with effects in the model, and improve their coefficients.
 
-        Filters of the latest parameters are kept, because sets of effects are often tried again.
-
         Args:
             theta: (P,) initial parameters.
             names: names of the effects.
             steps: maximum number of Gauss-Newton steps.
         """
-        initial = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
-        bounds = get_bounds_by_index(self.evaluator, names)
-        best = maximise_innovation_likelihood(initial, bounds, steps, self._follow_near)
-        newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
-        self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
-        return FilteredSet(best, tuple(names))
+        current = FilteredSet(self._follow_near(theta, self.base), tuple(names))
+        return self.improve(current, steps)
+
+    def improve(self, current: FilteredSet, steps: int = GAUSS_NEWTON_STEPS) -> FilteredSet:
+        """Improve the coefficients of a set by Gauss-Newton steps.
+
+        Args:
+            current: the set, with its filter.
+            steps: maximum number of steps.
+        """
+        bounds = get_bounds_by_index(self.evaluator, current.names)
+        followed = maximise_innovation_likelihood(
+            current.followed, bounds, steps, self._follow_near
+        )
+        return FilteredSet(followed, current.names)
 
     def _follow_near(self, theta: Array, neighbour: FollowedRuns) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about a known motion.

@@ -299,9 +299,9 @@ class Regression:
         """Return whether a larger set predicts left-out runs better.
 
         Each run is left out in turn (cross-validation; M. Stone, J. R. Stat. Soc. B 36(2), 111,
-        1974). If only the left-out run determines a coefficient well, that of the other runs is
-        arbitrary. So the prediction with coefficients that are shrunk where the others determine
-        them badly counts as well, if it keeps much of the gain in all runs together.
+        1974). If the left-out run alone determines a coefficient, the estimate from the other runs
+        is arbitrary and may predict badly. Such a coefficient is therefore also tried shrunk
+        towards zero; the prediction must then keep much of the gain in all runs together.
 
         Args:
             smaller: the smaller set.
@@ -345,8 +345,8 @@ class Regression:
 
         The products of eq. (1) of a run are subtracted from those of all runs, which gives the fit
         without that run: rss = e'e - 2 c'h + c'G c with the products G, h of the run and
-        coefficients c of the others. Shrunk coefficients are those of a fit in which the run is not
-        left out, but has zero innovations.
+        coefficients c of the others. Shrunk coefficients are those of a fit in which the left-out
+        run stays, but with zero innovations: those that it mainly determines become small.
 
         Args:
             chosen: the groups.

@@ -328,9 +328,10 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
     servo_signals = [
         (f"u.{a.name}", f"q.{a.joint}")
         for a in robot.actuators
-        if a.kind == "position" and f"u.{a.name}" in first.inputs
+        if a.kind == "position"
+        and f"u.{a.name}" in first.inputs
+        and f"q.{a.joint}" in first.channels
     ]
-    servo_signals = [pair for pair in servo_signals if pair[1] in first.channels]
     pairs = {
         (command, position): _compare_position_with_command(recording, command, position)
         for command, _ in servo_signals

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -204,13 +205,19 @@ def find_assets_of_file(spec: Any, path: str) -> list[Any]:
         path: path of the file as in MuJoCo's messages, with the folder of the assets.
     """
     assets = [*spec.meshes, *spec.hfields, *spec.skins, *spec.textures]
-    files = {i: [asset.file, *getattr(asset, "cubefiles", ())] for i, asset in enumerate(assets)}
-    exact = [i for i, names in files.items() if any(n and path.endswith(n) for n in names)]
+    files = [[asset.file, *getattr(asset, "cubefiles", ())] for asset in assets]
+
+    def select(is_needed: Callable[[str], bool]) -> list[Any]:
+        return [
+            asset
+            for asset, names in zip(assets, files, strict=True)
+            if any(is_needed(name) for name in names if name)
+        ]
+
     # With the setting strippath, MuJoCo ignores the folders in the names.
-    stripped = [
-        i for i, names in files.items() if any(n and Path(n).name == Path(path).name for n in names)
-    ]
-    return [assets[i] for i in exact or stripped]
+    return select(lambda name: f"/{path}".endswith(f"/{name}")) or select(
+        lambda name: Path(name).name == Path(path).name
+    )
 
 
 def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> None:
@@ -230,18 +237,18 @@ def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> 
     """
     import mujoco
 
-    name, label = asset.name, asset.file or asset.name
+    label = asset.file or asset.name
     if isinstance(asset, mujoco.MjsTexture):
-        label = next((file for file in (asset.file, *asset.cubefiles) if file), name)
+        label = next((file for file in (asset.file, *asset.cubefiles) if file), label)
         asset.file, asset.cubefiles = "", []
         asset.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
         asset.width = asset.height = 1
-    elif not isinstance(asset, mujoco.MjsSkin):
-        attribute = "meshname" if isinstance(asset, mujoco.MjsMesh) else "hfieldname"
-        for geom in [geom for geom in spec.geoms if getattr(geom, attribute) == name]:
-            omitted.leave_out(spec, geom, label, reason)
-        spec.delete(asset)
+        omitted.seen.setdefault(reason, []).append(label)
         return
+    if isinstance(asset, mujoco.MjsSkin):
+        omitted.seen.setdefault(reason, []).append(label)
     else:
-        spec.delete(asset)
-    omitted.seen.setdefault(reason, []).append(label)
+        attribute = "meshname" if isinstance(asset, mujoco.MjsMesh) else "hfieldname"
+        for geom in [geom for geom in spec.geoms if getattr(geom, attribute) == asset.name]:
+            omitted.leave_out(spec, geom, label, reason)
+    spec.delete(asset)

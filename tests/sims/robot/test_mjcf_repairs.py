@@ -59,15 +59,27 @@ def test_absent_pictures_and_height_fields_are_left_out(write):
     assert robot.compiled.ngeom == 1
 
 
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def test_a_mesh_is_kept_whose_name_ends_that_of_an_absent_one(write):
+    assets = '<mesh name="m" file="art.obj"/><mesh name="n" file="part.obj"/>'
+    path = write(mjcf(assets, '<geom type="mesh" mesh="m"/>', 'type="mesh" mesh="n" mass="0"'))
+    write(TETRAHEDRON, "parts/art.obj")
+    robot = read_robot(path)
+    assert robot.notes == (ABSENT.replace("no.stl", "part.obj"), NO_ACTUATORS_NOTE)
+    assert robot.compiled.nmesh == 1
+    assert robot.bodies[0].mass == pytest.approx(1000 / 6)
+
+
 def test_meshes_that_are_there_are_kept(write):
-    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     path = write(mjcf('<mesh name="m" file="part.obj"/>', ""))
-    write(tetrahedron, "parts/part.obj")
+    write(TETRAHEDRON, "parts/part.obj")
     robot = read_robot(path)
     assert robot.notes == (NO_ACTUATORS_NOTE,)
     assert robot.bodies[0].mass == pytest.approx(1000 / 6)
     assert robot.spec.copy().compile().nmesh == 1
-    write(tetrahedron.replace("v 0 0 1", "v 0 0 2"), "parts/part.obj")
+    write(TETRAHEDRON.replace("v 0 0 1", "v 0 0 2"), "parts/part.obj")
     assert read_robot(path).digest != robot.digest
 
 

@@ -95,6 +95,7 @@ def test_effects_that_regression_missed_are_tried_unless_a_force_is_replaced(
         proposals=SimpleNamespace(of=lambda _: starts),
         filters=SimpleNamespace(
             follow_with_effects=follow_with_effects,
+            improve=lambda larger_set: larger_set,
             penalty=lambda _: 10.0,
             compute_gain=lambda followed: 2.0 * followed.log_likelihood,
         ),
