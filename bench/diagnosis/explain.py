@@ -12,11 +12,11 @@ import numpy as np
 
 from bench.benchmark.runner.worker_pools import limit_to_one_thread
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
+from bench.diagnosis.evaluation.parameter_bounds import describe_unusual_values
 from bench.diagnosis.evaluation.search_control import STAGES
 from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
-from bench.diagnosis.fitting.base_fit import describe_unusual_values
 from bench.diagnosis.numerics_cause import (
     add_numerics_causes,
     list_option_causes,
@@ -24,12 +24,12 @@ from bench.diagnosis.numerics_cause import (
 )
 from bench.diagnosis.pipeline.base_model import SEGMENT_DURATIONS, BaseModel, filter_and_fit
 from bench.diagnosis.pipeline.cause_search import CauseSearch
-from bench.diagnosis.pipeline.extended_model import build_extended_simulator
-from bench.diagnosis.pipeline.left_out_segments import leave_out_jumps
-from bench.diagnosis.pipeline.recording_errors import (
+from bench.diagnosis.pipeline.convention_and_unit_checks import (
     RecordingErrorCheck,
     refuse_broken_conventions,
 )
+from bench.diagnosis.pipeline.extended_simulator_builder import build_extended_simulator
+from bench.diagnosis.pipeline.left_out_segments import leave_out_jumps
 from bench.diagnosis.pipeline.recording_preparation import RecordingSource, prepare_runs
 from bench.diagnosis.pipeline.report_data_builder import build_report_data
 from bench.diagnosis.pipeline.search_result import SearchResult

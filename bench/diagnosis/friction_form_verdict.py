@@ -170,7 +170,7 @@ def _refit_with_other_form(
     if models.evaluator.discretisation_correction is None:
         return refitted_model
     # Both forms are compared without the discretisation error of the integrator.
-    from bench.diagnosis.fitting.linearised_runs import correct_discretisation
+    from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
 
     correct_discretisation(
         evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states

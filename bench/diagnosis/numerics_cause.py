@@ -21,7 +21,7 @@ from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:
-    from bench.diagnosis.evaluation.solver_options import StepRefinement
+    from bench.diagnosis.evaluation.discretisation_error import StepRefinement
     from sims.robot.robot_simulator import RobotSimulator
 
 MIN_FINER_STEP_GAIN = 20.0

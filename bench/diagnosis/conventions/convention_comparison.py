@@ -36,9 +36,9 @@ from bench.diagnosis.conventions.convention_hypotheses import (
 )
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
-from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.friction_form_verdict import make_soft_kind
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns

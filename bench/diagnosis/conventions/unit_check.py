@@ -27,9 +27,9 @@ from typing import Any, Literal
 import numpy as np
 
 from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
-from bench.diagnosis.evaluation.coefficient_bounds import bound_of
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import bound_of
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import (
     FIT_HORIZONS,

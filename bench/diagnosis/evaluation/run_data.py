@@ -1,12 +1,4 @@
-"""Recorded runs prepared for fitting, their time scale, and a cache of their simulations.
-
-With T the duration of the longest run and h the shortest sample interval:
-
-* a delay or a lag is plausible up to T / 20, and a fit may move it up to T: longer ones look
-  constant within a run;
-* a decay time constant is at most `MAX_DECAY_FACTOR` T;
-* a frequency is at most 1 / (2 h), the Nyquist frequency.
-"""
+"""Recorded runs prepared for fitting: inputs, observations and guesses of initial states."""
 
 from __future__ import annotations
 
@@ -16,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask
-from sims.core.simulator import Array, Parameter, Scenario
+from sims.core.simulator import Array, Scenario
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
@@ -210,94 +202,3 @@ def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float
     coefficients = np.polynomial.polynomial.polyfit(t / scale, y, degree)
     value, slope = coefficients[:2]
     return float(value), float(slope / scale)
-
-
-MAX_DELAY_SHARE = 0.05
-"""Maximum plausible delay or lag, as a share of the duration of the longest run."""
-MAX_DECAY_FACTOR = 3.0
-"""Maximum decay time constant, as a multiple of the duration of the longest run."""
-FREQUENCY_RANGE_RATIO = 100.0
-"""Ratio of the highest to the lowest plausible frequency if the sampling limits the highest one."""
-
-
-def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
-    """Return a coefficient with a plausible range that fits the time scale of a recording.
-
-    The range of an effect is for typical recordings of seconds. A slow recording can show longer
-    delays and decays, and one with few samples shows only low frequencies. Coefficients without a
-    time in their unit are returned as they are.
-
-    Args:
-        parameter: coefficient, with the range that its effect states.
-        longest: duration of the longest run, s.
-        spacing: shortest sample interval, s; 0 if unknown.
-    """
-    low, high = parameter.bounds
-    if is_instant(parameter):
-        return parameter
-    if parameter.unit == "s":
-        if low > 0:
-            high = max(high, MAX_DECAY_FACTOR * longest)
-        else:
-            # A delay may have either sign, so both ends are scaled by the same factor.
-            factor = max(1.0, MAX_DELAY_SHARE * longest / high)
-            low, high = factor * low, factor * high
-    elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
-        high = 0.5 / spacing
-        low = min(low, high / FREQUENCY_RANGE_RATIO)
-    if (low, high) == parameter.bounds:
-        return parameter
-    nominal = min(max(parameter.nominal, low), high)
-    return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
-
-
-def is_instant(coefficient: Parameter) -> bool:
-    """Return whether a coefficient is a time on the clock of the recording."""
-    return coefficient.name.endswith(".instant")
-
-
-CACHE_BYTES = 64 << 20
-"""Maximum memory for the cached results of one `World`, in bytes; the oldest are dropped first."""
-
-
-class SimulationCache:
-    """Observations (T, C) of batch elements, cached by their inputs, with a memory limit.
-
-    A fit simulates a trial, accepts it, and then needs it again as the centre of finite
-    differences; starts are compared before they are fitted. A third of the simulations of a robot
-    are such repetitions.
-    """
-
-    def __init__(self) -> None:
-        self._held: dict[bytes, Array] = {}
-        self._bytes = 0
-
-    def missing(self, keys: Sequence[bytes]) -> list[int]:
-        """Return the indices of elements that are not cached; of equal ones only the first."""
-        first = {key: place for place, key in reversed(list(enumerate(keys)))}
-        return sorted(place for key, place in first.items() if key not in self._held)
-
-    def fill(
-        self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
-    ) -> None:
-        """Store new results, and write those of all elements, new and cached, to an output array.
-
-        The oldest results are removed if the memory limit is exceeded.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            keys: keys of all elements, as passed to `missing`.
-            places: indices of the elements that `missing` returned.
-            results: (N, T, C) results of these elements.
-            out: (L, T, C) output array for the results of all elements.
-        """
-        new_results = {keys[place]: row for place, row in zip(places, results, strict=True)}
-        for place, key in enumerate(keys):
-            out[place] = new_results[key] if key in new_results else self._held[key]
-        for key, row in new_results.items():
-            # Store a copy: a view would keep the results of a whole call in memory.
-            self._held[key] = row.copy()
-            self._bytes += row.nbytes
-        while self._bytes > CACHE_BYTES:
-            self._bytes -= self._held.pop(next(iter(self._held))).nbytes

@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.noise_model import Mask
-from bench.diagnosis.evaluation.run_data import (
-    RunData,
-    SimulationCache,
-    adapt_to_time_scale,
-    prepare_run,
-    take_first_samples,
-)
+from bench.diagnosis.evaluation.plausible_ranges import adapt_to_time_scale
+from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
 from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
@@ -107,7 +103,7 @@ class RunEvaluator:
         simulation_count: number of batch elements simulated so far.
         search_control: search control that stops fits early; by default it never does.
         discretisation_correction: (R, T, C) correction added to all simulations, or None
-            (`bench.diagnosis.fitting.linearised_runs`).
+            (`bench.diagnosis.evaluation.discretisation_error`).
         state_derivatives: (R, T, C, s) derivatives by the initial states if they come from a
             linearisation, else None.
         cached_linearisations: linearised robot runs that were used most recently

@@ -1,4 +1,4 @@
-"""Linearised robot runs: responses to effects and initial states, and discretisation correction."""
+"""Linearised robot runs: their responses to effects and to initial states."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
 from sims.core.simulator import Array
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.robot_simulator import RobotSimulator
-
-MAX_CORRECTABLE_ERROR = 1.0
-"""Maximum RMS discretisation error that is corrected, in units of the noise."""
 
 
 def compute_effect_responses(
@@ -188,48 +183,3 @@ def _get_linearisation(
     for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
         del cache[oldest_key]
     return linearisation
-
-
-def correct_discretisation(
-    evaluator: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
-) -> None:
-    """Correct all later simulations for the discretisation error at a model near the data.
-
-    An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate
-    it: for example dry friction that stops within a step and not at its end, or a servo that is
-    nearly too fast for the step. With the motion q(h) at step size h, the discretisation error is
-
-        2 q(h / 4) - q(h / 2) - q(h)                                                           (1)
-
-    to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
-    any higher order.
-
-    Shapes: R runs, P parameters.
-
-    Args:
-        evaluator: evaluator of the recorded runs of a robot.
-        noise: noise of each channel.
-        theta: (P,) parameters of a model near the data.
-        states: (R, s) initial states of the model.
-    """
-    if not evaluator.has_linearisation:
-        return
-    assert issubclass(evaluator.kind, RobotSimulator)
-    effects = [*evaluator.library, *evaluator.extra_effects]
-    run_count = len(evaluator.prepared_runs)
-    scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
-    thetas = np.tile(theta, (run_count, 1))
-    initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
-    half_step_kind = evaluator.kind.with_half_step()
-    # Motions with the usual step, half of it and a quarter of it.
-    simulated = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
-    for kind in (half_step_kind, half_step_kind.with_half_step()):
-        finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
-        simulated.append(finer.simulate_batch(thetas, scenarios, initial_states))
-    # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
-    evaluator.simulation_count += 7 * run_count
-    correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)
-    squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
-    # A large error cannot be removed by this correction.
-    if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
-        evaluator.discretisation_correction = np.nan_to_num(correction)

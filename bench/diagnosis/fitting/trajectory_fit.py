@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
+from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
     MAX_DAMPING,

@@ -16,7 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from bench.diagnosis.fitting.base_fit import Bounds
+from bench.diagnosis.evaluation.parameter_bounds import Bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from bench.diagnosis.fitting.base_fit import (
     BaseFit,
-    correct_discretisation,
     find_start_with_tuner,
     fit_base_model,
     fit_wider,
+    refit_without_step_error,
 )
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
@@ -143,7 +143,7 @@ class BaseModel:
         followed = evaluator.filtered_runs
         if followed is not None and (followed.has_missing_force or not shows_step_errors(followed)):
             return self
-        return replace(self, fit=correct_discretisation(evaluator, self.runs.noise, self.fit))
+        return replace(self, fit=refit_without_step_error(evaluator, self.runs.noise, self.fit))
 
     def finish(self) -> BaseModel:
         """Widen ranges, freeze unidentified numbers and correct the step error of a robot.

@@ -15,7 +15,7 @@ from bench.diagnosis.friction_form_verdict import (
     refit_if_likelier_soft,
 )
 from bench.diagnosis.pipeline.base_model import BaseModel
-from bench.diagnosis.pipeline.recording_errors import RecordingErrorCheck
+from bench.diagnosis.pipeline.convention_and_unit_checks import RecordingErrorCheck
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.pipeline.verdict_builder import restrict_verdict

@@ -9,12 +9,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
-    bound_of,
-    get_bounds_by_index,
-    is_unusual,
-)
-from bench.diagnosis.evaluation.run_data import is_instant
+from bench.diagnosis.evaluation.parameter_bounds import bound_of, get_bounds_by_index, is_unusual
+from bench.diagnosis.evaluation.plausible_ranges import is_instant
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
 from bench.diagnosis.search.alternative_causes import CauseEvidence

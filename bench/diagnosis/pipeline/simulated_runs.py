@@ -15,9 +15,10 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.noise_floor import NoiseFloor, compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import Bounds, use_bounds
 from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.explain_options import ExplainOptions
-from bench.diagnosis.fitting.base_fit import BaseFit, Bounds, use_bounds
+from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.pipeline.contact_conditions import ContactConditions
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import list_hat_effects

@@ -184,7 +184,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
         rated: The options of the model file.
     """
     # This import is needed for robots only.
-    from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
+    from bench.diagnosis.evaluation.solver_option_ranking import rank_option_alternatives
 
     runs = rated.model.runs
     for _ in range(MAX_OPTION_ROUNDS):

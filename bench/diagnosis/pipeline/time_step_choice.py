@@ -22,7 +22,7 @@ from bench.diagnosis.pipeline.search_result import SearchResult, rate_model
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 
 if TYPE_CHECKING:
-    from bench.diagnosis.evaluation.solver_options import StepRefinement
+    from bench.diagnosis.evaluation.discretisation_error import StepRefinement
 
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
@@ -58,7 +58,7 @@ class TimeStepChoice:
             model: base model with the file's own step.
         """
         # This import is needed for robots only.
-        from bench.diagnosis.evaluation.solver_options import find_step_refinements
+        from bench.diagnosis.evaluation.discretisation_error import find_step_refinements
 
         runs = model.runs
         (self._refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)

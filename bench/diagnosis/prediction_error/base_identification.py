@@ -17,11 +17,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import (
+    bound_of,
+    compute_range_around,
+    get_bounds_by_index,
+    use_bounds,
+)
 from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.base_fit import compute_range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import (
     Follow,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
+from bench.diagnosis.evaluation.parameter_bounds import (
     compute_coefficient_bounds,
     get_bounds_by_index,
 )
@@ -37,7 +37,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
     build_regression_about,
 )
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.start_value_selection import add_effect_to_start
+from bench.diagnosis.search.fit_starts import add_effect_to_start
 from sims.core.simulator import Array
 from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator

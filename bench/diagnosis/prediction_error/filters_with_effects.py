@@ -14,11 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
-    clip_coefficients,
-    get_bounds_by_index,
-)
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import clip_coefficients, get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart

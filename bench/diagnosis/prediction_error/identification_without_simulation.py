@@ -23,9 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
+from bench.diagnosis.evaluation.parameter_bounds import (
+    Bounds,
+    compute_range_around,
+    get_bounds_by_index,
+)
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -43,7 +46,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
 )
 from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
 from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
-from bench.diagnosis.search.start_value_selection import add_effect_to_start
+from bench.diagnosis.search.fit_starts import add_effect_to_start
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0

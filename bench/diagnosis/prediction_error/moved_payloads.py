@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.simulator import Array
 from sims.robot.robot_simulator import RobotSimulator

@@ -36,7 +36,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
+from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -98,8 +98,8 @@ from bench.diagnosis.prediction_error.single_effect_fits import (
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.fit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import CandidateScores
-from bench.diagnosis.search.start_value_selection import add_effect_to_start
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
-from bench.diagnosis.evaluation.coefficient_bounds import (
+from bench.diagnosis.evaluation.parameter_bounds import (
     clip_coefficients,
     compute_coefficient_bounds,
 )

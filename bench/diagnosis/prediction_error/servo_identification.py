@@ -27,12 +27,14 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
+from bench.diagnosis.evaluation.parameter_bounds import (
+    Bounds,
     compute_coefficient_bounds,
+    compute_range_around,
     is_unusual,
+    use_bounds,
 )
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
-from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.levenberg_marquardt_step import RIDGE_SHARE
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext

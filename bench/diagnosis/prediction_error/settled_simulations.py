@@ -25,8 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
-from bench.diagnosis.fitting.base_fit import Bounds
+from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.diagnosis.evaluation.coefficient_bounds import Bound
+from bench.diagnosis.evaluation.parameter_bounds import Bound
 from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.validation.run_consistency import ConsistencySummary
 from bench.diagnosis.verdict import Verdict

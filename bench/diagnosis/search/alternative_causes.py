@@ -18,11 +18,14 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.search.coefficient_start_values import generate_shifted_starts
-from bench.diagnosis.search.effect_search import FAR_EXCESS, EffectSearch
+from bench.diagnosis.search.effect_search import (
+    FAR_EXCESS,
+    MAX_RICHER_LAW_EXCESS_RATIO,
+    EffectSearch,
+)
+from bench.diagnosis.search.fit_starts import generate_shifted_starts
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
-from bench.diagnosis.search.model_moves import MAX_RICHER_LAW_EXCESS_RATIO
 from bench.diagnosis.search.score_test import estimate_tail_p_value
 from bench.diagnosis.search.verdict_rules import (
     compute_excess_ratio,

@@ -22,21 +22,13 @@ from itertools import product
 import numpy as np
 
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
-from bench.diagnosis.evaluation.coefficient_bounds import (
-    MIN_CYCLES_PER_RUN,
-)
 from bench.diagnosis.evaluation.noise_model import Mask
-from bench.diagnosis.evaluation.run_data import MAX_DECAY_FACTOR, is_instant
+from bench.diagnosis.evaluation.parameter_bounds import MIN_CYCLES_PER_RUN, list_coefficients
+from bench.diagnosis.evaluation.plausible_ranges import MAX_DECAY_FACTOR, is_instant, is_period
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
-from bench.diagnosis.search.coefficient_start_values import (
-    EVENT_TIME_COUNT,
-    compute_reachable_levels,
-    generate_end_stops,
-    is_period,
-    list_coefficients,
-)
+from bench.diagnosis.search.reachable_levels import compute_reachable_levels
 from sims.core.effect import ALL_PLACES, Effect, Input, members_of
 from sims.core.simulator import Array, Parameter
 
@@ -83,6 +75,8 @@ END_STOP_DEPTH_SHARES = (0.005, 0.02, 0.08, 0.2)
 """Depths of end stops that are tried, as shares of the range of the coordinate."""
 END_STOP_STIFFNESS_SHARES = (0.003, 0.03, 0.3, 3.0)
 """Stiffnesses of end stops that are tried, as shares of the largest plausible one."""
+EVENT_TIME_COUNT = 24
+"""Number of times tried for a single event."""
 
 
 @dataclass(frozen=True)
@@ -293,6 +287,37 @@ def _make_end_stop_candidates(
             can_be_negative=True,
             is_single_size=True,
         )
+
+
+def generate_end_stops(
+    evaluator: RunEvaluator,
+    name: str,
+    side: float,
+    stiffness_shares: Sequence[float],
+    depth_shares: Sequence[float],
+) -> Iterator[Array]:
+    """Yield coefficients (k,) of end stops at one end of a coordinate's range.
+
+    All combinations of stiffness and depth are tried, because the response to an end stop is not
+    linear. There are none if the range of the coordinate is not recorded.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        side: 1 for the upper end, -1 for the lower end.
+        stiffness_shares: stiffnesses, as fractions of the largest plausible one.
+        depth_shares: depths within the range of the coordinate, as fractions of the range.
+    """
+    low, high = evaluator.get_coordinate_range(name)
+    parameters = list_coefficients(evaluator, name)
+    max_stiffness = parameters[0].bounds[1]
+    for stiffness_share, depth_share in (
+        product(stiffness_shares, depth_shares) if low < high else ()
+    ):
+        coefficients = np.zeros(len(parameters))
+        coefficients[0] = side * stiffness_share * max_stiffness
+        coefficients[1] = (high if side > 0 else low) - side * depth_share * (high - low)
+        yield coefficients
 
 
 def _make_limit_probes(

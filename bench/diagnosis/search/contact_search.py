@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fitted_models import FittedModel
@@ -36,11 +36,14 @@ from bench.diagnosis.kalman.cubature_filter import (
     smooth_first_states,
 )
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
-from bench.diagnosis.search.effect_search import MAX_P_VALUE_FURTHER_EFFECT, EffectSearch
-from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES
+from bench.diagnosis.search.effect_search import (
+    MAX_P_VALUE_FURTHER_EFFECT,
+    MAX_REFITTED_CANDIDATES,
+    EffectSearch,
+)
+from bench.diagnosis.search.fit_starts import select_refit_starts
 from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomSearch
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
-from bench.diagnosis.search.start_value_selection import select_refit_starts
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 

@@ -18,13 +18,13 @@ from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
+from bench.diagnosis.search.fit_starts import select_refit_starts
 from bench.diagnosis.search.score_test import (
     CandidateScores,
     ScoreTest,
     compute_calibrated_scores,
     estimate_tail_p_value,
 )
-from bench.diagnosis.search.start_value_selection import select_refit_starts
 from bench.diagnosis.search.verdict_rules import MAX_AUTOCORRELATED_NOISE_RATIO
 from sims.core.simulator import Array
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.core.plugin_registries import load_plugins
-from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
-from bench.diagnosis.evaluation.run_data import adapt_to_time_scale
+from bench.diagnosis.evaluation.parameter_bounds import bound_of, compute_coefficient_bounds
+from bench.diagnosis.evaluation.plausible_ranges import adapt_to_time_scale
 from bench.diagnosis.explain import explain
 from bench.diagnosis.extended_robot_files import select_written_causes
 from bench.diagnosis.report.report_data import ParameterChange
@@ -156,7 +156,7 @@ def bounded(tmp_path_factory):
     effect = ["--effect", "drag.linear=0.004"]
     run_command("simulate", "pendulum", "--out", path, *words, *effect)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bench.diagnosis.evaluation.coefficient_bounds.MAX_RANGE_FACTOR", 0.02)
+        patch.setattr("bench.diagnosis.evaluation.parameter_bounds.MAX_RANGE_FACTOR", 0.02)
         found = explain(path)
         printed = format_summary(found.story)
         found.write(folder / "out")

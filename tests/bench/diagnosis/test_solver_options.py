@@ -7,7 +7,7 @@ import mujoco
 import pytest
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
-from bench.diagnosis.evaluation.solver_options import rank_option_alternatives
+from bench.diagnosis.evaluation.solver_option_ranking import rank_option_alternatives
 from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.pipeline.recording_preparation import prepare_runs

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
+from bench.diagnosis.evaluation.parameter_bounds import (
     MAX_RANGE_FACTOR_MODEL_FILE,
     bound_of,
     compute_coefficient_bounds,

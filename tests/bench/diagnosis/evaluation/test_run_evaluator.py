@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.coefficient_bounds import (
+from bench.diagnosis.evaluation.parameter_bounds import (
     MAX_RANGE_FACTOR,
     MAX_RANGE_FACTOR_DRY_FRICTION,
     compute_coefficient_bounds,

@@ -1,7 +1,7 @@
 import numpy as np
 
-from bench.diagnosis.evaluation import run_data
-from bench.diagnosis.evaluation.run_data import SimulationCache
+from bench.diagnosis.evaluation import simulation_cache
+from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 
 ROW = np.zeros((2, 1)).nbytes
 
@@ -27,7 +27,7 @@ def test_what_it_holds_is_its_own():
 
 
 def test_beyond_its_limit_the_oldest_are_dropped(monkeypatch):
-    monkeypatch.setattr(run_data, "CACHE_BYTES", 2 * ROW)
+    monkeypatch.setattr(simulation_cache, "CACHE_BYTES", 2 * ROW)
     cache = SimulationCache()
     made = {key: float(place) for place, key in enumerate([b"a", b"b", b"c", b"d"])}
     # One call may request more results than the cache can hold, and equal ones.

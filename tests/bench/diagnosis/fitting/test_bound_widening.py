@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import widen_range
 from bench.diagnosis.explain import explain
-from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider, widen_range
+from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider
 from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter

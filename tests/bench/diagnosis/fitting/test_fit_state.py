@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.solver_options import MAX_CORRECTED_ERROR, StepRefinement
+from bench.diagnosis.evaluation.discretisation_error import MAX_CORRECTED_ERROR, StepRefinement
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
     FitPoint,
     FitStart,

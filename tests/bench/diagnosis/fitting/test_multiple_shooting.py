@@ -12,7 +12,7 @@ from bench.diagnosis.fitting.multiple_shooting import (
     make_segment_evaluator,
 )
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search import effect_search, model_moves
+from bench.diagnosis.search import effect_search
 from bench.diagnosis.search.alternative_causes import refine_best_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
@@ -114,8 +114,7 @@ def test_a_search_goes_over_pieces_unless_the_motion_forgets_how_it_began(
 
 
 def test_competitors_that_were_not_selected_are_tested_before_a_cause_is_named(monkeypatch):
-    for module in (effect_search, model_moves):
-        monkeypatch.setattr(module, "MAX_REFITTED_CANDIDATES", 1)
+    monkeypatch.setattr(effect_search, "MAX_REFITTED_CANDIDATES", 1)
     dragged = Pendulum(effects=["drag.quadratic"])
     starts = [*STARTS, {"q": 2.0}]
     data = recorded(dragged, [0.0035, 4e-7], starts, TIMES[:250], SIGMA)

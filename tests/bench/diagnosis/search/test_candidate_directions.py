@@ -3,22 +3,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.candidate_directions import (
     END_STOP_DEPTH_SHARES,
+    EVENT_TIME_COUNT,
     MAX_FREQUENCIES,
     SHAPE_GRID_SIZE,
     compute_directions,
     simulate_with_effect,
 )
-from bench.diagnosis.search.coefficient_start_values import (
-    END_STOP_DEPTH_SHARES as DEEPER,
-)
-from bench.diagnosis.search.coefficient_start_values import (
+from bench.diagnosis.search.fit_starts import END_STOP_DEPTH_SHARES as DEEPER
+from bench.diagnosis.search.fit_starts import (
     END_STOP_STIFFNESS_FACTORS,
-    EVENT_TIME_COUNT,
     MAX_EVENT_TIME_SUBDIVISIONS,
     REFIT_STIFFNESS_FACTORS,
     generate_event_times,

@@ -1,4 +1,4 @@
-"""MuJoCo's time step, integrator and solver: discretisation error, and better options.
+"""Discretisation error of a robot's time step: better steps and integrators, and a correction.
 
 A model file specifies a time step and an integrator, and both affect the motion: with a coarse step
 the motion is early by about half a step, or a stiff servo becomes unstable. With the motion q(h) at
@@ -8,9 +8,7 @@ no scheme qualifies, the first-order error of an implicit scheme is extrapolated
 
     q = 2 q(h / 2) - q(h)                                                                      (1)
 
-Two simulators of one model file can differ in options that change the motion where geoms touch: the
-friction cone, the ratio of the friction's impedance to that of the normal force (`impratio`), the
-iterations that prevent slip, the constraint solver and its iterations, and the integrator.
+A smaller error, which no finer step is worth, is corrected: `correct_discretisation`.
 """
 
 from __future__ import annotations
@@ -25,14 +23,7 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.simulator import Array
-from sims.robot.integrator_settings import (
-    CONE_IDS,
-    INTEGRATOR_IDS,
-    SOLVER_IDS,
-    IntegratorSettings,
-    list_changed_options,
-    read_option,
-)
+from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.robot_simulator import RobotSimulator
 
 MIN_DISCRETISATION_ERROR = 0.2
@@ -42,7 +33,7 @@ MAX_CORRECTED_ERROR = 0.1
 MAX_CORRECTED_ERROR_FAR_FIT = 0.7
 """Maximum RMS error of a setting, in units of the noise, if the residual is much larger.
 
-The rest of the error is corrected after the fit (`bench.diagnosis.fitting.linearised_runs`).
+The rest of the error is corrected after the fit (`correct_discretisation`).
 """
 MIN_ERROR_REDUCTION = 4.0
 """Minimum factor by which a setting must reduce an error above `MAX_CORRECTED_ERROR`.
@@ -61,6 +52,8 @@ CHECKED_RUN_COUNT = 2
 """Number of runs that are checked; a step that is too coarse is so in all runs."""
 RELATIVE_RK4_COST = 3.3
 """Time of a step of RK4, relative to one of the other integrators."""
+MAX_CORRECTABLE_ERROR = 1.0
+"""Maximum RMS discretisation error that is corrected, in units of the noise."""
 
 
 class StepRefinement(NamedTuple):
@@ -256,125 +249,46 @@ class _ReferenceMotions:
         return size if np.isfinite(size) else float("inf")
 
 
-IMPEDANCE_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-"""Values of `impratio` that are tried; model files state numbers between 1 and 100."""
-NOSLIP_ITERATIONS = (0, 5)
-"""Numbers of iterations without slip that are tried: without, and with as many as usual."""
-SOLVER_ITERATIONS = (1, 3, 10, 30, 100)
-"""Numbers of iterations of the solver that are tried."""
-MIN_DISTINCT_CHANGE = 0.05
-"""Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
-MIN_SQUARES_DECREASE = 20.0
-"""Minimum decrease of the sum of squares by an alternative, in units of the noise."""
-MAX_EXCESS_RATIO = 0.4
-"""Maximum excess of the sum of squares over that of noise by another option, relative to without.
+def correct_discretisation(
+    evaluator: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
+) -> None:
+    """Correct all later simulations for the discretisation error at a model near the data.
 
-The initial states belong to the options in use. An option is accepted only if it leaves at most a
-quarter of this excess with initial states of its own.
-"""
-MIN_CLEAR_MEAN_SQUARE = 9.0
-"""Minimum mean square of the residual, in units of the noise, at which that ratio counts.
+    An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate
+    it: for example dry friction that stops within a step and not at its end, or a servo that is
+    nearly too fast for the step. With the motion q(h) at step size h, the discretisation error is
 
-Nearer to the noise, the residual also depends on the initial states.
-"""
+        2 q(h / 4) - q(h / 2) - q(h)                                                           (2)
 
+    to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
+    any higher order.
 
-class OptionAlternative(NamedTuple):
-    """Settings with other options than those in use.
-
-    Attributes:
-        numerics: the settings.
-        squares: sum of squares of the residual with them, in units of the noise.
-    """
-
-    numerics: IntegratorSettings
-    squares: float
-
-
-def rank_option_alternatives(
-    evaluator: RunEvaluator, noise: NoiseModel, theta: Array, initial_states: Array
-) -> list[OptionAlternative]:
-    """Simulate the runs with alternative solver options, and rank those that explain them better.
-
-    1. Compute the sum of squares that an alternative must not exceed. Another value of an option
-       that has been changed already needs no large decrease.
-    2. Simulate all alternatives.
-    3. Leave out those that make the same motion as a better one.
-
-    Shapes: R runs, P parameters, s states of a run.
+    Shapes: R runs, P parameters.
 
     Args:
         evaluator: evaluator of the recorded runs of a robot.
         noise: noise of each channel.
-        theta: (P,) parameters of the fitted model.
-        initial_states: (R, s) initial states.
-
-    Returns:
-        The alternatives, the smallest sum of squares first.
+        theta: (P,) parameters of a model near the data.
+        states: (R, s) initial states of the model.
     """
-    kind = evaluator.kind
-    assert issubclass(kind, RobotSimulator)
-    is_recorded = np.isfinite(evaluator.observed)
-
-    def simulate(numerics: IntegratorSettings) -> Array:
-        """Return the simulated readings in units of the noise, zero where none is recorded."""
-        motion = simulate_with_settings(evaluator, numerics, theta, initial_states)
-        return np.where(is_recorded, motion, 0.0) / noise.sigma
-
-    observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma
-    samples = max(int(is_recorded.sum()), 1)
-    # 1. Limits.
-    present = float(np.square(simulate(kind.numerics) - observed).sum())
-    limit = present - MIN_SQUARES_DECREASE
-    limit_of_other_option = limit
-    if present > MIN_CLEAR_MEAN_SQUARE * samples:
-        limit_of_other_option = samples + MAX_EXCESS_RATIO * (present - samples)
-    changed_options = list_changed_options(kind.robot, kind.numerics).keys()
-    # 2. Simulations.
-    ranked: list[tuple[OptionAlternative, Array]] = []
-    for numerics in _iterate_alternatives(kind):
-        evaluator.search_control.check_not_stopped()
-        motion = simulate(numerics)
-        squares = float(np.square(motion - observed).sum())
-        options = list_changed_options(kind.robot, numerics).keys()
-        if squares < (limit if options == changed_options else limit_of_other_option):
-            ranked.append((OptionAlternative(numerics, squares), motion))
-    # 3. Distinct motions.
-    ranked.sort(key=lambda pair: pair[0].squares)
-    distinct: list[tuple[OptionAlternative, Array]] = []
-    for alternative, motion in ranked:
-        differences = [float(np.square(motion - known).sum()) / samples for _, known in distinct]
-        if all(difference >= MIN_DISTINCT_CHANGE**2 for difference in differences):
-            distinct.append((alternative, motion))
-    return [alternative for alternative, _ in distinct]
-
-
-def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSettings]:
-    """Yield solver settings that differ from the present ones in one option.
-
-    The solver and its iterations count as one option. Values that are closer to common settings
-    come first.
-
-    Args:
-        kind: Simulator class of the robot.
-    """
-    settings = kind.numerics
-    present = settings.to_model_options()
-    for name in ("cone", "impratio", "noslip_iterations", "solver", "iterations"):
-        present.setdefault(name, read_option(kind.robot, name))
-    values_by_option = {
-        "cone": list(CONE_IDS.values()),
-        "impratio": IMPEDANCE_RATIOS,
-        "noslip_iterations": NOSLIP_ITERATIONS,
-        "integrator": list(INTEGRATOR_IDS.values()),
-    }
-    for name, option_values in values_by_option.items():
-        for number in option_values:
-            if number != present[name]:
-                yield settings.replace_options({name: number})
-    for solver in (present["solver"], *SOLVER_IDS.values()):
-        for iterations in (present["iterations"], *SOLVER_ITERATIONS[::-1]):
-            changed = {"solver": solver, "iterations": iterations}
-            options = {name: n for name, n in changed.items() if n != present[name]}
-            if options:
-                yield settings.replace_options(options)
+    if not evaluator.has_linearisation:
+        return
+    assert issubclass(evaluator.kind, RobotSimulator)
+    effects = [*evaluator.library, *evaluator.extra_effects]
+    run_count = len(evaluator.prepared_runs)
+    scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
+    thetas = np.tile(theta, (run_count, 1))
+    initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
+    half_step_kind = evaluator.kind.with_half_step()
+    # Motions with the usual step, half of it and a quarter of it.
+    simulated = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
+    for kind in (half_step_kind, half_step_kind.with_half_step()):
+        finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
+        simulated.append(finer.simulate_batch(thetas, scenarios, initial_states))
+    # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
+    evaluator.simulation_count += 7 * run_count
+    correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (2)
+    squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
+    # A large error cannot be removed by this correction.
+    if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
+        evaluator.discretisation_correction = np.nan_to_num(correction)

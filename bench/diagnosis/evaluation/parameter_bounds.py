@@ -1,16 +1,17 @@
-"""Ranges of effect coefficients: where they are plausible, and where a fit may move them.
+"""Ranges of parameters and effect coefficients: plausible values, and the bounds of a fit.
 
-Times and frequencies follow the time scale of the recording (`evaluation.run_data`).
+Times and frequencies follow the time scale of the recording (`evaluation.plausible_ranges`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 
-from bench.diagnosis.evaluation.run_data import is_instant
+from bench.diagnosis.evaluation.plausible_ranges import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.effect import Coefficient, Effect, Friction
 from sims.core.simulator import Array, Parameter
@@ -48,6 +49,13 @@ RELATIVE_BOUND_TOLERANCE = 1e-3
 It applies in addition to `BOUND_TOLERANCE`.
 """
 
+WIDENING_FACTOR = 4.0
+"""Factor by which a range is widened in one round."""
+MAX_WIDENING_ROUNDS = 5
+"""Maximum number of rounds: the range is then a thousand times as wide."""
+
+Bounds = tuple[float, float]
+"""Lower and upper end of a range."""
 Bound = Literal["low", "high"]
 """End of a range that a value lies at."""
 
@@ -189,3 +197,150 @@ def _compute_fit_bounds(
         range_factor = MAX_RANGE_FACTOR_MODEL_FILE
     # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
     return range_factor * low, range_factor * high
+
+
+def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]:
+    """Return the coefficients of an effect as parameters, with units and plausible ranges.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+    """
+    return evaluator.parameters[evaluator.coefficient_slices[name]]
+
+
+def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
+    """Return the range of a base parameter, widened until it contains a value.
+
+    It is widened at most `MAX_WIDENING_ROUNDS` times.
+
+    Args:
+        evaluator: run evaluator of the runs to which models are fitted.
+        place: index of the parameter.
+        value: value that the range must contain; None for the widest range.
+    """
+    parameter = evaluator.parameters[place]
+    limits = get_physical_limits(evaluator, place)
+    for _ in range(MAX_WIDENING_ROUNDS):
+        low, high = parameter.bounds
+        if value is not None and low <= value <= high:
+            break
+        parameter = replace(parameter, bounds=widen_range(parameter, limits), training=None)
+    return parameter.bounds
+
+
+def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> None:
+    """Replace the ranges of parameters of a run evaluator.
+
+    Args:
+        evaluator: the runs for fitting; its parameters are replaced.
+        new_bounds: new range of each parameter, by name.
+    """
+    if not new_bounds:
+        return
+    evaluator.parameters = tuple(
+        replace(p, bounds=new_bounds[p.name], training=None) if p.name in new_bounds else p
+        for p in evaluator.parameters
+    )
+    # Workers that were forked before still have the narrow ranges.
+    evaluator.worker_pool.forget(evaluator)
+
+
+def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
+    """Return the physical limits of a base parameter; for a robot, those of its total value.
+
+    For example, a mass cannot be negative. A robot's free number is a correction of a number in its
+    model file; without an upper limit it is limited to a multiple of its plausible range.
+
+    Args:
+        evaluator: run evaluator of the runs to which models are fitted.
+        place: index of the parameter.
+    """
+    parameter = evaluator.parameters[place]
+    if evaluator.kind.has_model:
+        coefficient = _get_coefficient(evaluator.kind, parameter.name)
+        if coefficient is not None:
+            lower_limit, upper_limit = coefficient.least, coefficient.most
+            return (
+                -np.inf if lower_limit is None else lower_limit,
+                MAX_RANGE_FACTOR_MODEL_FILE * coefficient.plausible[0][1]
+                if upper_limit is None
+                else upper_limit,
+            )
+    return _get_physical_limits(parameter)
+
+
+def _get_coefficient(kind: Any, name: str) -> Any:
+    """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
+
+    It is None for a parameter of the simulator itself.
+
+    Args:
+        kind: class of the simulator.
+        name: name of the freed parameter, such as ``EFFECT`` or ``EFFECT.COEFFICIENT``.
+    """
+    for effect in kind.system.freed_effects:
+        for c in effect.coefficients:
+            if name in (effect.name, f"{effect.name}.{c.name}"):
+                return c
+    return None
+
+
+def _get_physical_limits(parameter: Parameter) -> Bounds:
+    """Return the limits of a declared parameter from its unit and its range.
+
+    A parameter with a nonnegative range stays nonnegative, and a share is at most 1.
+    """
+    low, high = parameter.bounds
+    share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
+    return 0.0 if low >= 0.0 else -np.inf, 1.0 if share else np.inf
+
+
+def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
+    """Return the next wider range of a parameter, which is at most as wide as its limits.
+
+    The sign of the range is kept: only a range with negative values grows below zero.
+
+    Args:
+        parameter: the parameter with its present range.
+        limits: its physical limits.
+    """
+    low, high = parameter.bounds
+    width = high - low
+    # A positive parameter stays positive, so its range grows by a factor on both sides.
+    lower = (
+        low / WIDENING_FACTOR if low > 0.0 else low - (WIDENING_FACTOR - 1.0) * width * (low < 0.0)
+    )
+    upper = high * WIDENING_FACTOR if low >= 0.0 else high + (WIDENING_FACTOR - 1.0) * width
+    return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
+
+
+def describe_unusual_values(
+    evaluator: RunEvaluator, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]
+) -> list[str]:
+    """Return a sentence for each fitted parameter that lies outside its declared range.
+
+    The report shows them, because such a value often means a wrong unit or constant.
+
+    Shapes: P parameters.
+
+    Args:
+        evaluator: run evaluator of the runs to which models are fitted.
+        theta: (P,) fitted parameters.
+        wider: by parameter name, the declared range and the wider range that was used.
+    """
+    sentences = []
+    for parameter_index in evaluator.base_indices.tolist():
+        parameter, value = evaluator.parameters[parameter_index], float(theta[parameter_index])
+        if parameter.name not in wider:
+            continue
+        (low, high), (wide_low, wide_high) = wider[parameter.name]
+        if low <= value <= high:
+            continue
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        sentences.append(
+            f"{parameter.name} = {value:.4g}{unit} lies outside its usual range, {low:g} to "
+            f"{high:g}{unit}; the range was widened to {wide_low:g} to {wide_high:g}{unit}. "
+            "Check the units and constants of the recording"
+        )
+    return sentences

@@ -1,4 +1,8 @@
-"""Select the starts of fits with one more effect, among high-scoring effects and initial values."""
+"""Starts of fits with one more effect: high-scoring effects, and several initial coefficients.
+
+Least squares finds only the nearest local minimum. End stops, frequencies and event times have many
+of them, so that their fits start from several values.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +11,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.parameter_bounds import (
+    compute_coefficient_bounds,
+    list_coefficients,
+)
+from bench.diagnosis.evaluation.plausible_ranges import is_instant, is_period
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
 from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
-from bench.diagnosis.search.candidate_directions import DirectionSet
-from bench.diagnosis.search.coefficient_start_values import (
-    generate_event_times,
-    generate_neighbouring_end_stops,
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
+from bench.diagnosis.search.candidate_directions import (
+    EVENT_TIME_COUNT,
+    DirectionSet,
+    generate_end_stops,
 )
 from bench.diagnosis.search.score_test import CandidateScores, DirectionGroup
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Parameter
 
 MAX_REFITS_BY_SQUARES = 3
 """Number of best candidates by sum of squares that are refitted in addition.
@@ -47,6 +55,20 @@ Scores are linear, so a smaller size is tried, too.
 """
 RANGE_SHARES = (0.2, 0.7, 1.5)
 """Shares of the plausible range at which fits of a single coefficient start in addition."""
+END_STOP_STIFFNESS_FACTORS = (0.3, 1.0, 3.0)
+"""Stiffness factors of end stops that a fit starts from, relative to the best-scoring one."""
+END_STOP_DEPTH_SHARES = tuple(np.geomspace(0.002, 0.4, 10).tolist())
+"""Depths of end stops within the range of a coordinate, as shares of the range."""
+REFIT_STIFFNESS_FACTORS = (0.25, 0.5, 2.0, 4.0)
+"""Stiffness factors of alternative end stops with the same turning point as the fitted one."""
+MAX_EVENT_TIME_SUBDIVISIONS = 16
+"""Maximum number of times between two tried event times at which a fit starts."""
+EVENT_TIME_SHIFTS_SAMPLES = (-8, -4, -2, -1, 1, 2, 4, 8)
+"""Shifts of the time of a single event that are tried, in samples."""
+FREQUENCY_SHIFTS_CYCLES = (-1.0, -0.5, 0.5, 1.0)
+"""Shifts of a frequency or period that are tried, in cycles over the longest run."""
+CONTACT_DEPTH_EXPONENT = -0.4
+"""Exponent of the stiffness in the depth of contact of a motion with given energy."""
 
 
 def select_refit_starts(
@@ -345,3 +367,148 @@ def _select_nearest_start(
         if cost < lowest_cost:
             best[key] = cost, start
     return [start for _, start in best.values()]
+
+
+def generate_neighbouring_end_stops(
+    evaluator: RunEvaluator, name: str, c: Array
+) -> Iterator[Array]:
+    """Yield end stops (k,) on the same side as a given one; nothing for other effects.
+
+    They are starts of a fit near an end stop with a good score. All depths are tried, because the
+    stiffness determines the depth of contact.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        c: (k,) coefficients of the given end stop.
+    """
+    if evaluator.available_effects[name].coefficients[0].of == "stop":
+        bound_share = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
+        # Simulating a robot costs a hundred times as much, so fewer stops are tried.
+        stiffness_factors, depth_shares = (
+            ((1.0,), END_STOP_DEPTH_SHARES[::2])
+            if evaluator.has_linearisation
+            else (END_STOP_STIFFNESS_FACTORS, END_STOP_DEPTH_SHARES)
+        )
+        yield from generate_end_stops(
+            evaluator,
+            name,
+            side=np.sign(c[0]),
+            stiffness_shares=[bound_share * factor for factor in stiffness_factors],
+            depth_shares=depth_shares,
+        )
+
+
+def generate_equal_travel_end_stops(
+    evaluator: RunEvaluator, name: str, c: Array
+) -> Iterator[Array]:
+    """Yield softer and harder end stops (k,) with the same turning point as a given one.
+
+    They are starts for a fit, since stiffness and position of a stop are nearly interchangeable.
+    The depth of contact for a motion of equal energy is proportional to k^(-2/5), with the
+    stiffness k, by eq. (2) of `sims.effects.state_limits`.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        c: (k,) coefficients of the given end stop.
+    """
+    low, high = evaluator.get_coordinate_range(name)
+    if evaluator.available_effects[name].coefficients[0].of != "stop" or not c[0]:
+        return
+    end = high if c[0] > 0 else low
+    for factor in REFIT_STIFFNESS_FACTORS:
+        end_stop = c.copy()
+        end_stop[0] = factor * c[0]
+        end_stop[1] = end - (end - c[1]) * factor**CONTACT_DEPTH_EXPONENT
+        yield end_stop
+
+
+def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+    """Yield coefficients (k,) with other event times near a given one, between the time stamps.
+
+    A fit cannot move an event time over a sample, because the cost has a step there. The times
+    cover the interval to the next event times that scores have tried. Nothing is generated for
+    effects without an event time.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        c: (k,) given coefficients.
+    """
+    for i, parameter in enumerate(list_coefficients(evaluator, name)):
+        if not is_instant(parameter):
+            continue
+        clock_start, clock_end = evaluator.time_span
+        stamps = np.unique(
+            np.concatenate([run_data.scenario.times for run_data in evaluator.prepared_runs])
+        )
+        midpoints = (stamps[1:] + stamps[:-1]) / 2.0
+        near_midpoints = midpoints[
+            np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
+        ]
+        # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced.
+        stride = -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
+        for instant in near_midpoints[::stride].tolist():
+            coefficients = c.copy()
+            coefficients[i] = instant
+            yield coefficients
+
+
+def generate_shifted_starts(evaluator: RunEvaluator, fit: TrajectoryFit) -> Iterator[FitStart]:
+    """Yield starts with shifted frequencies, periods, event times and end stops.
+
+    Least squares stops at the nearest of the many local minima that such effects have, so fits
+    start from several of them.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        fit: fit whose effects are shifted.
+    """
+    for name in fit.effects:
+        for coefficients in generate_equal_travel_end_stops(
+            evaluator, name, fit.theta[evaluator.coefficient_slices[name]]
+        ):
+            theta = fit.theta.copy()
+            theta[evaluator.coefficient_slices[name]] = coefficients
+            yield FitStart(fit.effects, theta, fit.initial_states)
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for i, index in enumerate(evaluator.get_coefficient_indices(name)):
+            parameter = evaluator.parameters[index]
+            fitted_value = float(fit.theta[index])
+            for shifted_value in _shift_frequency_or_time(
+                evaluator, parameter, fitted_value, evaluator.get_effect_travel(name)
+            ):
+                theta = fit.theta.copy()
+                theta[index] = np.clip(shifted_value, *bounds[i])
+                yield FitStart(fit.effects, theta, fit.initial_states)
+
+
+def _shift_frequency_or_time(
+    evaluator: RunEvaluator, parameter: Parameter, value: float, travel: float
+) -> Iterator[float]:
+    """Yield shifted values of a frequency, a period or an event time.
+
+    The shifts are about the distance of neighbouring local minima: event times are shifted by
+    samples, frequencies by fractions of a cycle over the longest run, and periods, which are
+    lengths of travel of a joint, by fractions of a cycle over its largest travel.
+
+    Args:
+        evaluator: evaluator, whose longest run determines how far a frequency is shifted.
+        parameter: coefficient, with its unit and plausible range.
+        value: value to shift, in the unit of the coefficient.
+        travel: largest range of the position within one run, in m or rad, for periods over
+            position.
+    """
+    if is_instant(parameter):
+        for samples in EVENT_TIME_SHIFTS_SAMPLES:
+            yield value + samples * evaluator.sample_interval
+        return
+    for cycles in FREQUENCY_SHIFTS_CYCLES:
+        if parameter.unit == "Hz":
+            yield value + cycles / evaluator.longest_duration
+        elif is_period(parameter, travel) and value > 0:
+            frequency = 1.0 / value + cycles / travel
+            # Beyond the longest period, the frequency might become negative.
+            lowest = 1.0 / parameter.bounds[1]
+            yield 1.0 / max(frequency, lowest)

@@ -1,0 +1,154 @@
+"""Largest recorded values of the quantities that effects limit: inputs, rates, errors, levels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.diagnosis.evaluation.parameter_bounds import list_coefficients
+from bench.diagnosis.evaluation.run_data import RunData
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.core.effect import Effect, members_of
+from sims.core.simulator import Array
+
+MIN_PROFILE_SECONDS = 0.05
+"""Duration in seconds below which the motion profile of a servo is hardly visible."""
+
+
+def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
+    """Return the largest values that the limited quantity of an effect reaches in the runs.
+
+    A limit above such a value changes nothing, so the search tries fractions of it. The quantity
+    is, for example, the input, its rate, or the error of a servo.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+
+    Returns:
+        One value for each member of the effect (a family has several).
+    """
+    effect = evaluator.available_effects[name]
+    members = members_of(effect)
+    kind = effect.coefficients[0].of
+    if kind == "give":
+        # The coefficients after the first one are shape parameters.
+        return np.array([list_coefficients(evaluator, name)[0].bounds[1]])
+    if kind == "drive" or (kind == "level" and not _get_limited_channel(evaluator, effect)):
+        # The range of the quantity is not recorded, so the plausible range is used.
+        return np.array([p.bounds[1] for p in list_coefficients(evaluator, name)])
+    if kind == "travel":
+        return np.array([evaluator.get_effect_travel(name)])
+    level_functions = {
+        "input/s": _compute_max_input_rate,
+        "input/s^2": _compute_max_input_acceleration,
+        "error": _compute_max_servo_error,
+        "level": _compute_max_level,
+    }
+    level_function = level_functions.get(kind, _get_largest_input)
+    return np.array(
+        [
+            max(level_function(evaluator, run_data, member) for run_data in evaluator.prepared_runs)
+            for member in members
+        ]
+    )
+
+
+def _get_command(run_data: RunData, effect: Effect) -> Array:
+    """Return the input signal (T,) of a run on which an effect acts.
+
+    It is the first input if the effect names none, and zero if the run has no such input.
+
+    Args:
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect on an input.
+    """
+    signals = run_data.scenario.inputs
+    zero_signal = np.zeros(run_data.scenario.times.size)
+    first_signal = next(iter(signals.values()), zero_signal)
+    return signals.get(effect.signal, zero_signal) if effect.signal else first_signal
+
+
+def _get_largest_input(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest magnitude of the input of an effect in a run.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect on an input.
+    """
+    return float(np.abs(_get_command(run_data, effect)).max())
+
+
+def _compute_max_input_rate(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest rate of change of an effect's input in a run, in its unit per second.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect on an input.
+    """
+    changes = np.abs(np.diff(_get_command(run_data, effect)))
+    return float((changes / np.diff(run_data.scenario.times)).max(initial=0.0))
+
+
+def _compute_max_input_acceleration(
+    evaluator: RunEvaluator,  # noqa: ARG001
+    run_data: RunData,
+    effect: Effect,
+) -> float:
+    """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
+
+    Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
+    limit that is tried.
+
+    Args:
+        evaluator: unused; all level functions have the same arguments.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect on an input.
+    """
+    return 4.0 * float(np.ptp(_get_command(run_data, effect))) / MIN_PROFILE_SECONDS**2
+
+
+def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
+    """Return the channel of the stored quantity, such as a tank's level, that an effect limits.
+
+    It is empty if the quantity is not recorded.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        effect: effect that limits a stored quantity.
+    """
+    name = effect.place or evaluator.simulator.system.levels[0]
+    return name if name in evaluator.channels else ""
+
+
+def _compute_max_level(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:
+    """Return the maximum of the stored quantity, such as a tank's level, recorded in a run.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect that limits the quantity.
+    """
+    levels = run_data.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
+    return float(np.nanmax(levels, initial=0.0))
+
+
+def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:
+    """Return the largest difference of command and position of a servo in a run.
+
+    It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        run_data: recorded run, prepared for fitting: scenario and observed samples.
+        effect: effect on the command of the servo.
+    """
+    system = evaluator.simulator.system
+    place = system.primary if effect.coordinate is None else effect.coordinate
+    name = system.coordinates[place]
+    if name not in evaluator.channels:
+        return 0.0
+    motor_position = system.gear(place) * run_data.observed[:, evaluator.channels.index(name)]
+    error = _get_command(run_data, effect) - motor_position
+    return float(np.nanmax(np.abs(error), initial=0.0))
