@@ -293,7 +293,7 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
     Raises:
         CheckError: an effect of one place changes several places.
     """
-    from sims.robot.dynamics.series_joints import add_elements, list_added_elements
+    from sims.robot.dynamics.added_elements import add_elements, list_added_elements
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
     native = MODEL_FIELD_EFFECTS[effect.of]

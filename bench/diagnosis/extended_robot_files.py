@@ -40,9 +40,9 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     kind: Any = extended.kind
     if kind is None or not kind.has_model:
         return ExtendedRobotFiles({})
-    from sims.robot.export.mjcf_document import strip_heading
     from sims.robot.export.round_trip_check import check_written_files
     from sims.robot.export.write_model_file import write_model_files
+    from sims.robot.export.xml_editing import strip_heading
     from sims.robot.parsing.read_model_file import restore_floating_joints
 
     # Models with all meshes are compiled several times, which needs the memory of the search.

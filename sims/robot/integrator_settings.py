@@ -1,18 +1,14 @@
-"""Time step, integrator and solver options of a robot, and stiff friction constraints.
-
-MuJoCo models dry friction as a constraint with the parameters `solref` and `solimp`
-(https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). Its defaults are
-soft, so that a joint at rest creeps; effects add stiff friction.
-"""
+"""Time step, integrator and solver options of a robot: from its model file or a recording."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, cast
 
-import numpy as np
-
+from sims.core import toml_validation
 from sims.core.engine import IntegrationBatch, Trajectories
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.robot.parsing.floating_bases import fix_bases
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
@@ -43,8 +39,6 @@ OPTION_EFFECTS: Mapping[str, str] = {
     "numerics.iterations": "iterations",
 }
 """Options of a model file by the effect that names them as a cause."""
-MAX_RK4_FRICTION_RATE = 2.5
-"""Largest decay rate of stiff friction at which RK4 does not chatter, in 1 / time step."""
 
 
 class IntegratorSettings(NamedTuple):
@@ -170,84 +164,47 @@ def specifies_integrator(robot: RobotModel) -> bool:
     return robot.format == "mjcf" or read_integrator_settings(robot) != DEFAULT_SETTINGS
 
 
-Fields = Mapping[str, Any]
-"""Model fields of L batch elements by name, arrays (L, ...)."""
+class EngineTable(TypedDict, total=False):
+    """Table ``[engine]`` of a recording."""
 
-FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Parameter `solimp` of stiff dry friction: the hardest value that MuJoCo allows.
-
-With it a joint at rest hardly creeps.
-"""
-
-SOLREF_PLACEHOLDER_STIFFNESS = -1e-9
-"""Placeholder for the stiffness in `solref` of dry friction, which has no stiffness.
-
-The negative value makes MuJoCo read the second number as a damping.
-"""
+    timestep: float
+    integrator: str
+    fix_base: bool
+    recorded_bases: tuple[str, ...]
 
 
-def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]:
-    """Return `solref` of stiff dry friction, which stops a velocity within one step.
+MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
+"""Smallest and largest allowed time step, in seconds."""
 
-    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
-    the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
-    tolerate `MAX_RK4_FRICTION_RATE` / h, and 3 / h chatters. MuJoCo's default time constant,
-    0.02 s, creeps at rest.
+
+def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
+    """Apply the table ``[engine]`` of a recording to a model: its time step, integrator and base.
 
     Args:
-        timestep: time step h in seconds.
-        integrator: MuJoCo's number of the integrator.
+        spec: a mujoco.MjSpec; it is changed in place.
+        table: ``timestep`` in s, ``integrator`` by MuJoCo's name, and whether to ``fix_base``.
+        source: beginning of error messages.
+
+    Returns:
+        Notes about the fixed bodies and omitted keyframes.
+
+    Raises:
+        InputError: the table is invalid.
     """
-    if integrator == RK4_INTEGRATOR_ID:
-        return (SOLREF_PLACEHOLDER_STIFFNESS, -MAX_RK4_FRICTION_RATE / timestep)
-    return (2.0 * timestep, 1.0)
-
-
-def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, dofs: Any) -> None:
-    """Set the solver parameters of dry friction that effects add, in the form of the robot.
-
-    Time step and integrator are taken from the fields if they contain them, else from the file.
-
-    Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: its `friction_form` decides; ``soft`` keeps the parameters of the file.
-        batch_indices: index of the batch elements.
-        dofs: index of the joints' velocities.
-    """
-    if robot.friction_form == "soft":
-        return
-    option = robot.compiled.opt
-    timestep = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
-    integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
-    solref = get_friction_solref(float(timestep), int(integrator))
-    fields["dof_solref"][batch_indices, dofs] = solref
-    fields["dof_solimp"][batch_indices, dofs] = FRICTION_SOLIMP
-
-
-def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
-    """Return damping b (1/s) and impedance d of MuJoCo's constraint for friction loss.
-
-    The constraint has the reference acceleration -b v at the velocity v. The values are those of
-    the form in which effects add friction to the robot.
-
-    Args:
-        robot: robot with the time step and the integrator in use.
-        dof: index of the joint's velocity.
-    """
-    import mujoco
-
-    model = robot.compiled
-    solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
-    if robot.friction_form == "stiff":
-        solref = get_friction_solref(float(model.opt.timestep), int(model.opt.integrator))
-        solimp = FRICTION_SOLIMP
-    timeconst, ratio = (float(value) for value in solref)
-    limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    (at_rest, largest), width = limits.tolist(), float(solimp[2])
-    # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
-    d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
-    if timeconst <= 0:
-        return -ratio / largest, d
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
-        timeconst = max(timeconst, 2.0 * float(model.opt.timestep))
-    return 2.0 / (largest * timeconst), d
+    settings = toml_validation.check_entries(
+        source, "engine", table, toml_validation.get_type_hints_of(EngineTable)
+    )
+    if "timestep" in settings:
+        step = toml_validation.check_finite(source, "engine.timestep", settings["timestep"])
+        if not MIN_TIME_STEP <= step <= MAX_TIME_STEP:
+            raise toml_validation.make_error(
+                source, "engine.timestep", f"{MIN_TIME_STEP:g} to {MAX_TIME_STEP:g} s", step
+            )
+        spec.option.timestep = step
+    if "integrator" in settings:
+        name = settings["integrator"]
+        if name not in INTEGRATOR_IDS:
+            error = make_unknown_name_error("integrator", name, list(INTEGRATOR_IDS))
+            raise InputError(f"{source}: engine: {error}")
+        spec.option.integrator = INTEGRATOR_IDS[name]
+    return fix_bases(spec) if settings.get("fix_base") else []

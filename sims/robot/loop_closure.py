@@ -1,4 +1,6 @@
-"""Poses in which the loops of a robot are closed: unmeasured joints follow from the measured ones.
+"""Closed loops of a robot: the joints that they couple, and poses in which they are closed.
+
+In such a pose, unmeasured joints follow from the measured ones.
 
 Equality constraints of MuJoCo (connect, weld, joint and tendon) have residuals r(q) and Jacobian
 J = dr/dq. With the measured joints m fixed, the unmeasured joints u satisfy r(q) = 0, found by
@@ -108,3 +110,79 @@ def _solve_constraints(
             return jacobian
         data.qpos[positions] += step
     return None
+
+
+def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
+    """Return the groups of joints that constraints of a MuJoCo model couple.
+
+    Their motions are not independent, so effects at them may be indistinguishable. A `connect` or
+    `weld` constraint couples the joints between its two bodies and their common ancestor. A joint
+    equality couples its two joints.
+
+    Args:
+        model: compiled MuJoCo model (`mujoco.MjModel`).
+        dofs: index of the degree of freedom of each joint.
+
+    Returns:
+        Sets of joint numbers (indices into `dofs`), each with at least two joints. Sets that share
+        a joint are merged.
+    """
+    import mujoco
+
+    joint_of_dof = {int(dof): joint for joint, dof in enumerate(dofs)}
+    constraint_types, object_types = mujoco.mjtEq, mujoco.mjtObj
+    groups: list[set[int]] = []
+    for constraint in range(model.neq):
+        kind = int(model.eq_type[constraint])
+        first_object = int(model.eq_obj1id[constraint])
+        second_object = int(model.eq_obj2id[constraint])
+        if kind == int(constraint_types.mjEQ_JOINT):
+            coupled_dofs = [
+                int(model.jnt_dofadr[joint])
+                for joint in (first_object, second_object)
+                if joint >= 0
+            ]
+        elif kind in (int(constraint_types.mjEQ_CONNECT), int(constraint_types.mjEQ_WELD)):
+            if int(model.eq_objtype[constraint]) == int(object_types.mjOBJ_SITE):
+                first_object, second_object = (
+                    int(model.site_bodyid[site]) for site in (first_object, second_object)
+                )
+            first_ancestors = _list_ancestors(model, first_object)
+            second_ancestors = _list_ancestors(model, second_object)
+            coupled_dofs = [
+                dof
+                for body in set(first_ancestors) ^ set(second_ancestors)
+                for dof in _get_dofs(model, body)
+            ]
+        else:
+            continue
+        group = {joint_of_dof[dof] for dof in coupled_dofs if dof in joint_of_dof}
+        overlapping_groups = [other_group for other_group in groups if other_group & group]
+        groups = [other_group for other_group in groups if not other_group & group]
+        groups.append(group.union(*overlapping_groups))
+    return [group for group in groups if len(group) > 1]
+
+
+def _list_ancestors(model: Any, body: int) -> list[int]:
+    """Return a body and all its ancestors, including the world.
+
+    Args:
+        model: compiled model.
+        body: number of the body.
+    """
+    bodies = [body]
+    while body > 0:
+        body = int(model.body_parentid[body])
+        bodies.append(body)
+    return bodies
+
+
+def _get_dofs(model: Any, body: int) -> range:
+    """Return the velocity addresses of a body's own joints; empty if it has none.
+
+    Args:
+        model: compiled model.
+        body: number of the body.
+    """
+    first = int(model.body_dofadr[body])
+    return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)

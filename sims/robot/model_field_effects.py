@@ -33,13 +33,13 @@ import numpy as np
 
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_geom, find_pair
+from sims.robot.dry_friction import write_friction_form
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
     compute_principal_axes,
 )
-from sims.robot.integrator_settings import write_friction_form
-from sims.robot.places.centre_of_mass_limits import observable_tilts
+from sims.robot.places.observable_axes import observable_tilts
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 
 MIN_FACTOR = 1e-6

@@ -15,7 +15,7 @@ import numpy as np
 
 from sims.core.freed_memory import release_free_memory
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.parsing import collision_hulls
+from sims.robot.parsing.collision_filters import find_colliding_geoms
 from sims.robot.parsing.collision_hulls import (
     MIN_FACES,
     TESTED_VERSION_PREFIX,
@@ -218,7 +218,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     """
     import mujoco
 
-    collision_mask = collision_hulls.find_colliding_geoms(model)
+    collision_mask = find_colliding_geoms(model)
     is_tested_version = mujoco.__version__.startswith(TESTED_VERSION_PREFIX)
     hull_by_mesh: dict[str, Hull] = {}
     geom_numbers: dict[str, int] = {}

@@ -164,7 +164,7 @@ class RobotModel:
         actuator_tables: actuators that a recording added, by name, as specified there.
         engine_table: time step and integrator that a recording specified instead of the file's.
         recorded_bases: floating joints that are replaced by slides and hinges, since their pose is
-            recorded (`sims.robot.parsing.recorded_bases`).
+            recorded (`sims.robot.parsing.floating_bases`).
         speeds: velocity limits of joints in a URDF, rad/s or m/s; an MJCF specifies none.
         series: added joints in series with others (`dynamics.series_joints`): inertia about them by
             name, kg or kg m^2; only these joints are not in the model file.

@@ -9,10 +9,9 @@ over the step.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,30 +28,24 @@ from sims.robot.dynamics.activation_filters import (
     extend_into_past,
     select_initial_activations,
 )
-from sims.robot.dynamics.applied_inputs import (
-    SAME_INSTANT_SHARE,
-    STEP_COUNT_TOLERANCE,
-    compute_inputs_over_steps,
-)
-from sims.robot.dynamics.batch_work import (
-    BatchInputs,
-    BatchResult,
-    BatchStart,
-    RobotRunBatch,
-    group_by_run,
-    list_last_read_times,
-)
-from sims.robot.dynamics.drive_limits import compute_off_steps, find_working_servos
-from sims.robot.dynamics.effect_forces import (
+from sims.robot.dynamics.active_effects import (
     changes_derived_constants,
-    compute_time_dependent_forces,
     find_active_elements,
     is_evaluated_per_step,
     pad_coefficients,
     select_model_field_effects,
     slice_active_effects,
 )
-from sims.robot.dynamics.midpoint_state import IndexArray
+from sims.robot.dynamics.added_elements import AddedElements, group_by_added_elements
+from sims.robot.dynamics.applied_inputs import (
+    SAME_INSTANT_SHARE,
+    STEP_COUNT_TOLERANCE,
+    compute_inputs_over_steps,
+)
+from sims.robot.dynamics.disabled_drives import compute_off_steps, find_working_servos
+from sims.robot.dynamics.drive_force_sensors import DriveSensorModel
+from sims.robot.dynamics.effect_force_program import StepForces
+from sims.robot.dynamics.effect_forces import compute_time_dependent_forces
 from sims.robot.dynamics.mujoco_batch import (
     BATCH_SIZE,
     JointAddresses,
@@ -60,9 +53,16 @@ from sims.robot.dynamics.mujoco_batch import (
     RefusedModelError,
     get_batch_cache,
 )
-from sims.robot.dynamics.sensor_sampling import DriveSensorModel, sample_readings
-from sims.robot.dynamics.series_joints import AddedElements, group_by_added_elements
-from sims.robot.dynamics.step_forces import StepForces
+from sims.robot.dynamics.run_batches import (
+    BatchInputs,
+    BatchResult,
+    BatchStart,
+    RobotRunBatch,
+    group_batch_elements,
+    group_by_run,
+    list_last_read_times,
+)
+from sims.robot.dynamics.sensor_sampling import sample_readings
 from sims.robot.dynamics.stepping_with_forces import step_with_forces
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.integrator_settings import (
@@ -255,7 +255,7 @@ class RobotSimulator(SystemSimulator):
         all_observations = np.full((len(x), max_samples, len(self.channels)), np.nan)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for indices in _group_batch_elements(acting, len(x)):
+            for indices in group_batch_elements(acting, len(x)):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
                 order = np.argsort(runs.scenario_index[indices], kind="stable")
                 sorted_indices = indices[order]
@@ -682,31 +682,6 @@ class RobotSimulator(SystemSimulator):
         if kind == "tau":
             return self._get_batch(False, 1).drives[element_name]
         return next(s for s in self.robot.sensors if s.name == element_name).address
-
-
-def _group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArray]:
-    """Yield the indices of batch elements that can be simulated together.
-
-    Their effects add the same elements to the model; all or none of them change constants that
-    MuJoCo derives; and the forces of all or none are evaluated in every step.
-
-    Shapes: L batch elements, K coefficients.
-
-    Args:
-        acting: active effects, with coefficients (K, L, 1).
-        count: number L of batch elements.
-    """
-    kinds = np.stack(
-        [
-            find_active_elements(acting, count, needs_work)
-            for needs_work in (is_evaluated_per_step, changes_derived_constants)
-        ]
-    )
-    for indices in group_by_added_elements(acting, count).values():
-        for kind in product((False, True), repeat=2):
-            is_in_group = np.all(kind == kinds[:, indices].T, axis=1)
-            if is_in_group.any():
-                yield np.array(indices)[is_in_group]
 
 
 def make_robot_simulator(

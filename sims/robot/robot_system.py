@@ -15,16 +15,15 @@ from sims.core.simulator import Channel, InputError, Parameter, make_unknown_nam
 from sims.core.system import System, SystemKind
 from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.series_joints import find_compile_error, list_added_elements
+from sims.robot.dynamics.added_elements import find_compile_error, list_added_elements
 from sims.robot.floating_joints import FloatingJoints
-from sims.robot.loop_closure import close_loops
+from sims.robot.loop_closure import close_loops, coupled_joints
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
-from sims.robot.places import effect_places
+from sims.robot.places import placed_effect_classes
 from sims.robot.places.default_excitation import LazyDefaultRecording
 from sims.robot.places.place_list import (
     MUJOCO_EFFECT_WORDS,
     EffectPlace,
-    coupled_joints,
     list_places,
     make_contact_place,
     make_geom_place,
@@ -52,7 +51,7 @@ class RobotSystem(System):
         gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
         activations: names under which a recording may specify initial activations of filters.
         refused_inputs: reason why a recording cannot contain an input, by input.
-        traced: compiled effects by inputs (`sims.robot.dynamics.step_forces`).
+        traced: compiled effects by inputs (`sims.robot.dynamics.effect_force_program`).
     """
 
     name = "robot"
@@ -104,7 +103,7 @@ class RobotSystem(System):
         """
         if effect.name not in cls._placed:
             cls._placed[effect.name] = tuple(
-                effect_places.make_effect_classes(
+                placed_effect_classes.make_effect_classes(
                     effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles_with
                 )
             )
@@ -169,10 +168,10 @@ class RobotSystem(System):
         if registered.at == "contact" and PAIR_SEPARATOR in place:
             # The contacts of a recording are candidates, but any contact may be named.
             effect_place = make_contact_place(cls.robot, place, (place,))
-            return effect_places.make_placed_effect(registered, effect_place)
+            return placed_effect_classes.make_placed_effect(registered, effect_place)
         if registered.at == "geom" and place not in ("", ALL_PLACES):
             effect_place = make_geom_place(cls.robot, place)
-            return effect_places.make_placed_effect(registered, effect_place)
+            return placed_effect_classes.make_placed_effect(registered, effect_place)
         if not effects_by_name:
             raise InputError(f"robot {cls.name} cannot have effect {effect_name}")
         if not place:
@@ -220,7 +219,7 @@ class RobotSystem(System):
         # Shared effects, such as delays, have one number for all places.
         members = (
             ()
-            if name in effect_places.SHARED_COEFFICIENT_EFFECTS
+            if name in placed_effect_classes.SHARED_COEFFICIENT_EFFECTS
             else getattr(placed_effect, "members", ())
         )
         return [type(member) for member in members] or [placed_effect]

@@ -326,8 +326,8 @@ def _render_class(
         notes: Notes for the comment of the class.
     """
     from sims.robot.export.apply_causes import apply_causes
-    from sims.robot.export.mjcf_document import NotEditableError
-    from sims.robot.export.write_model_file import render_default_class, render_model_using_class
+    from sims.robot.export.default_class import render_default_class, render_model_using_class
+    from sims.robot.export.xml_editing import NotEditableError
 
     applied = apply_causes(robot, causes, sheet.extended.title)
     ids = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None

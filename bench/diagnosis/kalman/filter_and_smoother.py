@@ -9,7 +9,7 @@ h(x̄[i]),
     δ[i] = δ- + K_i e[i],            P[i] = P- - K_i S_i K_iᵀ                                  (3)
     log L = - Σ_i (log det S_i + e_iᵀ S_i⁻¹ e_i) / 2                                           (4)
 
-with Q the variances of missing forces and J_i those of jumps (`dynamics.drive_limits`). (R.
+with Q the variances of missing forces and J_i those of jumps (`dynamics.servo_force_limits`). (R.
 E.
 Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737.) The smoother
 is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,

@@ -39,7 +39,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.fit_starts import add_effect_to_start
 from sims.core.simulator import Array
-from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
+from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 
 MAX_REGRESSION_PROPOSALS = 4

@@ -27,7 +27,7 @@ from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.places.place_list import coupled_joints
+from sims.robot.loop_closure import coupled_joints
 from sims.robot.robot_simulator import RobotSimulator
 
 JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")

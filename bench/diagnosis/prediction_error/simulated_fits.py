@@ -27,7 +27,7 @@ from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
 from sims.core.simulator import Array
-from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
+from sims.robot.dynamics.active_effects import TIME_DEPENDENT_EFFECTS
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)

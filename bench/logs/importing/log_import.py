@@ -25,7 +25,7 @@ from bench.logs.recording_loading import load_recording
 from sims.core.files import write_files
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import check_known_names, toml_key, toml_text
-from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
+from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.robot_model import Joint, RobotModel
 
 FREE_GAINS = "actuator.stiffness", "actuator.damping"

@@ -108,7 +108,7 @@ def _can_touch(model: Any) -> bool:
     # These imports are needed for robots only.
     import mujoco
 
-    from sims.robot.parsing.collision_hulls import can_collide
+    from sims.robot.parsing.collision_filters import can_collide
 
     is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     return not is_disabled and can_collide(model)

@@ -14,7 +14,7 @@ from sims.core.effect import ActiveEffects, Input
 from sims.core.simulator import Array, Scenario
 from sims.engines.step_inputs import compute_applied_inputs
 from sims.engines.time_grid import ScenarioGroups, TimeGrid
-from sims.robot.dynamics.effect_forces import slice_active_effects
+from sims.robot.dynamics.active_effects import slice_active_effects
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 
 SAME_INSTANT_SHARE = 1e-6

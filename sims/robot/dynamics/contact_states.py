@@ -29,8 +29,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.core.simulator import Array, Scenario
-from sims.robot.dynamics.batch_work import RobotRunBatch
-from sims.robot.dynamics.effect_forces import select_model_field_effects
+from sims.robot.dynamics.active_effects import select_model_field_effects
+from sims.robot.dynamics.run_batches import RobotRunBatch
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_simulator import RobotSimulator
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array, Scenario
-from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
+from sims.robot.dynamics.active_effects import LOAD_DEPENDENT_EFFECTS
 from sims.robot.dynamics.linearisation_about_simulation import (
     EffectWithCoefficients,
     RunLinearisation,

@@ -15,14 +15,14 @@ from sims.robot.dynamics.applied_inputs import (
     RunInputs,
     compute_changed_inputs,
 )
-from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
-from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
+from sims.robot.dynamics.joint_scales import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
     LinearisationPoints,
     RobotMotion,
 )
 from sims.robot.dynamics.midpoint_state import compute_midpoint_loads, forces_are_at_step_end
+from sims.robot.dynamics.run_batches import BatchInputs, RobotRunBatch
 from sims.robot.dynamics.sensor_sampling import (
     apply_effects_to_readings,
     find_sample_steps,

@@ -16,27 +16,25 @@ import numpy as np
 from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
 from sims.recording.recorded_poses import POSITION_AXES
-from sims.robot.dynamics.drive_limits import ForceRanges, Mask, find_working_servos
-from sims.robot.dynamics.effect_forces import (
+from sims.robot.dry_friction import get_friction_constraint
+from sims.robot.dynamics.active_effects import (
     LOAD_DEPENDENT_EFFECTS,
     StepEffects,
+    is_in_drive,
+    select_model_field_effects,
+)
+from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, find_working_servos
+from sims.robot.dynamics.effect_forces import (
     compute_drive_effect_forces,
     compute_effect_forces,
     compute_friction_limits,
     compute_hidden_state_forces,
-    is_in_drive,
     make_snapshot,
-    select_model_field_effects,
 )
-from sims.robot.dynamics.midpoint_state import (
-    IndexArray,
-    advance_state,
-    forces_are_at_step_end,
-    integrate_state,
-)
+from sims.robot.dynamics.hidden_states import advance_state, integrate_state
+from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_end
 from sims.robot.dynamics.mujoco_batch import JointAddresses, MujocoBatch
 from sims.robot.floating_joints import FloatingState
-from sims.robot.integrator_settings import get_friction_constraint
 from sims.robot.robot_system import RobotSystem
 from sims.robot.state_snapshots import RobotSnapshot
 

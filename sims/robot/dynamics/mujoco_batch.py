@@ -22,26 +22,24 @@ import numpy as np
 from sims.core.effect import ActiveEffects
 from sims.core.mujoco_import import disable_step_profiler
 from sims.core.simulator import Array
-from sims.robot.dynamics.drive_limits import (
+from sims.robot.dry_friction import write_friction_form
+from sims.robot.dynamics.added_elements import AddedElements, add_elements
+from sims.robot.dynamics.disabled_drives import (
     FORCE_FIELDS,
-    ForceLimits,
     ForceRanges,
-    find_stiff_force_limits,
     iterate_constant_stretches,
 )
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.series_joints import (
     USED_FIELDS,
     WRITTEN_FIELDS,
-    AddedElements,
-    add_elements,
     compute_rest_positions,
     convert_flank_parameters,
     is_series_effect,
     write_series_effects,
 )
+from sims.robot.dynamics.servo_force_limits import ForceLimits, find_stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
-from sims.robot.integrator_settings import write_friction_form
 from sims.robot.model_field_effects import (
     CONTACT_FIELDS,
     COUPLING_FIELD,
@@ -50,7 +48,7 @@ from sims.robot.model_field_effects import (
 )
 from sims.robot.model_simplification import strip_assets
 from sims.robot.mujoco_messages import format_mujoco_error
-from sims.robot.parsing import collision_hulls
+from sims.robot.parsing.collision_filters import can_collide
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 BATCH_SIZE = 64
@@ -223,7 +221,7 @@ class MujocoBatch:
         model = compile_batch_model(robot, derived)
         # A failed simulation must become NaN; an automatic reset by MuJoCo would hide the failure.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        if not collision_hulls.can_collide(model):
+        if not can_collide(model):
             # Collision detection without possible contacts takes a third of a step of one joint.
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = find_drive_sensors(model, robot)

@@ -1,4 +1,4 @@
-"""Recorded samples of a channel, and corrected readings of drive-force sensors.
+"""Recorded samples of a channel, interpolated between steps, with sensor effects.
 
 Between two steps of length h, with values a, b and slopes a', b' at their ends, a position at the
 fraction s of the step is
@@ -12,7 +12,6 @@ with unknown slope is interpolated linearly.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,21 +19,6 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Sensor, Signal
 from sims.core.simulator import Array
 from sims.engines.time_grid import is_active
-from sims.robot.coupled_drives import find_preceding_joint
-from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.batch_work import BatchInputs
-from sims.robot.dynamics.drive_limits import find_working_servos
-from sims.robot.dynamics.effect_forces import (
-    compute_drive_effect_forces,
-    find_active_elements,
-    is_in_drive,
-    make_snapshot,
-    slice_active_effects,
-)
-from sims.robot.dynamics.mujoco_batch import MujocoBatch
-from sims.robot.model_field_effects import COUPLING_FIELD, get_coupling_address
-from sims.robot.robot_model import Actuator, RobotModel
-from sims.robot.robot_system import RobotSystem
 from sims.system_simulator import apply_sensor_effects
 
 TIME_TOLERANCE_SHARE = 1e-6
@@ -199,131 +183,3 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
         - s * s * rest * end_change
     )
     return cubic
-
-
-@dataclass(frozen=True)
-class DriveSensorModel:
-    """Drive-force readings of the batch elements of one MuJoCo batch.
-
-    Attributes:
-        robot: robot that is simulated.
-        system: system of the robot.
-        batch: MuJoCo batch.
-        given: inputs of the batch elements.
-        step: step length in seconds.
-    """
-
-    robot: RobotModel
-    system: RobotSystem
-    batch: MujocoBatch
-    given: BatchInputs
-    step: float
-
-    def shift_to_step_begin(self, readings: Array) -> None:
-        """Shift readings (n, S, k) from the mean command of a step to its initial command.
-
-        MuJoCo applies the mean of a command over a step, but a sensor of the drive force shows the
-        force at the beginning. The difference of the two commands times the actuator's force per
-        unit of command is added, within its force limits. If a drive is coupled to the preceding
-        joint, that reading changes too. The readings are changed in place.
-
-        Shapes: S steps.
-        """
-        given, mujoco_batch = self.given, self.batch
-        batch_size = len(readings)
-        for actuator in self.robot.actuators:
-            control_change = (
-                given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
-            )
-            control_change = np.where(given.off[:, :, actuator.id], 0.0, control_change)
-            if actuator.joint not in mujoco_batch.drives or not control_change.any():
-                continue
-            column = readings[:, :, mujoco_batch.drives[actuator.joint]]
-            unshifted = column.copy()
-            column += control_change * self._compute_force_per_control(actuator)[:batch_size, None]
-            np.clip(column, *self._get_force_limits(actuator), out=column)
-            if actuator.joint in mujoco_batch.robot.coupled:
-                preceding_joint = find_preceding_joint(self.robot, actuator.joint)
-                assert preceding_joint is not None
-                coupling_coefficients: Array = mujoco_batch.fields[COUPLING_FIELD][
-                    :batch_size, get_coupling_address(mujoco_batch.robot, actuator.joint)
-                ]
-                readings[:, :, mujoco_batch.drives[preceding_joint.name]] += coupling_coefficients[
-                    :, None
-                ] * (column - unshifted)
-
-    def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
-        """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
-
-        The simulation applies these effects as external forces, so MuJoCo's sensors do not contain
-        them.
-
-        Shapes: S steps, D joints.
-
-        Args:
-            readings: (n, S, k) sensor readings; changed in place.
-            x: (n, S + 1, D) positions.
-            v: (n, S + 1, D) velocities.
-            acting: active effects with their coefficients.
-        """
-        batch_indices = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
-        if not batch_indices.size:
-            return
-        mujoco_batch, given, steps = self.batch, self.given, readings.shape[1]
-        columns = [mujoco_batch.drives[name.removeprefix("q.")] for name in self.system.coordinates]
-        drive_readings = readings[batch_indices][:, :, columns]
-
-        def flatten(values: Array) -> Array:
-            """Stack all sample times of the selected batch elements into one axis."""
-            return values[batch_indices, :steps].reshape(batch_indices.size * steps, -1)
-
-        inputs = {name: flatten(u) for name, u in given.applied_inputs.items()}
-        for actuator in self.robot.actuators:
-            # The output of an activation filter does not change within a step.
-            if not self._is_filtered(actuator):
-                inputs[f"u.{actuator.name}"] = flatten(given.instant[:, :, actuator.control])
-        t = np.tile(self.step * np.arange(float(steps)), batch_indices.size)[:, None]
-        drive = drive_readings.reshape(batch_indices.size * steps, -1)
-        carried = np.stack([drive, np.zeros_like(drive)])
-        stiffness = np.repeat(
-            mujoco_batch.get_servo_stiffness(mujoco_batch.file_joints)[batch_indices], steps, axis=0
-        )
-        if given.off.any():
-            is_servo_on = find_working_servos(
-                mujoco_batch.robot,
-                mujoco_batch.file_joints.velocities,
-                given.off[batch_indices, :steps],
-            )
-            stiffness = stiffness * is_servo_on.reshape(stiffness.shape)
-        snapshot = make_snapshot(self.system, t, flatten(x), flatten(v), inputs, carried, stiffness)
-        selected = slice_active_effects(
-            tuple((e, c) for e, c in acting if is_in_drive(e)), batch_indices
-        )
-        repeated = tuple((e, np.repeat(c, steps, axis=1)) for e, c in selected)
-        drive_readings += compute_drive_effect_forces(repeated, snapshot).reshape(
-            drive_readings.shape
-        )
-        readings[batch_indices[:, None, None], np.arange(steps)[:, None], columns] = drive_readings
-
-    def _compute_force_per_control(self, actuator: Actuator) -> Array:
-        """Return the immediate joint force per unit of an actuator's control, (N,)."""
-        gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
-        gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]
-        direct = actuator.kind in ("motor", "position", "velocity")
-        direct = direct and not self._is_filtered(actuator)
-        return gear * gain if direct else np.zeros_like(gain)
-
-    def _is_filtered(self, actuator: Actuator) -> bool:
-        """Return whether a filter precedes the actuator, so that controls act with a delay."""
-        return any(one.actuator == actuator for one in activation_filters(self.robot))
-
-    def _get_force_limits(self, actuator: Actuator) -> tuple[float, float]:
-        """Return lower and upper limit of an actuator's joint force; infinite if unspecified.
-
-        The actuator's own limit is multiplied by its gear; the joint may have a limit, too.
-        """
-        gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
-        low, high = actuator.force or (-np.inf, np.inf)
-        assert actuator.joint is not None
-        effort = self.robot.joint(actuator.joint).effort or np.inf
-        return max(gear * low, -effort), min(gear * high, effort)

@@ -24,10 +24,10 @@ from sims.engines.compiled.mujoco_callback import (
     MAX_DATA_WORDS,
     CallbackContext,
 )
-from sims.robot.dynamics.drive_limits import iterate_constant_stretches
+from sims.robot.dynamics.disabled_drives import iterate_constant_stretches
+from sims.robot.dynamics.effect_force_program import StepForces
 from sims.robot.dynamics.midpoint_state import Mask, MidpointPredictor
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
-from sims.robot.dynamics.step_forces import StepForces
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 
 MIN_FRICTION = 1e-12

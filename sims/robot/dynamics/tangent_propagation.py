@@ -38,7 +38,7 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Effect
 from sims.core.simulator import Array
-from sims.robot.dynamics.effect_forces import is_in_drive
+from sims.robot.dynamics.active_effects import is_in_drive
 from sims.robot.dynamics.linearisation_points import LinearisationPoints
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import MujocoBatch

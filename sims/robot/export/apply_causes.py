@@ -29,10 +29,10 @@ from sims.robot.dynamics.series_joints import (
     prepare_flanks_for_file,
     write_series_element,
 )
+from sims.robot.export.input_effect_writers import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
     ATTRIBUTES_BY_KIND,
-    COMMAND_WRITERS,
     ENUM_ATTRIBUTES,
     FLAG_ATTRIBUTES,
     INTEGER_ATTRIBUTES,
@@ -44,9 +44,8 @@ from sims.robot.export.mjcf_attributes import (
     copy_model_fields,
     find_differing_statements,
     find_missing_statements,
-    get_application_order,
 )
-from sims.robot.export.model_comparison import format_spec
+from sims.robot.export.mjcf_writer import format_spec
 from sims.robot.fitted_causes import FittedCause, expand_families, is_gravity_compensated
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.robot_model import RobotModel

@@ -1,12 +1,16 @@
-"""Write attributes and comments into an MJCF source document."""
+"""Write attributes, comments and added elements into an MJCF, or a whole spec as MJCF."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sims.robot.coupled_drives import find_preceding_joint
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
     ENUM_ATTRIBUTES,
@@ -20,14 +24,16 @@ from sims.robot.export.mjcf_attributes import (
     get_enum_word,
     list_all_attributes,
 )
-from sims.robot.export.mjcf_document import (
-    MjcfDocument,
+from sims.robot.export.mjcf_document import MjcfDocument
+from sims.robot.export.xml_editing import (
     NotEditableError,
     XmlElement,
     format_element,
     format_number,
     format_numbers,
 )
+from sims.robot.model_field_effects import get_coupling_address
+from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 
 _ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 """Attributes that are alternatives to ``quat`` and ``diaginertia``."""
@@ -282,3 +288,171 @@ def _format_values(name: str, values: tuple[float, ...]) -> str:
         last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
         return format_numbers(values[: last_nonzero + 1])
     return format_numbers(values)
+
+
+EXACT_DIGITS = 17
+"""Number of significant digits with which every float64 number is read back exactly."""
+
+
+def format_spec(spec: Any, folder: Path) -> str:
+    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
+
+    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
+    the notation of the model file.
+
+    Args:
+        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
+        folder: folder to which the paths of its assets are relative.
+
+    Returns:
+        The MJCF text.
+
+    Raises:
+        RuntimeError: this MuJoCo library has no function that sets the number of digits.
+    """
+    spec.meshdir = str(folder / spec.meshdir)
+    spec.texturedir = str(folder / spec.texturedir)
+    spec.compiler.savecompiled = False
+    spec.compiler.savecanonical = False
+    library = _load_library()
+    try:
+        digits = library._mjPRIVATE__get_xml_precision()
+        library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
+    except AttributeError:
+        raise RuntimeError("this MuJoCo writes models with six digits only") from None
+    try:
+        return str(spec.to_xml())
+    finally:
+        library._mjPRIVATE__set_xml_precision(digits)
+
+
+@cache
+def _load_library() -> Any:
+    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
+    import mujoco
+
+    folder = Path(mujoco.__file__).parent
+    names = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
+    (path, *_) = [library_path for name in names for library_path in sorted(folder.glob(name))]
+    return ctypes.CDLL(str(path))
+
+
+def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
+    """Return the text of the model file with the elements that causes add, and a fixed base.
+
+    These elements are joints in series (second joints of flexible or slack drives), tendons of
+    coupled drives, and pairs of geoms with contact parameters of their own. Their numbers are
+    written afterwards. Without any of them, the text is unchanged.
+
+    Args:
+        robot: robot with the added elements.
+        model: compiled model with the causes.
+
+    Raises:
+        NotEditableError: the text does not contain a required joint, actuator or geom.
+    """
+    text = robot.path.read_bytes()
+    has_fixed_base = robot.engine_table.get("fix_base", False)
+    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
+        return text
+    document = MjcfDocument(text, robot.path)
+    # Free joints and keyframes are removed, as by `parsing.floating_bases.fix_bases`.
+    for tag in document.walk() if has_fixed_base else ():
+        is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+        if tag.name in ("freejoint", "keyframe") or is_free:
+            tag.text = b""
+    if robot.coupled:
+        _write_couplings(document, robot, model)
+    _add_pairs(document, robot)
+    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
+    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        joint_tag = tags.get(series_joint.name.rpartition("_")[0])
+        if joint_tag is None:
+            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
+        joint_tag.after.append(_render_series_joint(series_joint))
+    return document.to_text().encode()
+
+
+def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
+    """Write the couplings of joints: a fixed tendon for each, which the joint's actuators drive.
+
+    The length of the tendon is q + c q_first, with the coefficient c and the preceding joint
+    q_first.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: robot with the couplings.
+        model: compiled model with the causes, which has the coefficients of the couplings.
+
+    Raises:
+        NotEditableError: the text lacks a joint or an actuator of the compiled model.
+    """
+    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
+    if len(tags) != len(robot.actuators):
+        raise NotEditableError("the compiled model has other actuators")
+    for name in robot.coupled:
+        first = find_preceding_joint(robot, name)
+        assert first is not None
+        joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+        if not {name, first.name} <= joint_names:
+            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
+        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
+        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
+        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
+        document.root.within.append(([], f"<tendon>{tendon}</tendon>"))
+        for actuator in (a for a in robot.actuators if a.joint == name):
+            tags[actuator.id].removed |= {"joint", "jointinparent"}
+            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
+
+
+def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
+    """Write the elements `<pair>` of a robot that the text lacks.
+
+    A pair states the parameters of one contact; it refers to its geoms by their names.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: the robot with its pairs.
+
+    Raises:
+        NotEditableError: a geom has no name in the text.
+    """
+    existing_pairs = document.find_pairs()
+    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
+    for pair in robot.spec.pairs:
+        geoms = [pair.geomname1, pair.geomname2]
+        if frozenset(geoms) in existing_pairs:
+            continue
+        if not set(geoms) <= names:
+            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
+        attributes = {"name": pair.name, "geom1": geoms[0], "geom2": geoms[1]}
+        attributes["condim"] = str(pair.condim)
+        for name in ("friction", "solref", "solimp"):
+            attributes[name] = format_numbers(tuple(getattr(pair, name)))
+        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
+        pair_text = format_element("pair", attributes)
+        document.root.within.append(([], f"<contact>{pair_text}</contact>"))
+
+
+def _render_series_joint(second: Any) -> str:
+    """Render a joint in series as an MJCF element, with all attributes stated.
+
+    The file's default classes then have no influence on it. `is_limited` is whether its range is
+    limited, which represents backlash.
+    """
+    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
+    is_limited = str(second.limited).endswith("TRUE")
+    attributes = {
+        "name": second.name,
+        "type": kind,
+        "axis": format_numbers(tuple(second.axis)),
+        "pos": format_numbers(tuple(second.pos)),
+        "limited": "true" if is_limited else "false",
+        "actuatorfrclimited": "false",
+    }
+    if is_limited:
+        attributes["range"] = format_numbers(tuple(second.range))
+        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
+        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
+    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
+    return format_element("joint", attributes)

@@ -1,62 +1,13 @@
-"""Save MuJoCo models with full precision, and compare compiled models field by field."""
+"""Compare compiled MuJoCo models field by field."""
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-EXACT_DIGITS = 17
-"""Number of significant digits with which every float64 number is read back exactly."""
-
 _IGNORED_NAME_PARTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
 """Parts of the names of model fields that do not influence the motion."""
-
-
-def format_spec(spec: Any, folder: Path) -> str:
-    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
-
-    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
-    the notation of the model file.
-
-    Args:
-        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
-        folder: folder to which the paths of its assets are relative.
-
-    Returns:
-        The MJCF text.
-
-    Raises:
-        RuntimeError: this MuJoCo library has no function that sets the number of digits.
-    """
-    spec.meshdir = str(folder / spec.meshdir)
-    spec.texturedir = str(folder / spec.texturedir)
-    spec.compiler.savecompiled = False
-    spec.compiler.savecanonical = False
-    library = _load_library()
-    try:
-        digits = library._mjPRIVATE__get_xml_precision()
-        library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
-    except AttributeError:
-        raise RuntimeError("this MuJoCo writes models with six digits only") from None
-    try:
-        return str(spec.to_xml())
-    finally:
-        library._mjPRIVATE__set_xml_precision(digits)
-
-
-@cache
-def _load_library() -> Any:
-    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
-    import mujoco
-
-    folder = Path(mujoco.__file__).parent
-    names = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
-    (path, *_) = [library_path for name in names for library_path in sorted(folder.glob(name))]
-    return ctypes.CDLL(str(path))
 
 
 def find_first_difference(first_model: Any, second_model: Any, tolerance: float) -> str | None:

@@ -20,9 +20,8 @@ from sims.robot.export.write_model_file import (
     WrittenModelFiles,
 )
 from sims.robot.fitted_causes import expand_families
-from sims.robot.inertia_tensors import compute_inertia_tensors
+from sims.robot.inertia_tensors import MIN_MOMENT, compute_inertia_tensors
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.parsing.compile_repairs import MIN_MOMENT
 from sims.robot.robot_model import RobotModel
 
 MOTION_TOLERANCE = 1e-9

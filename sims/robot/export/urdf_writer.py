@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from sims.core.simulator import Array
 from sims.robot.export.mjcf_attributes import UnstatableCauseError
-from sims.robot.export.mjcf_document import (
+from sims.robot.export.xml_editing import (
     XmlElement,
     XmlText,
     format_heading,

@@ -1,98 +1,26 @@
-"""Repairs that MuJoCo needs to compile a model file, and engine settings of a description."""
+"""Repairs that MuJoCo needs to compile a model file."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
-from sims.core import toml_validation
-from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.simulator import Array, InputError
+from sims.robot.inertia_tensors import (
+    MIN_MOMENT,
+    ROUNDING_SHARE,
+    compose_inertia_tensor,
+    compute_principal_moments,
+    compute_triangle_violation,
+    find_nearest_valid_moments,
+    format_moments,
+)
 from sims.robot.mujoco_messages import format_item_list, format_mujoco_error, format_name_list
 from sims.robot.parsing.mesh_files import OmittedShapes, find_assets_of_file, remove_asset
 from sims.robot.parsing.xml_files import ModelFileReader
-
-MIN_MOMENT = 1e-9
-"""Moment of inertia, in kg m^2, that replaces moments that are not positive.
-
-It is the moment of 1 g at a distance of 1 mm.
-"""
-NEGLIGIBLE_MOMENT = 1e-14
-"""Largest moment of inertia, in kg m^2, that counts as zero; MuJoCo's own limit is 1e-15."""
-ROUNDING_SHARE = 1e-9
-"""Margin for rounding in the triangle inequality, as a share of the largest moment."""
-
-
-def compute_triangle_violation(moments: Array) -> float:
-    """Return by how much the moments violate the triangle inequality, in kg m^2.
-
-    The violation is the largest moment minus the sum of the two others; it is negative or zero for
-    a physically valid body.
-    """
-    return float(2 * np.max(moments) - np.sum(moments))
-
-
-def find_nearest_valid_moments(moments: Array) -> Array:
-    """Return the nearest physically valid moments of inertia, in kg m^2.
-
-    Moments that are not positive become `MIN_MOMENT`. Principal moments A <= B <= C of a rigid body
-    also satisfy A + B >= C. If A + B is smaller, the violation C - A - B is divided equally: the
-    largest moment is decreased and both others are increased by a third of it, with a margin for
-    rounding.
-
-    Args:
-        moments: (3,) principal moments in kg m^2.
-    """
-    raised_moments: Array = np.maximum(
-        moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0)
-    )
-    margin = ROUNDING_SHARE * np.max(raised_moments)
-    correction = (compute_triangle_violation(raised_moments) + margin) / 3
-    if correction <= margin / 3:  # without a violation
-        return raised_moments
-    return np.where(
-        raised_moments == np.max(raised_moments),
-        raised_moments - correction,
-        raised_moments + correction,
-    )
-
-
-def compute_principal_moments(entries: Sequence[float]) -> tuple[Array, Array]:
-    """Compute the principal moments and axes of an inertia tensor.
-
-    Args:
-        entries: xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
-
-    Returns:
-        Principal moments (3,) in kg m^2, and axes (3, 3) as columns.
-    """
-    xx, yy, zz, xy, xz, yz = entries
-    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    return moments, axes
-
-
-def compose_inertia_tensor(moments: Array, axes: Array) -> list[float]:
-    """Compose an inertia tensor from principal moments and axes.
-
-    Args:
-        moments: (3,) principal moments in kg m^2.
-        axes: (3, 3) principal axes as columns.
-
-    Returns:
-        Entries xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
-    """
-    tensor = axes @ np.diag(moments) @ axes.T
-    return [float(tensor[index]) for index in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-
-
-def format_moments(before: Array, after: Array) -> str:
-    """Format the moments before and after a repair, in kg m^2, as text of a note."""
-    rows = (", ".join(f"{moment:.4g}" for moment in sorted(row)) for row in (before, after))
-    return " -> ".join(rows)
-
 
 DEFAULT_BODY_MASS = 1e-6
 """Mass, in kg, given to a moving body without a mass."""
@@ -275,90 +203,3 @@ def _set_principal_moments(body: Any, moments: Array, axes: Array | None) -> Non
         body.inertia = moments
     else:
         body.fullinertia = compose_inertia_tensor(moments, axes)
-
-
-class EngineTable(TypedDict, total=False):
-    """Table ``[engine]`` of a recording."""
-
-    timestep: float
-    integrator: str
-    fix_base: bool
-    recorded_bases: tuple[str, ...]
-
-
-INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
-"""Names of integrators, in the order of MuJoCo's mjtIntegrator."""
-
-
-MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
-"""Smallest and largest allowed time step, in seconds."""
-
-
-def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
-    """Apply the table ``[engine]`` of a recording to a model: its time step, integrator and base.
-
-    Args:
-        spec: a mujoco.MjSpec; it is changed in place.
-        table: ``timestep`` in s, ``integrator`` by MuJoCo's name, and whether to ``fix_base``.
-        source: beginning of error messages.
-
-    Returns:
-        Notes about the fixed bodies and omitted keyframes.
-
-    Raises:
-        InputError: the table is invalid.
-    """
-    import mujoco
-
-    settings = toml_validation.check_entries(
-        source, "engine", table, toml_validation.get_type_hints_of(EngineTable)
-    )
-    if "timestep" in settings:
-        step = toml_validation.check_finite(source, "engine.timestep", settings["timestep"])
-        if not MIN_TIME_STEP <= step <= MAX_TIME_STEP:
-            raise toml_validation.make_error(
-                source, "engine.timestep", f"{MIN_TIME_STEP:g} to {MAX_TIME_STEP:g} s", step
-            )
-        spec.option.timestep = step
-    if "integrator" in settings:
-        name = settings["integrator"]
-        if name not in INTEGRATORS:
-            raise InputError(
-                f"{source}: engine: {make_unknown_name_error('integrator', name, INTEGRATORS)}"
-            )
-        spec.option.integrator = int(mujoco.mjtIntegrator(INTEGRATORS.index(name)))
-    return fix_bases(spec) if settings.get("fix_base") else []
-
-
-def fix_bases(spec: Any) -> list[str]:
-    """Fix all free bodies where the model file has them, and return notes about it.
-
-    Keyframes are left out, since they have the coordinates of free joints.
-
-    Args:
-        spec: a mujoco.MjSpec; it is changed in place.
-    """
-    import mujoco
-
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    if not free:
-        return ["fix_base: no body of the model file floats"]
-    names = [joint.parent.name for joint in free]
-    for joint in free:
-        spec.delete(joint)
-    return [f"fixed in the pose of the model file: {', '.join(names)}{remove_keyframes(spec)}"]
-
-
-def remove_keyframes(spec: Any) -> str:
-    """Remove the keyframes (stored states) of a model, and return the end of a note about them.
-
-    A caller that changes joints must remove them, because they have values for the former
-    coordinates. The text is empty without them.
-
-    Args:
-        spec: a mujoco.MjSpec; it is changed in place.
-    """
-    keyframes = list(spec.keys)
-    for keyframe in keyframes:
-        spec.delete(keyframe)
-    return f"; {len(keyframes)} keyframes are left out" if keyframes else ""

@@ -13,6 +13,11 @@ import numpy as np
 from sims.core.freed_memory import release_free_memory
 from sims.core.plain_values import MAX_NUMBER, truncate_text
 from sims.core.simulator import InputError
+from sims.robot.integrator_settings import (
+    MAX_TIME_STEP,
+    MIN_TIME_STEP,
+    apply_engine_settings,
+)
 from sims.robot.mujoco_messages import (
     capture_mujoco_warnings,
     format_mujoco_error,
@@ -20,12 +25,11 @@ from sims.robot.mujoco_messages import (
 )
 from sims.robot.parsing import (
     added_actuators,
-    collision_hulls,
-    compile_repairs,
+    collision_filters,
+    element_names,
+    floating_bases,
     mjcf_loading,
-    recorded_bases,
     urdf_loading,
-    xml_files,
 )
 from sims.robot.parsing.compile_repairs import CompileRepairs
 from sims.robot.parsing.mesh_files import OmittedShapes
@@ -112,7 +116,7 @@ def _make_robot(
         engine: time step and integrator that the recording sets.
         warnings: list to which MuJoCo's warnings are appended while it compiles.
     """
-    source, notes = str(files.path), xml_files.rename_invalid_names(root)
+    source, notes = str(files.path), element_names.rename_invalid_names(root)
     repairs = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
         notes += urdf_loading.repair_urdf(files, root)
@@ -122,9 +126,9 @@ def _make_robot(
         mjcf_loading.read_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
-    notes += compile_repairs.apply_engine_settings(spec, engine, source)
-    notes += xml_files.name_unnamed_elements(spec)
-    bases, base_notes = recorded_bases.separate_floating_joints(
+    notes += apply_engine_settings(spec, engine, source)
+    notes += element_names.name_unnamed_elements(spec)
+    bases, base_notes = floating_bases.separate_floating_joints(
         spec, () if engine.get("fix_base") else engine.get("recorded_bases", ()), source
     )
     notes += base_notes
@@ -132,7 +136,7 @@ def _make_robot(
     spec, model = repairs.compile(spec)
     _check_model(files, model)
     exclusion_notes = (
-        collision_hulls.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
+        collision_filters.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
     )
     if exclusion_notes:
         spec, model = repairs.compile(spec)
@@ -180,8 +184,8 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     if model.njnt == 0:
         raise InputError(f"{files.path}: it has no movable joint")
     step = float(model.opt.timestep)
-    if not compile_repairs.MIN_TIME_STEP <= step <= compile_repairs.MAX_TIME_STEP:
-        span = f"{compile_repairs.MIN_TIME_STEP:g} to {compile_repairs.MAX_TIME_STEP:g} s"
+    if not MIN_TIME_STEP <= step <= MAX_TIME_STEP:
+        span = f"{MIN_TIME_STEP:g} to {MAX_TIME_STEP:g} s"
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)

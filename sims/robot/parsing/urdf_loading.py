@@ -12,9 +12,9 @@ import numpy as np
 
 from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.robot.integrator_settings import FRICTION_SOLIMP
+from sims.robot import inertia_tensors
+from sims.robot.dry_friction import FRICTION_SOLIMP
 from sims.robot.mujoco_messages import format_item_list, format_mujoco_error, format_name_list
-from sims.robot.parsing import compile_repairs
 from sims.robot.parsing.mesh_files import MeshLookup
 from sims.robot.parsing.xml_files import ModelFileReader, find_children, format_tree
 
@@ -85,7 +85,7 @@ def repair_inertials(
         change = _raise_moments(tensor, entries)
         if name in fixed_links or mass < FRAME_MASS_THRESHOLD or not change:
             continue
-        if max(map(abs, entries)) < compile_repairs.NEGLIGIBLE_MOMENT:
+        if max(map(abs, entries)) < inertia_tensors.NEGLIGIBLE_MOMENT:
             point_masses.append(name)
         else:
             raised_links.append(f"{name} {change}")
@@ -101,15 +101,15 @@ def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
         tensor: element with the inertia tensor, changed in place.
         entries: the six entries of the tensor, kg m².
     """
-    moments, axes = compile_repairs.compute_principal_moments(entries)
-    if moments[0] >= compile_repairs.NEGLIGIBLE_MOMENT:
+    moments, axes = inertia_tensors.compute_principal_moments(entries)
+    if moments[0] >= inertia_tensors.NEGLIGIBLE_MOMENT:
         return ""
-    after = compile_repairs.find_nearest_valid_moments(moments)
+    after = inertia_tensors.find_nearest_valid_moments(moments)
     for key, entry in zip(
-        TENSOR_ENTRIES, compile_repairs.compose_inertia_tensor(after, axes), strict=True
+        TENSOR_ENTRIES, inertia_tensors.compose_inertia_tensor(after, axes), strict=True
     ):
         tensor.set(key, repr(entry))
-    return compile_repairs.format_moments(moments, after)
+    return inertia_tensors.format_moments(moments, after)
 
 
 def _format_repair_notes(
@@ -124,7 +124,7 @@ def _format_repair_notes(
     """
     notes = []
     if point_masses:
-        min_moment = f"{compile_repairs.MIN_MOMENT:g} kg·m²"
+        min_moment = f"{inertia_tensors.MIN_MOMENT:g} kg·m²"
         notes.append(
             f"a mass and no moments of inertia, so it is a point mass ({min_moment}): "
             f"{format_name_list(point_masses)}"

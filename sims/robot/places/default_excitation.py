@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.system import DefaultRecording
-from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
+from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import Actuator, Joint, RobotModel
 

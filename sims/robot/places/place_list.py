@@ -1,4 +1,4 @@
-"""List of the places of a robot at which effects can act, coupled joints included.
+"""List of the places of a robot at which effects can act.
 
 Places are joints, actuators, bodies, channels, contacts of two geoms, and round geoms in contact.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +19,8 @@ from sims.robot.contact_pairs import (
     read_contact_parameters,
 )
 from sims.robot.coupled_drives import list_coupling_places
-from sims.robot.places.centre_of_mass_limits import (
-    compute_centre_of_mass_limits,
-    observable_axes,
-    observable_tilts,
-)
+from sims.robot.places.centre_of_mass_limits import compute_centre_of_mass_limits
+from sims.robot.places.observable_axes import observable_axes, observable_tilts
 from sims.robot.robot_model import Actuator, RobotModel
 
 MUJOCO_EFFECT_WORDS = {
@@ -128,7 +125,7 @@ def list_places(
 
 def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
     """List the joints with one coordinate; the index of each is that of its coordinate."""
-    from sims.robot.dynamics.inverse_dynamics import coefficient_scales
+    from sims.robot.dynamics.joint_scales import coefficient_scales
 
     scales = coefficient_scales(robot)
     may_be_coupled = list_coupling_places(robot)
@@ -375,79 +372,3 @@ def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float
         "spring.linear": float(model.jnt_stiffness[joint]),
         "drag.quadratic": float(np.ravel(model.dof_dampingpoly[dof])[0]),
     }
-
-
-def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
-    """Return the groups of joints that constraints of a MuJoCo model couple.
-
-    Their motions are not independent, so effects at them may be indistinguishable. A `connect` or
-    `weld` constraint couples the joints between its two bodies and their common ancestor. A joint
-    equality couples its two joints.
-
-    Args:
-        model: compiled MuJoCo model (`mujoco.MjModel`).
-        dofs: index of the degree of freedom of each joint.
-
-    Returns:
-        Sets of joint numbers (indices into `dofs`), each with at least two joints. Sets that share
-        a joint are merged.
-    """
-    import mujoco
-
-    joint_of_dof = {int(dof): joint for joint, dof in enumerate(dofs)}
-    constraint_types, object_types = mujoco.mjtEq, mujoco.mjtObj
-    groups: list[set[int]] = []
-    for constraint in range(model.neq):
-        kind = int(model.eq_type[constraint])
-        first_object = int(model.eq_obj1id[constraint])
-        second_object = int(model.eq_obj2id[constraint])
-        if kind == int(constraint_types.mjEQ_JOINT):
-            coupled_dofs = [
-                int(model.jnt_dofadr[joint])
-                for joint in (first_object, second_object)
-                if joint >= 0
-            ]
-        elif kind in (int(constraint_types.mjEQ_CONNECT), int(constraint_types.mjEQ_WELD)):
-            if int(model.eq_objtype[constraint]) == int(object_types.mjOBJ_SITE):
-                first_object, second_object = (
-                    int(model.site_bodyid[site]) for site in (first_object, second_object)
-                )
-            first_ancestors = _list_ancestors(model, first_object)
-            second_ancestors = _list_ancestors(model, second_object)
-            coupled_dofs = [
-                dof
-                for body in set(first_ancestors) ^ set(second_ancestors)
-                for dof in _get_dofs(model, body)
-            ]
-        else:
-            continue
-        group = {joint_of_dof[dof] for dof in coupled_dofs if dof in joint_of_dof}
-        overlapping_groups = [other_group for other_group in groups if other_group & group]
-        groups = [other_group for other_group in groups if not other_group & group]
-        groups.append(group.union(*overlapping_groups))
-    return [group for group in groups if len(group) > 1]
-
-
-def _list_ancestors(model: Any, body: int) -> list[int]:
-    """Return a body and all its ancestors, including the world.
-
-    Args:
-        model: compiled model.
-        body: number of the body.
-    """
-    bodies = [body]
-    while body > 0:
-        body = int(model.body_parentid[body])
-        bodies.append(body)
-    return bodies
-
-
-def _get_dofs(model: Any, body: int) -> range:
-    """Return the velocity addresses of a body's own joints; empty if it has none.
-
-    Args:
-        model: compiled model.
-        body: number of the body.
-    """
-    first = int(model.body_dofadr[body])
-    return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)

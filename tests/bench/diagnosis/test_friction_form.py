@@ -35,7 +35,7 @@ from bench.logs.recording_loading import load_joined
 from sims.extended_simulator import read_extended
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 from tests.bench.diagnosis.verdict_schema import check
-from tests.sims.robot.test_friction_form import ARM
+from tests.sims.robot.test_dry_friction import ARM
 
 NOISE, PLANTED = 1e-3, 0.06
 FORMS = {

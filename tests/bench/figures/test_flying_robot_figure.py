@@ -6,7 +6,7 @@ import pytest
 from bench.figures.camera_view import make_posed_data
 from bench.figures.robot_figure import locate_place
 from sims.robot.parsing.read_model_file import read_robot
-from tests.sims.robot.test_recorded_bases import BASE, QUADROTOR
+from tests.sims.robot.test_floating_bases import BASE, QUADROTOR
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from bench.core.plugin_registries import make_robot_simulator
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.mujoco_batch import get_batch_cache
-from sims.robot.parsing.collision_hulls import can_collide
+from sims.robot.parsing.collision_filters import can_collide
 
 MODEL = """<mujoco>{option}<worldbody>{floor}
   <body name="a"><joint type="slide"/><geom name="a" size="0.1"{mask}/>

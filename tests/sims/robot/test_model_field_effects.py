@@ -9,8 +9,8 @@ from mujoco.batch import Batch
 
 from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
+from sims.robot.dynamics.added_elements import add_elements
 from sims.robot.dynamics.mujoco_batch import make_batch_spec
-from sims.robot.dynamics.series_joints import add_elements
 from tests.sims.robot.sample_arms import ARM, robot
 
 ELBOW = 'damping="0.1" frictionloss="0.05" stiffness="0.5"'

@@ -15,8 +15,9 @@ from bench.diagnosis.evaluation.parameter_bounds import (
     is_unusual,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from sims.robot.dynamics.inverse_dynamics import coefficient_scales, compute_joint_scales
-from sims.robot.places.centre_of_mass_limits import compute_centre_of_mass_limits, observable_axes
+from sims.robot.dynamics.joint_scales import coefficient_scales, compute_joint_scales
+from sims.robot.places.centre_of_mass_limits import compute_centre_of_mass_limits
+from sims.robot.places.observable_axes import observable_axes
 from sims.robot.robot_simulator import make_robot_simulator
 from tests.bench.diagnosis.explained_samples import recorded
 from tests.sims.robot.sample_arms import ARM, robot

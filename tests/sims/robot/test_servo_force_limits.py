@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims.robot.dynamics.drive_limits import find_stiff_force_limits
+from sims.robot.dynamics.servo_force_limits import find_stiff_force_limits
 
 STEP, INERTIA, KP, KV, LIMIT = 0.002, 0.02, 2000.0, 100.0, 28.0
 SERVO = """

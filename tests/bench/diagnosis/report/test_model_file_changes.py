@@ -4,8 +4,8 @@ from pathlib import Path
 
 from bench.diagnosis.extended_robot_files import find_model_file_changes
 from sims.extended_simulator import FittedValue
-from sims.robot.export.mjcf_document import strip_heading
 from sims.robot.export.write_model_file import write_model_files
+from sims.robot.export.xml_editing import strip_heading
 from sims.robot.parsing.read_model_file import read_robot
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -11,7 +11,7 @@ import pytest
 from sims import effects
 from sims.core.simulator import InputError
 from sims.robot.dynamics.effect_forces import compute_time_dependent_forces, make_snapshot
-from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
+from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.dynamics.sensor_sampling import sample_readings
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator

@@ -1,7 +1,4 @@
-"""Limits of drives: steps in which they are switched off, and force limits of stiff servos.
-
-An actuator that is off gets a force range from zero to zero. So its force is zero whatever its
-kind, and MuJoCo's implicit integrators take no derivative of it, as for any force at a limit.
+"""Force limits of stiff servos, at which a simulated motion jumps.
 
 MuJoCo's implicit integrators treat the velocity gain kv of a servo implicitly, except in a step in
 which its force F is at a limit (`mjd_smooth_vel`: a clamped force does not depend on the velocity).
@@ -16,107 +13,12 @@ model does not contain such jumps.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sims.core.simulator import Array, Scenario
+from sims.core.simulator import Array
 from sims.robot.dynamics.inverse_dynamics import inertia_matrix
-from sims.robot.robot_model import RobotModel
-
-Mask = NDArray[np.bool_]
-
-FORCE_FIELDS = ("actuator_forcelimited", "actuator_forcerange")
-"""Model fields that switch an actuator off: whether its force is limited, and its force range."""
-SAMPLED_STEP_FRACTION = 0.5
-"""Fraction of a step after which the on/off state of an actuator is sampled for the whole step."""
-
-
-def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps: int) -> Mask:
-    """Compute in which steps of a run each actuator is switched off.
-
-    The state is held from one sample of the recording to the next.
-
-    Args:
-        robot: robot whose actuators are meant.
-        scenario: run with its sample times and the actuators that are off at each sample.
-        step: step length in seconds.
-        steps: number S of steps.
-
-    Returns:
-        (S, K) whether each of the K actuators is off.
-    """
-    off_steps = np.zeros((steps, len(robot.actuators)), dtype=bool)
-    if not scenario.off:
-        return off_steps
-    stamps = scenario.times - scenario.times[0] + scenario.offset
-    middles = step * (np.arange(float(steps)) + SAMPLED_STEP_FRACTION)
-    sample_indices = np.clip(np.searchsorted(stamps, middles, side="right") - 1, 0, stamps.size - 1)
-    for name, off in scenario.off.items():
-        off_steps[:, robot.actuator(name).id] = off[sample_indices]
-    return off_steps
-
-
-def iterate_constant_stretches(off: Mask) -> Iterator[slice]:
-    """Yield the slices of steps within which no element of an on/off mask (n, S, K) changes."""
-    changes = np.flatnonzero((off[:, 1:] != off[:, :-1]).any(axis=(0, 2))) + 1
-    edges = [0, *changes.tolist(), off.shape[1]]
-    for first, end in pairwise(edges):
-        yield slice(first, end)
-
-
-class ForceRanges:
-    """Actuator force ranges of batch elements, which can be set to zero to switch actuators off.
-
-    Args:
-        fields: model fields of the batch elements by name; includes all of `FORCE_FIELDS`.
-    """
-
-    def __init__(self, fields: Mapping[str, Any]) -> None:
-        self._limited, self._range = (fields[name] for name in FORCE_FIELDS)
-        self._initial = self._limited.copy(), self._range.copy()
-
-    def write(self, off: Mask) -> None:
-        """Switch actuators of the first n batch elements off where `off` (n, K) is true.
-
-        All their other actuators are switched on.
-        """
-        limited, ranges = self._initial
-        n = len(off)
-        self._limited[:n] = np.where(off, True, limited[:n])
-        self._range[:n] = np.where(off[..., None], 0.0, ranges[:n])
-
-    def restore(self) -> None:
-        """Switch all actuators on."""
-        self._limited[...], self._range[...] = self._initial
-
-
-def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
-    """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
-
-    The caller multiplies the stiffness of servos by it.
-
-    Shapes: D joints.
-
-    Args:
-        robot: robot whose actuators are meant.
-        velocities: (D,) addresses of the velocities of the coordinates in `qvel`.
-        off: (..., K) whether each actuator is off.
-
-    Returns:
-        (..., D) zeros and ones.
-    """
-    columns = {int(place): i for i, place in enumerate(velocities)}
-    result = np.ones((*off.shape[:-1], len(columns)))
-    for actuator in robot.actuators:
-        if actuator.kind == "position" and actuator.joint is not None:
-            column = columns[robot.joint(actuator.joint).velocity]
-            result[..., column] = np.where(off[..., actuator.id], 0.0, result[..., column])
-    return result
-
 
 MIN_STIFF_RATIO = 0.1
 """Minimum r (see the module) of a stiff servo."""

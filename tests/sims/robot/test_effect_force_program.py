@@ -11,8 +11,8 @@ from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Scenario
 from sims.engines.compiled.array_programs import TracedPrograms
 from sims.robot.dynamics import mujoco_batch, stepping_with_forces
-from sims.robot.dynamics.effect_forces import is_evaluated_per_step
-from sims.robot.places.effect_places import make_placed_effect
+from sims.robot.dynamics.active_effects import is_evaluated_per_step
+from sims.robot.places.placed_effect_classes import make_placed_effect
 from tests.sims.robot.sample_arms import ARM
 
 TIMES = np.arange(60) / 100.0

@@ -17,9 +17,10 @@ from sims.extended_simulator import (
     read_extended,
     write_extended,
 )
+from sims.robot.dry_friction import get_friction_constraint
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.export.write_model_file import write_model_files
-from sims.robot.integrator_settings import INTEGRATOR_IDS, get_friction_constraint
+from sims.robot.integrator_settings import INTEGRATOR_IDS
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -11,6 +12,12 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Sensor
 from sims.core.simulator import Array, Scenario
 from sims.engines.time_grid import ScenarioGroups
+from sims.robot.dynamics.active_effects import (
+    changes_derived_constants,
+    find_active_elements,
+    is_evaluated_per_step,
+)
+from sims.robot.dynamics.added_elements import group_by_added_elements
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.floating_joints import FloatingState
 
@@ -176,3 +183,28 @@ class BatchResult(NamedTuple):
         series = self.series[0][batch_indices], self.series[1][batch_indices]
         rest = self.initial_activations[batch_indices], self.failed[batch_indices], series
         return BatchResult(self.x[batch_indices], self.v[batch_indices], fields, *rest)
+
+
+def group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArray]:
+    """Yield the indices of batch elements that can be simulated together.
+
+    Their effects add the same elements to the model; all or none of them change constants that
+    MuJoCo derives; and the forces of all or none are evaluated in every step.
+
+    Shapes: L batch elements, K coefficients.
+
+    Args:
+        acting: active effects, with coefficients (K, L, 1).
+        count: number L of batch elements.
+    """
+    kinds = np.stack(
+        [
+            find_active_elements(acting, count, needs_work)
+            for needs_work in (is_evaluated_per_step, changes_derived_constants)
+        ]
+    )
+    for indices in group_by_added_elements(acting, count).values():
+        for kind in product((False, True), repeat=2):
+            is_in_group = np.all(kind == kinds[:, indices].T, axis=1)
+            if is_in_group.any():
+                yield np.array(indices)[is_in_group]

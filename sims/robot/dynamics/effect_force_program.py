@@ -25,9 +25,8 @@ from sims.engines.compiled.array_programs import (
     make_numpy_program,
 )
 from sims.engines.compiled.traced_array import PER_ELEMENT, PER_EVALUATION
+from sims.robot.dynamics.active_effects import LOAD_DEPENDENT_EFFECTS, StepEffects
 from sims.robot.dynamics.effect_forces import (
-    LOAD_DEPENDENT_EFFECTS,
-    StepEffects,
     compute_effect_forces,
     compute_friction_limits,
     compute_hidden_state_forces,

@@ -1,7 +1,7 @@
-"""Replace free and ball joints whose pose is recorded by slides and hinges.
+"""Replace floating joints of a model: fix the bodies, or add slides and hinges for recorded poses.
 
-The motion is the same, but each coordinate is one that a channel shows, so that initial states are
-estimated and the body is a place of causes like any other.
+With slides and hinges, the motion is the same, but each coordinate is one that a channel shows, so
+that initial states are estimated and the body is a place of causes like any other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.recording.recorded_poses import ANGLES, POSITION_AXES
-from sims.robot.parsing.compile_repairs import remove_keyframes
 
 
 def separate_floating_joints(
@@ -104,3 +103,37 @@ def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
     joint.actfrclimited = 0
     joint.actgravcomp = 0
     return joint
+
+
+def fix_bases(spec: Any) -> list[str]:
+    """Fix all free bodies where the model file has them, and return notes about it.
+
+    Keyframes are left out, since they have the coordinates of free joints.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+    """
+    import mujoco
+
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    if not free:
+        return ["fix_base: no body of the model file floats"]
+    names = [joint.parent.name for joint in free]
+    for joint in free:
+        spec.delete(joint)
+    return [f"fixed in the pose of the model file: {', '.join(names)}{remove_keyframes(spec)}"]
+
+
+def remove_keyframes(spec: Any) -> str:
+    """Remove the keyframes (stored states) of a model, and return the end of a note about them.
+
+    A caller that changes joints must remove them, because they have values for the former
+    coordinates. The text is empty without them.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+    """
+    keyframes = list(spec.keys)
+    for keyframe in keyframes:
+        spec.delete(keyframe)
+    return f"; {len(keyframes)} keyframes are left out" if keyframes else ""

@@ -1,0 +1,98 @@
+"""Elements that effects add to a robot's model: joints in series, tendons, and pairs of geoms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.effect import ActiveEffects, Effect
+from sims.robot.contact_pairs import add_contact_pairs
+from sims.robot.coupled_drives import (
+    COUPLING_EFFECT,
+    COUPLING_PLACEHOLDER,
+    list_coupling_places,
+    make_coupled_robot,
+)
+from sims.robot.dynamics.series_joints import SeriesJoints, add_series_joints, is_series_effect
+from sims.robot.model_simplification import strip_shapes
+from sims.robot.mujoco_messages import format_mujoco_error
+from sims.robot.robot_model import RobotModel, cache_per_robot
+
+CONTACT_PAIR = "contact"
+"""Name in `AddedElements`, in place of an effect, for the element `<pair>` of two geoms."""
+
+
+AddedElements = tuple[tuple[str, str], ...]
+"""Added elements, as pairs of place and effect.
+
+`COUPLING_PLACEHOLDER` stands for the tendons of all coupled drives.
+"""
+
+
+def list_added_elements(effect: Effect | type[Effect]) -> AddedElements:
+    """List the elements that the model needs for an effect at one place."""
+    if effect.of == COUPLING_EFFECT:
+        return (COUPLING_PLACEHOLDER,)
+    if is_series_effect(effect):
+        return ((effect.place, effect.of),)
+    return tuple((pair, CONTACT_PAIR) for pair in effect.pairs)
+
+
+def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElements, list[int]]:
+    """Group batch elements by the model elements that their effects add, such as a second joint.
+
+    Each group needs a model and a batch of its own. Batch elements without such effects are a group
+    too, with the key ().
+
+    Shapes: K coefficients.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        count: number L of batch elements.
+    """
+    needs = [
+        (added, np.where(is_series_effect(e), c[0] > 0, c.any(axis=0))[:, 0])
+        for e, c in acting
+        if (added := list_added_elements(e))
+    ]
+    batch_indices: dict[AddedElements, list[int]] = {}
+    for batch_index in range(count):
+        # Effects may share an element.
+        elements = dict.fromkeys(
+            element for added, is_on in needs if is_on[batch_index] for element in added
+        )
+        batch_indices.setdefault(tuple(elements), []).append(batch_index)
+    return batch_indices
+
+
+def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:
+    """Add elements to a robot, without changing element names.
+
+    They change no motion until effects write their numbers.
+
+    Args:
+        robot: robot as read from its model file.
+        added: the elements; with none of them, the robot itself is returned.
+    """
+    robot = add_contact_pairs(robot, [place for place, effect in added if effect == CONTACT_PAIR])
+    if COUPLING_PLACEHOLDER in added:
+        robot = make_coupled_robot(robot, dict.fromkeys(list_coupling_places(robot), 0.0))
+    series: SeriesJoints = tuple(
+        one for one in added if one[1] not in (CONTACT_PAIR, COUPLING_EFFECT)
+    )
+    return add_series_joints(robot, series) if series else robot
+
+
+@cache_per_robot
+def find_compile_error(robot: RobotModel, added: AddedElements) -> str:
+    """Return why the model with added elements does not compile; empty if it does.
+
+    Args:
+        robot: robot as read from its model file.
+        added: joints in series and tendons; the model is compiled without shapes.
+    """
+    try:
+        add_elements(strip_shapes(robot), added).compiled  # noqa: B018
+    # MuJoCo raises several kinds of errors, and an effect of a user's plugin may raise any.
+    except Exception as error:
+        return format_mujoco_error(error) or type(error).__name__
+    return ""

@@ -1,0 +1,128 @@
+"""Integration of hidden states of effects, such as the deflection of bristles in a friction model.
+
+The rate r(w) of a state is linearised in w over a step h, so that stiff states are integrated
+exactly:
+
+    w(t + h) = w + h phi(h dr/dw) r(w),  phi(z) = (e^z - 1) / z                             (1)
+
+(the exponential Rosenbrock-Euler method: M. Hochbruck, A. Ostermann, Acta Numerica 19 (2010), eq.
+2.23), with the velocity at the middle of the step. Forces over a step are evaluated half a step
+later.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.effect import HiddenState, HiddenStateEffect
+from sims.core.simulator import Array
+from sims.core.system import StateSnapshot
+from sims.robot.state_snapshots import RobotSnapshot
+
+MIN_EXPONENT = 1e-6
+"""Absolute exponent below which (exp(z) - 1) / z is computed by its series."""
+
+
+LINEARITY_TOLERANCE = 1e-9
+"""Relative deviation from linearity up to which the rate of a hidden state counts as linear."""
+
+
+STATE_STEP = 1e-6
+"""Step of the state variable for the finite-difference derivative of its rate."""
+
+
+def advance_state(
+    effect: HiddenStateEffect, c: Array, snapshot: StateSnapshot, state: HiddenState, step: float
+) -> HiddenState:
+    """Advance a hidden state w by one exponential Rosenbrock-Euler step (1).
+
+    With the rate r(w) and the step h, w changes by h phi(z) r, z = h dr/dw and
+    phi(z) = (e^z - 1) / z, which is exact if the rate is linear in w. The derivative dr/dw is a
+    difference quotient.
+
+    Shapes: L batch elements, K coefficients.
+
+    Args:
+        effect: effect with the hidden state.
+        c: (K, L, 1) coefficients of the effect.
+        snapshot: state of the system, constant over the step.
+        state: hidden state at the beginning of the step, (L, 1).
+        step: step length in seconds.
+
+    Returns:
+        The hidden state at the end of the step, (L, 1).
+    """
+    _, rate = effect.act(c, snapshot, state)
+    _, perturbed_rate = effect.act(c, snapshot, HiddenState(state.x, state.v + STATE_STEP))
+    z = step * (perturbed_rate - rate) / STATE_STEP
+    is_small = np.abs(z) < MIN_EXPONENT
+    phi = np.where(is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z))
+    v = state.v + step * phi * rate  # (1)
+    return HiddenState(state.x + 0.5 * step * (state.v + v), v)
+
+
+def integrate_state(
+    effect: HiddenStateEffect, c: Array, snapshots: RobotSnapshot, step: float
+) -> HiddenState:
+    """Integrate the hidden state of an effect along a known motion.
+
+    The motion is not changed by the effect, as in a linearisation. If the state's rate is a linear
+    function of it at all times, which is tested at three points, a fast recursion is used.
+    Otherwise the state advances step by step.
+
+    Args:
+        effect: effect at its place.
+        c: (K, 1, 1) coefficients of the effect.
+        snapshots: system states at the middle of each of the S steps, stored as S batch elements.
+        step: step length in seconds.
+
+    Returns:
+        Hidden states (S + 1, 1): at the beginning of each step, and at the end of the motion.
+    """
+    steps = len(snapshots.x)
+    state = effect.begin(c, snapshots.select_element(0))
+    coefficients = np.repeat(c, steps, axis=1)
+    zero = np.zeros((steps, 1))
+
+    def rate(w: float, x: float) -> Array:
+        return effect.act(coefficients, snapshots, HiddenState(zero + x, zero + w))[1]
+
+    rate_at_zero, rate_at_one, rate_at_half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
+    if np.allclose(
+        rate_at_half, 0.5 * (rate_at_zero + rate_at_one), rtol=LINEARITY_TOLERANCE, atol=0.0
+    ):
+        return _integrate_linear_state(
+            state, step * rate_at_zero, step * (rate_at_one - rate_at_zero)
+        )
+    states = [state]
+    for k in range(steps):
+        states.append(advance_state(effect, c, snapshots.select_element(k), states[-1], step))
+    return HiddenState(np.concatenate([s.x for s in states]), np.concatenate([s.v for s in states]))
+
+
+def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array) -> HiddenState:
+    """Integrate a hidden state whose rate is linear in the state throughout the motion.
+
+    The step is w + h phi(z) r(w), phi(z) = (e^z - 1) / z, z = h dr/dw (1).
+
+    Shapes: S steps.
+
+    Args:
+        state: initial state, (1, 1).
+        change_at_zero: (S, 1) h r(0) of each step, with r and h as in (1).
+        z: (S, 1) h dr/dw of each step.
+
+    Returns:
+        Hidden states (S + 1, 1).
+    """
+    is_small = np.abs(z) < MIN_EXPONENT
+    changes = change_at_zero * np.where(
+        is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z)
+    )
+    w = float(state.v[0, 0])
+    values = [w]
+    for factor, change in zip(np.exp(z[:, 0]).tolist(), changes[:, 0].tolist(), strict=True):
+        w = factor * w + change
+        values.append(w)
+    v = np.array(values)[:, None]
+    return HiddenState(np.zeros_like(v) + state.x, v)
