@@ -16,7 +16,7 @@ from bench.diagnosis.datasheet.datasheet_subject import make_subject
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.verdict import Verdict
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended

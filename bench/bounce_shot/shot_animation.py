@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.bounce_shot.drop_recording import RECORDINGS_FOLDER
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_execution import SAMPLING_RATE_HZ
-from bench.bounce_shot.shot_figures import (
-    ExampleShot,
-    draw_shot_panel,
-    execute_example,
-    find_path_end,
-)
-from bench.bounce_shot.shot_sampling import RECORDINGS_FOLDER, ShotSetup
+from bench.bounce_shot.shot_execution import SAMPLING_RATE_HZ, ExampleShot, execute_example
+from bench.bounce_shot.shot_figures import draw_shot_panel
+from bench.bounce_shot.shot_geometry import find_path_end
+from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.figures.style import BLUE, TRUSTED_TUNERS_NOTE, VERMILION, make_panel_grid
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import read_recording

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -13,14 +13,13 @@ import pandas as pd
 from bench.benchmark.problem.experiment import Experiment
 from bench.bounce_shot.hit_rate_table import make_success_panel
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_execution import ShotResult, execute_shot, find_descent_index
-from bench.bounce_shot.shot_planner import ShotGeometry
+from bench.bounce_shot.shot_execution import ExampleShot, execute_example
+from bench.bounce_shot.shot_geometry import find_path_end
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.tuned_shots import (
     EXPLAIN_METHOD,
     EXPLAIN_SUFFIX,
     UNTUNED_METHOD,
-    TunedModel,
 )
 from bench.figures.figure_output import FigureFiles, render_all_formats
 from bench.figures.style import (
@@ -49,8 +48,6 @@ _GROUP_LABELS = {
 }
 _MAX_MISS_RADII = 6
 """Range of the shown misses, in radii of the hoop."""
-_MIN_DRAWN_DEPTH = 0.12
-"""Distance below the hoop down to which paths are drawn, m."""
 
 
 def draw_figures(
@@ -260,38 +257,6 @@ def select_example_shots(
     ]
 
 
-class ExampleShot(NamedTuple):
-    """Example shot.
-
-    Attributes:
-        models: tuned models by method.
-        results: executed shots by method.
-        top: upper limit of the height axis, m.
-    """
-
-    models: dict[str, TunedModel]
-    results: dict[str, ShotResult]
-    top: float
-
-
-def execute_example(
-    settings: ShotConfig, setup: ShotSetup, methods: Sequence[str], stored: Mapping[str, Any]
-) -> ExampleShot:
-    """Execute one shot again with each of some methods, because stored results contain no paths.
-
-    Args:
-        settings: settings of the bounce shot, from the table [shot] of the experiment.
-        setup: setup of the shot: its ball, drop, incline and hoop.
-        methods: names of the methods.
-        stored: stored results by name of the shot.
-    """
-    models = {model["method"]: TunedModel(**model) for model in stored[setup.name]["models"]}
-    shot_results = {method: execute_shot(setup, settings, models[method]) for method in methods}
-    # Upper end of the axis, 0.1 m above the highest flight.
-    top = max(float(np.nanmax(t.flown[:, 2])) for t in shot_results.values()) + 0.1
-    return ExampleShot(models, shot_results, top)
-
-
 def draw_shots_figure(
     settings: ShotConfig, chosen: Sequence[tuple[ShotSetup, list[str]]], stored: Mapping[str, Any]
 ) -> Figure:
@@ -354,15 +319,3 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
     right_limit = scene.hoop_x + 4 * scene.hoop_radius
     axis.set(xlim=(-0.25, right_limit), ylim=(-0.35, shot.top), aspect="equal")
     axis.spines[["top", "right"]].set_visible(False)
-
-
-def find_path_end(path: Array, scene: ShotGeometry) -> int:
-    """Return the number of samples to draw of a path, up to 0.12 m below the hoop after its bounce.
-
-    How it continues is not of interest.
-
-    Args:
-        path: positions, (T, 3).
-        scene: incline and hoop.
-    """
-    return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

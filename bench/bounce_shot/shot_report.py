@@ -21,9 +21,9 @@ from bench.bounce_shot.hit_rate_table import (
 )
 from bench.bounce_shot.shot_animation import write_animation
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_execution import read_shot
 from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
 from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.bounce_shot.shot_storage import read_shot
 from bench.figures import figure_output
 from bench.figures.figure_output import FigureFiles
 from bench.pages.html_page import HtmlPage

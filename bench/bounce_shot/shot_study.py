@@ -36,19 +36,10 @@ from bench.benchmark.storage.run_status import (
     StudyOutcome,
 )
 from bench.bounce_shot import true_world, tuned_shots
+from bench.bounce_shot.drop_recording import RECORDINGS_FOLDER, record_drop
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
-from bench.bounce_shot.shot_execution import (
-    SHOTS_FOLDER,
-    check_shots,
-    list_missing_shots,
-    store_shot,
-)
-from bench.bounce_shot.shot_sampling import (
-    RECORDINGS_FOLDER,
-    ShotSetup,
-    draw_shots,
-    record_drop,
-)
+from bench.bounce_shot.shot_sampling import ShotSetup, draw_shots
+from bench.bounce_shot.shot_storage import SHOTS_FOLDER, check_shots, list_missing_shots, store_shot
 from bench.bounce_shot.tuned_shots import TunedModel
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError

@@ -8,6 +8,7 @@ network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.sho
 
 from __future__ import annotations
 
+import math
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,10 +22,15 @@ from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.recording_observations import ObservedRuns, make_scenario
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
-from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_planner import PlanningModel, ShotGeometry, plan_shot
-from bench.bounce_shot.shot_sampling import build_pixel_runs, make_pixel_experiment
-from sims.core.simulator import InputError, Scenario
+from bench.bounce_shot.drop_recording import (
+    CAMERA_DISTANCE_RANGE,
+    CAMERA_HEIGHT_RANGE,
+    CAMERA_TARGET_HEIGHT,
+)
+from bench.bounce_shot.shot_config import ShotConfig, get_ball_kind
+from bench.bounce_shot.shot_geometry import ShotGeometry
+from bench.bounce_shot.shot_planner import PlanningModel, plan_shot
+from sims.core.simulator import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.systems.ball import Ball as BallSimulator
 from sims.systems.bounce_shot import BounceShot, ShotSystem
@@ -360,3 +366,57 @@ def _plan_shot(
             reason="the model does not reach the hoop's plane from any height",
         )
     return replace(model, height=plan.height, margin=plan.rim_margin)
+
+
+ROW_CHANNEL = "v"
+"""Channel of the ball's row in the picture, pixels from above."""
+
+
+def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Experiment:
+    """Make the experiment for a ball in front of an unknown camera.
+
+    Args:
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+    """
+    radii = [get_ball_kind(name).radius for name in settings.balls]
+    return experiment.chosen(
+        simulator="ball-filmed",
+        observe=("z", ROW_CHANNEL),
+        error_channel=ROW_CHANNEL,
+        noise={},
+        constants={
+            **experiment.constants,
+            "radius": (min(radii), max(radii)),
+            "camera_azimuth": (0.0, 2.0 * math.pi),
+            "camera_distance": CAMERA_DISTANCE_RANGE,
+            "camera_height": CAMERA_HEIGHT_RANGE,
+            "camera_aim": CAMERA_TARGET_HEIGHT,
+            "pixels": settings.filmed,
+        },
+    )
+
+
+def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float) -> ObservedRuns:
+    """Convert tracked rows to observations at the experiment's sample times.
+
+    Samples in which the tracker saw nothing are NaN.
+
+    Args:
+        recording: a tracked drop, with the rows as extra column `v`.
+        experiment: the experiment as returned by `make_pixel_experiment`.
+        radius: radius of the ball, m.
+    """
+    (run,) = recording.runs
+    times: Array = np.arange(experiment.sampling.samples) / experiment.sampling.rate
+    # The recording may begin later or skip samples; each row is assigned by its time.
+    indices = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
+    is_inside = indices < times.size
+    observed: Array = np.full((times.size, 2), np.nan)
+    observed[indices[is_inside], 1] = run.extra[ROW_CHANNEL][is_inside]
+    heights = run.channels["z"]
+    first = int(np.flatnonzero(np.isfinite(heights))[0])
+    gravity = recording.constants["gravity"]
+    # Released at rest at t = 0, and possibly first seen later: z(t) = z(0) - g t^2 / 2.
+    height = float(heights[first] + 0.5 * gravity * run.times[first] ** 2)
+    return ObservedRuns((Scenario(times, {"z": height}, {}, {"radius": radius}),), observed)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sims.core.simulator import InputError, Simulator
+from sims.recording.recording import Recording
 from sims.system_simulator import SystemSimulator
 
 FORCE_HINT = "or insist with --force (force=True in Python)"
@@ -154,3 +155,103 @@ def format_bytes(count: float) -> str:
             return f"{count:.3g} {unit}"
         count /= 1000
     return f"{count:.3g} EB"
+
+
+_BYTES_PER_TABLE_CELL = 8
+"""Size of a number in a table, in bytes."""
+_CELL_SECONDS = 1e-7
+"""Time to write a number, in seconds."""
+_RUN_MEMORY = 3000
+"""Memory of a run in addition to its samples, in bytes."""
+_MIN_SIMULTANEOUS_SIMULATIONS = 10
+"""Minimum number of simultaneous simulations for fitting a run."""
+_MIN_FIT_SIMULATIONS = 100
+"""Minimum number of simulations of a run for fitting it."""
+_BYTES_PER_PIXEL = 100
+"""Memory per pixel of a rendered image, in bytes."""
+_PIXEL_SECONDS = 1e-8
+"""Time to render a pixel, in seconds."""
+
+
+def check_simulation_size(
+    runs: int, samples: int, seconds: float, simulator: Simulator, force: bool = False
+) -> None:
+    """Refuse a recording that this machine cannot simulate.
+
+    The need for memory, disk and time is estimated from the number of samples and of simulation
+    steps, before anything is simulated.
+
+    Args:
+        runs: Number of runs.
+        samples: Number of samples of each run.
+        seconds: Duration of each run.
+        simulator: Simulator of the recording.
+        force: Whether the user insists.
+
+    Raises:
+        InputError: It needs more than is available; the message is one line.
+    """
+    columns = 1 + len(simulator.inputs) + len(simulator.channels)
+    steps = max(seconds / get_max_step(simulator), samples)
+    cells = float(runs) * samples * columns
+    need = ResourceNeed(
+        f"{runs:.4g} runs of {samples:.4g} samples and {steps:.3g} steps",
+        "lower runs, seconds or rate",
+        # The samples exist as numbers, and as the text of the table before it is written.
+        memory=cells * (BYTES_PER_NUMBER + _BYTES_PER_TABLE_CELL)
+        + runs * _RUN_MEMORY
+        + steps * BYTES_PER_STEP,
+        disk=cells * _BYTES_PER_TABLE_CELL,
+        steps=steps,
+        seconds=runs * (MIN_SIMULATION_SECONDS + MIN_STEP_SECONDS * steps) + cells * _CELL_SECONDS,
+    )
+    check_feasible(f"simulate {simulator.name}", need, get_machine_resources(), force)
+
+
+def check_recording_size(recording: Recording, simulator: Simulator, force: bool = False) -> None:
+    """Refuse a recording that this machine cannot fit.
+
+    A fit simulates each run many times, several of them at once. Its minimum need is estimated
+    from the longest run.
+
+    Args:
+        recording: Recording to explain or score.
+        simulator: Simulator to fit.
+        force: Whether the user insists.
+
+    Raises:
+        InputError: It needs more than is available; the message is one line.
+    """
+    longest = max(float(run.times[-1] - run.times[0]) for run in recording.runs)
+    steps = longest / get_max_step(simulator)
+    count = len(recording.runs)
+    need = ResourceNeed(
+        f"{count} runs of up to {longest:.4g} s, {steps:.3g} steps,",
+        "explain shorter runs",
+        memory=count * _MIN_SIMULTANEOUS_SIMULATIONS * steps * BYTES_PER_STEP,
+        steps=steps,
+        seconds=count * _MIN_FIT_SIMULATIONS * steps * MIN_STEP_SECONDS,
+    )
+    check_feasible(str(recording.path), need, get_machine_resources(), force)
+
+
+def check_film_size(recording: Path, frames: int, pixels: int, force: bool = False) -> None:
+    """Refuse a film that this machine cannot render.
+
+    Args:
+        recording: Path of the recording to film.
+        frames: Number of images.
+        pixels: Width and height of each image.
+        force: Whether the user insists.
+
+    Raises:
+        InputError: It needs more than is available; the message is one line.
+    """
+    area = float(pixels) ** 2
+    need = ResourceNeed(
+        f"{frames} pictures of {pixels:.4g} x {pixels:.4g} pixels",
+        "lower the size",
+        memory=area * _BYTES_PER_PIXEL,
+        seconds=frames * area * _PIXEL_SECONDS,
+    )
+    check_feasible(str(recording), need, get_machine_resources(), force)

@@ -26,7 +26,8 @@ from bench.diagnosis.report.effect_and_unit_text import (
     joined,
 )
 from bench.figures.figure_settings import is_pdf_wanted
-from bench.logs.recording_loading import compute_recording_digest, make_log_names, read_content
+from bench.logs.recording_digest import compute_content_digest, compute_recording_digest
+from bench.logs.recording_joining import make_log_names
 from bench.pages.text_format import format_csv
 from sims.core.document_fields import Document
 from sims.core.files import check_folder_empty, get_first_line, write_atomically
@@ -265,7 +266,7 @@ def list_logs(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> 
     """
     settings_text = repr(sorted((key, str(value)) for key, value in settings.items()))
     if settings.get("model") is not None:
-        settings_text += read_content(Path(settings["model"])).hex()
+        settings_text += compute_content_digest(Path(settings["model"])).hex()
     return [
         BatchLog(
             name,

@@ -13,13 +13,15 @@ import numpy as np
 
 from bench.benchmark.storage.provenance import read_environment
 from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.core.resource_estimates import check_recording_size
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
-from bench.logs.importing.sample_selection import fill_lost_commands, leave_out_settling
+from bench.logs.filter_settling import leave_out_settling
+from bench.logs.lost_samples import fill_lost_commands
 from bench.logs.quality.log_quality import check_recording_plausible
-from bench.logs.recording_loading import check_recording_size, check_value_sizes
+from bench.logs.recording_loading import check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator, open_extended, read_extended
 from sims.recording.recording import Recording, read_recording, read_system_name

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from bench.logs.quality.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
+from bench.logs.quality.range_checks import list_exceeded_ranges
 from sims.core.plain_values import align_columns, format_count, format_run_names, format_unit
 from sims.core.simulator import Channel, Simulator
 from sims.recording.recording import Recording, Run
@@ -307,12 +308,6 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
     return f"{name} = {value:g}{unit}{note}"
 
 
-LIMIT_TOLERANCE = 0.01
-"""Tolerance beyond a limit, as a fraction of the range, for soft limits and encoder offsets."""
-MAX_NAMED_RUNS = 4
-"""Maximum number of runs that are named in one line."""
-
-
 def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
     """Yield lines about the robot of a simulator: its file, its parts and notes on repairs.
 
@@ -346,7 +341,7 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
         return
     robot = cast(type[RobotSimulator], kind).robot
     yield from _list_missing_signals(recording, robot)
-    yield from _list_exceeded_ranges(recording, robot)
+    yield from list_exceeded_ranges(recording, robot)
 
 
 def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
@@ -367,66 +362,4 @@ def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[s
         yield (
             "positions that are not in the log, with initial values from the model file: "
             f"{joint_names}"
-        )
-
-
-def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:
-    """Yield a line for each signal that leaves its range.
-
-    Checked are the positions and forces of joints with one coordinate, and the commands.
-
-    Args:
-        recording: recorded runs, with their channels, inputs and constants.
-        robot: model of the robot, with its ranges.
-    """
-    model = robot.path.name
-    for joint in robot.joints:
-        if joint.has_one_coordinate:
-            yield from _format_exceeded_range(
-                recording, f"q.{joint.name}", joint.range, joint.unit, model
-            )
-            effort = None if joint.effort is None else (-joint.effort, joint.effort)
-            yield from _format_exceeded_range(
-                recording, f"tau.{joint.name}", effort, joint.force_unit, model
-            )
-    for actuator in robot.actuators:
-        yield from _format_exceeded_range(
-            recording, f"u.{actuator.name}", actuator.range, "", model
-        )
-
-
-def _format_exceeded_range(
-    recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
-) -> Iterator[str]:
-    """Yield a line if a recorded signal clearly leaves the range that the model file states.
-
-    The line names the runs and the extreme values, and asks whether unit, sign or zero is wrong.
-
-    Args:
-        recording: recorded runs, with their channels, inputs and constants.
-        name: name of the channel or input.
-        limits: range of the model file; None if it states none.
-        unit: unit of signal and range.
-        model: name of the model file.
-    """
-    if limits is None:
-        return
-    low, high = limits
-    slack = LIMIT_TOLERANCE * (high - low)
-    runs, min_value, max_value = [], np.inf, -np.inf
-    for run in recording.runs:
-        signal = run.channels.get(name, run.inputs.get(name))
-        if signal is None or not np.isfinite(signal).any():
-            continue
-        lowest, highest = float(np.nanmin(signal)), float(np.nanmax(signal))
-        if lowest < low - slack or highest > high + slack:
-            runs.append(run.name)
-            min_value, max_value = min(min_value, lowest), max(max_value, highest)
-    if runs:
-        run_names = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
-            " ..." if len(runs) > MAX_NAMED_RUNS else ""
-        )
-        states = f"{model} states {low:.4g} to {high:.4g}"
-        yield f"{name} ranges from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
-            f" in runs {run_names}, and {states}: another unit, sign or zero?"
         )

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array, InputError, Simulator
+from sims.recording.drive_switches import Mask, spans
 from sims.recording.recording import Recording, Run
 
 MAX_RECORDING_COST = 1.6e5
@@ -189,3 +190,30 @@ def _compute_command_changes(run: Run) -> Array:
             cumulative_change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
             total += cumulative_change - cumulative_change[lead_places]
     return total
+
+
+MIN_PART_SAMPLES = 10
+"""Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
+
+
+def split_without_masked(run: Run, off: Mask) -> list[Run]:
+    """Return the parts of a run in which a mask is not set.
+
+    Parts of fewer than `MIN_PART_SAMPLES` samples are left out. If the mask is set nowhere, the run
+    itself is returned.
+
+    Args:
+        run: recorded run: times, channels and inputs.
+        off: (T,) the mask.
+    """
+    if not off.any():
+        return [run]
+    split_runs = []
+    for first, end in spans(~off):
+        if end - first < MIN_PART_SAMPLES:
+            continue
+        name = f"{run.name} from {run.times[first]:.4g} s" if first else run.name
+        part = run.part(slice(first, end), name)
+        if any(np.isfinite(values).any() for values in part.channels.values()):
+            split_runs.append(part)
+    return split_runs

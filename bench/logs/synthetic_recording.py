@@ -17,7 +17,7 @@ from bench.core.input_signals import evaluate_signal
 from bench.core.options import option
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.core.random_streams import make_rng
-from bench.logs.recording_loading import check_simulation_size
+from bench.core.resource_estimates import check_simulation_size
 from sims import effects as library
 from sims.core.argument_checks import Expected, Name, Names, check_arguments
 from sims.core.files import check_absent

@@ -1,4 +1,4 @@
-"""Check values of a user's TOML file, with one-line errors.
+"""Read a user's TOML file, and check its values with one-line errors.
 
 An error names file, entry, expected and found value. Each check takes the source with which its
 message begins (the path of the file, or a name), the entry in it (``noise.x``), and the value, and
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
@@ -377,3 +377,41 @@ def _choose_union_member(value: Any, members: Sequence[Any]) -> Any:
     kinds = [kind for kind in members if kind is not NoneType]
     lists = [kind for kind in kinds if get_origin(kind) is tuple]
     return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]
+
+
+def join_nested_names(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Join the names of nested tables, where the joined names are those of signals.
+
+    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` is a table ``elbow``
+    in a table ``q``. Here it becomes the entry ``q.elbow``.
+
+    Args:
+        entries: Entries as read from TOML.
+        names: Names that may contain dots.
+
+    Returns:
+        The entries by their full names.
+    """
+    flat_table: dict[str, Any] = {}
+    for name, value in entries.items():
+        is_nested = isinstance(value, dict) and name not in names
+        if is_nested and any(known_name.startswith(f"{name}.") for known_name in names):
+            flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}
+            flat_table.update(join_nested_names(flat_entries, names))
+        else:
+            flat_table[name] = value
+    return flat_table
+
+
+def list_nested_names(tables: Mapping[str, Any]) -> list[str]:
+    """List the names of channels in the tables of a description, of which some may be nested.
+
+    TOML reads ``[channels.q.base.x]`` as tables within each other.
+    """
+    names = []
+    for name, entry in tables.items():
+        nested = (
+            isinstance(entry, dict) and entry and all(isinstance(e, dict) for e in entry.values())
+        )
+        names += [f"{name}.{inner}" for inner in list_nested_names(entry)] if nested else [name]
+    return names

@@ -24,8 +24,6 @@ Run: TypeAlias = Any
 
 SWITCH_KEYS = ("enable", "disable")
 """Keys of ``[actuators.NAME]`` that name a switch column."""
-MIN_PART_SAMPLES = 10
-"""Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
 MAX_LISTED_RUNS = 6
 """Maximum number of runs named in a message."""
 
@@ -91,7 +89,7 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
     return tuple(switches)
 
 
-def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
+def remove_switch_keys(actuators: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of actuators that the model file lacks, without the keys of this module.
 
     A switch key names the column that says when the drive is on; it does not describe an actuator.
@@ -178,7 +176,7 @@ def apply_drive_switches(
             if mask.any():
                 masks[switch.actuator] = mask
         if any(mask.any() for mask in off_masks):
-            note = f"where {switch.condition}: {spans_of_runs(runs, off_masks)}"
+            note = f"where {switch.condition}: {format_run_spans(runs, off_masks)}"
             notes.setdefault(note, []).append(switch.actuator)
     run_notes = [
         f"actuator {names[0]} exerts nothing {note}"
@@ -192,7 +190,7 @@ def apply_drive_switches(
     return Switched(switched, tuple(run_notes))
 
 
-def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
+def format_run_spans(runs: Sequence[Run], off: Sequence[Mask]) -> str:
     """Describe the time spans of each run in which a mask is set.
 
     Args:
@@ -218,26 +216,3 @@ def spans(mask: Mask) -> list[tuple[int, int]]:
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     first, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     return list(zip(first.tolist(), end.tolist(), strict=True))
-
-
-def split_without_masked(run: Run, off: Mask) -> list[Run]:
-    """Return the parts of a run in which a mask is not set.
-
-    Parts of fewer than `MIN_PART_SAMPLES` samples are left out. If the mask is set nowhere, the run
-    itself is returned.
-
-    Args:
-        run: recorded run: times, channels and inputs.
-        off: (T,) the mask.
-    """
-    if not off.any():
-        return [run]
-    split_runs = []
-    for first, end in spans(~off):
-        if end - first < MIN_PART_SAMPLES:
-            continue
-        name = f"{run.name} from {run.times[first]:.4g} s" if first else run.name
-        part = run.part(slice(first, end), name)
-        if any(np.isfinite(values).any() for values in part.channels.values()):
-            split_runs.append(part)
-    return split_runs

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -52,20 +51,6 @@ def find_recorded_bases(channels: Iterable[str]) -> list[str]:
         if is_quaternion or is_pose:
             found.append(match[1])
     return found
-
-
-def list_channel_names(tables: Mapping[str, Any]) -> list[str]:
-    """List the names of channels in the tables of a description, of which some may be nested.
-
-    TOML reads ``[channels.q.base.x]`` as tables within each other.
-    """
-    names = []
-    for name, entry in tables.items():
-        nested = (
-            isinstance(entry, dict) and entry and all(isinstance(e, dict) for e in entry.values())
-        )
-        names += [f"{name}.{inner}" for inner in list_channel_names(entry)] if nested else [name]
-    return names
 
 
 def convert_quaternions(

@@ -29,7 +29,7 @@ from sims.recording.recording_description import (
     RecordingDescription,
     RunMetadata,
     check_description,
-    model_in,
+    get_model_reference,
     read_meta,
     read_system_name,
 )
@@ -228,7 +228,7 @@ def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = Fa
         parts = _read_own_table(csv_path, sources, *columns, list(description.extra))
     else:
         parts = read_logs(table.with_suffix(".csv"), sources, *columns, description.linear)
-    model = model_in(description_path, meta)
+    model = get_model_reference(description_path, meta)
     recording = _assemble_recording(table, parts, description, description_path, model)
     if whole:
         return recording
@@ -309,7 +309,7 @@ def _read_own_table(
     return renamed_runs
 
 
-def recording_of_frame(
+def make_frame_recording(
     frame: Frame,
     declared: DeclaredSignals,
     meta: Mapping[str, Any],
@@ -337,7 +337,7 @@ def recording_of_frame(
     document = build_frame_description(path, indexed_frame, declared, meta, units)
     description = check_description(path, document, declared)
     parts = read_frame(path, indexed_frame, description)
-    return _assemble_recording(path, parts, description, path, model_in(path, document))
+    return _assemble_recording(path, parts, description, path, get_model_reference(path, document))
 
 
 def split_held_out(recording: Recording, folds: bool = False) -> Recording:

@@ -23,6 +23,8 @@ from sims.core.toml_validation import (
     check_text,
     check_type,
     get_subtable,
+    join_nested_names,
+    list_nested_names,
     make_error,
     read_toml,
 )
@@ -31,14 +33,9 @@ from sims.recording.drive_switches import (
     DriveSwitch,
     check_switches,
     read_switches,
-    without_switches,
+    remove_switch_keys,
 )
-from sims.recording.recorded_poses import (
-    ANGLES,
-    QUATERNION_ENTRIES,
-    find_recorded_bases,
-    list_channel_names,
-)
+from sims.recording.recorded_poses import ANGLES, QUATERNION_ENTRIES, find_recorded_bases
 from sims.recording.unit_conversion import UnitScale, compute_unit_scale
 
 DeclaredSignals: TypeAlias = type[Simulator] | type[System]
@@ -156,10 +153,10 @@ def read_model_reference(
     Raises:
         InputError: The description is missing or malformed, or states both system and model.
     """
-    return model_in(*read_meta(Path(path)), model)
+    return get_model_reference(*read_meta(Path(path)), model)
 
 
-def model_in(
+def get_model_reference(
     description: Path, meta: Mapping[str, Any], model: str | Path | None = None
 ) -> ModelFileReference | None:
     """Return the model file that a description states; None if it states a system.
@@ -182,9 +179,9 @@ def model_in(
         if "system" in meta:
             raise InputError(f"{description}: expected system or model, found both; leave one out")
         model = description.parent / check_text(description, "model", meta["model"])
-    actuators = without_switches(get_subtable(description, meta, "actuators"))
+    actuators = remove_switch_keys(get_subtable(description, meta, "actuators"))
     engine = dict(get_subtable(description, meta, "engine"))
-    bases = find_recorded_bases(list_channel_names(get_subtable(description, meta, "channels")))
+    bases = find_recorded_bases(list_nested_names(get_subtable(description, meta, "channels")))
     if bases and not engine.get("fix_base"):
         engine["recorded_bases"] = bases
     free = check_name_list(description, "free", meta.get("free", []), 'names, as ["damping@*"]')
@@ -217,7 +214,9 @@ def get_description_path(table: Path) -> Path:
     return table.with_suffix(".toml")
 
 
-def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str, float, float]]:
+def read_stated_columns(
+    path: Path, declared: DeclaredSignals
+) -> dict[str, tuple[str, float, float]]:
     """Read the unit and the conversion to SI units of each channel and input.
 
     Args:
@@ -303,30 +302,6 @@ def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
     """Return the units of the states of floating bodies, by name; empty if there are none."""
     units: Mapping[str, str] = getattr(_get_system(declared), "floating_state_units", {})
     return units
-
-
-def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Join the names of nested tables, where the joined names are those of signals.
-
-    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` is a table ``elbow``
-    in a table ``q``. Here it becomes the entry ``q.elbow``.
-
-    Args:
-        entries: Entries as read from TOML.
-        names: Names that may contain dots.
-
-    Returns:
-        The entries by their full names.
-    """
-    flat_table: dict[str, Any] = {}
-    for name, value in entries.items():
-        is_nested = isinstance(value, dict) and name not in names
-        if is_nested and any(known_name.startswith(f"{name}.") for known_name in names):
-            flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}
-            flat_table.update(dotted(flat_entries, names))
-        else:
-            flat_table[name] = value
-    return flat_table
 
 
 class _DescriptionReader:
@@ -426,8 +401,8 @@ class _DescriptionReader:
         check_known_names(f"entry {location}of {self.path}", entry_names, allowed_names)
 
     def _get_tables(self, key: str, names: Collection[str]) -> dict[str, Any]:
-        """Return the tables below a key of the description, by their full names (`dotted`)."""
-        return dotted(get_subtable(self.path, self.meta, key), names)
+        """Return the tables below a key of the description, by their full names."""
+        return join_nested_names(get_subtable(self.path, self.meta, key), names)
 
     def _compute_scale(self, location: str, unit: str, target: str) -> UnitScale:
         """Return the conversion of a stated unit, with the location in the message of an error."""
@@ -660,7 +635,7 @@ class _DescriptionReader:
             value: the table.
             allowed_names: names that may occur in it.
         """
-        entries = dotted(check_table(self.path, key, value), allowed_names)
+        entries = join_nested_names(check_table(self.path, key, value), allowed_names)
         self._check_known_names(key, entries, allowed_names)
         return {
             name: check_finite(self.path, f"{key}.{name}", number)

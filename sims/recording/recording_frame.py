@@ -14,14 +14,13 @@ import numpy as np
 
 from sims.core.plain_values import is_plausible_number, to_toml_value
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
-from sims.core.toml_validation import format_value, get_subtable
+from sims.core.toml_validation import format_value, get_subtable, join_nested_names
 from sims.recording.column_mapping import SignalSource
 from sims.recording.csv_table import CsvRun, RecordingTable
 from sims.recording.drive_switches import read_switches
 from sims.recording.recording_description import (
     DeclaredSignals,
     RecordingDescription,
-    dotted,
     get_floating_state_units,
 )
 
@@ -101,9 +100,9 @@ def build_frame_description(
         # The same dict of units may be used for frames with different columns.
         if name not in columns and name not in usual:
             raise make_unknown_name_error(f"column in units of {path}", name, columns)
-    channels = dotted(get_subtable(path, description, "channels"), usual)
-    inputs = dotted(get_subtable(path, description, "inputs"), usual)
-    extra = dotted(get_subtable(path, description, "extra"), poses)
+    channels = join_nested_names(get_subtable(path, description, "channels"), usual)
+    inputs = join_nested_names(get_subtable(path, description, "inputs"), usual)
+    extra = join_nested_names(get_subtable(path, description, "extra"), poses)
     time = get_subtable(path, description, "time")
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 

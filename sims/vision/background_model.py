@@ -1,28 +1,16 @@
-"""Background image of a fixed camera without the ball, and the cuts of a film."""
+"""Background image of a fixed camera without the ball, and its camera noise."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.medians import compute_nan_median
-from sims.core.simulator import Array, InputError
+from sims.core.simulator import Array
 from sims.vision.ball_renderer import RgbImage
 
 MAX_BACKGROUND_FRAMES = 25
 """Maximum number of frames whose median is the background."""
-_SURVEY_PIXELS = 5_000
-"""Approximate number of pixels per picture used in the first pass."""
-_MIN_CUT_SHARE = 0.5
-"""Fraction of pixels that change where the film is cut or the camera moves."""
-_MIN_PIXEL_CHANGE = 12
-"""Change in grey levels above which a pixel counts as changed; smaller ones are noise or shadow."""
-_COMPRESSION_NOISE = 4
-"""Grey levels of compression noise in addition to the camera noise, which the median estimates."""
 _HIDDEN_RADII = 1.3
 """Distance around a ball's centre at which it hides the background with its soft edge, in radii."""
 _HIDDEN_MARGIN_PIXELS = 3
@@ -31,67 +19,6 @@ _SIGMA_PER_MEDIAN = 1.4826
 """Standard deviation of normal noise divided by its median magnitude."""
 _LARGEST_OF_THREE_RATIO = 1.5
 """Assumed ratio of the largest of three noise magnitudes to a single one."""
-
-
-@dataclass(frozen=True)
-class FrameSurvey:
-    """Result of a first pass over the frames.
-
-    Attributes:
-        times: (n,) times of the frames, s.
-        moved: (n,) mean change from the previous frame, grey levels.
-        cuts: Numbers of the frames that begin a new shot.
-        size: Width and height of the picture, px.
-    """
-
-    times: Array
-    moved: Array
-    cuts: tuple[int, ...]
-    size: tuple[int, int]
-
-    def list_shots(self) -> list[tuple[int, int]]:
-        """Return the first frame and the end (exclusive) of each shot between cuts."""
-        edges = [0, *self.cuts, len(self.times)]
-        # Consecutive cuts have no shot between them.
-        return [(a, b) for a, b in pairwise(edges) if b > a]
-
-
-def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
-    """Measure the change between consecutive frames at low resolution.
-
-    Args:
-        frames: Time in seconds and picture (height, width, 3) of each frame.
-
-    Raises:
-        InputError: The size of the picture changes.
-    """
-    times = []
-    motions = []
-    cuts = []
-    frame_size = 0, 0
-    previous_frame = None
-    for frame_index, (time, picture) in enumerate(frames):
-        if frame_index and picture.shape[1::-1] != frame_size:
-            expected = f"{frame_size[0]} x {frame_size[1]} px as before"
-            raise InputError(f"frame {frame_index}: expected {expected}, found another size")
-        height, width = picture.shape[:2]
-        frame_size = width, height
-        downsampling = height * width / _SURVEY_PIXELS
-        pixel_stride = max(1, int(downsampling**0.5))
-        thinned = picture[::pixel_stride, ::pixel_stride].astype(np.int16)
-        reference_frame = thinned if previous_frame is None else previous_frame
-        change = np.abs(thinned - reference_frame).max(axis=2)
-        if np.mean(change > _MIN_PIXEL_CHANGE) > _MIN_CUT_SHARE:
-            cuts.append(frame_index)
-            # The whole picture has changed, and no ball has moved.
-            change[:] = 0
-        times.append(time)
-        # Ignore small changes: noise would make a static picture look busy.
-        median_change = np.median(change)
-        excess = change - 2 * median_change - _COMPRESSION_NOISE
-        motions.append(float(np.maximum(excess, 0).mean()))
-        previous_frame = thinned
-    return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), frame_size)
 
 
 def select_frames(moved: Array) -> list[int]:

@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError
-from sims.vision import background_model
+from sims.vision import background_model, film_cuts
 from sims.vision.ball_detection import BallDetection, BallDetector
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.circle_fit import Circle
@@ -282,8 +282,6 @@ def _compute_median_distance(line: Array, points: Array) -> float:
     return float(np.median(np.abs(distances)))
 
 
-_MIN_FRAMES = 5
-"""Minimum number of frames that must show the ball."""
 _NOISE_WINDOW_SAMPLES = 9
 """Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
 _COMPARED_FRAMES = 8
@@ -348,9 +346,9 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
         InputError: No ball is found.
     """
     frames = _FrameCache(frames)
-    survey = background_model.survey_frames(frames)
+    survey = film_cuts.survey_frames(frames)
     notes: list[str] = []
-    first_frame, end_frame = _find_longest_shot(survey, notes)
+    first_frame, end_frame = film_cuts.find_longest_shot(survey, notes)
     sample_frames = [
         first_frame + k for k in background_model.select_frames(survey.moved[first_frame:end_frame])
     ]
@@ -368,7 +366,7 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
         )
     path, other_paths = merge_continuations(paths)
     # An object that hardly moves may be a ball, but its fall cannot be measured.
-    if len(path.frames) < _MIN_FRAMES or path.travel < path.radius:
+    if len(path.frames) < film_cuts.MIN_FRAMES or path.travel < path.radius:
         raise InputError(_format_no_ball_message(end_frame - first_frame, len(path.frames)))
     _note_other_objects(path, other_paths, notes)
     sample_pictures = {n - first_frame: p for n, p in zip(sample_frames, pictures, strict=True)}
@@ -423,32 +421,6 @@ def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
         f"no ball found: {observation} that moves and stays round; "
         "film with a fixed camera and a ball unlike its background"
     )
-
-
-def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -> tuple[int, int]:
-    """Return the first frame and the end (exclusive) of the longest part without a cut.
-
-    Args:
-        survey: result of the first pass over the frames.
-        notes: remarks for the user, extended in place.
-
-    Raises:
-        InputError: the part has too few frames.
-    """
-    shots = survey.list_shots()
-    first_frame, end_frame = max(shots, key=lambda shot: shot[1] - shot[0])
-    if len(shots) > 1:
-        cuts = ", ".join(f"{survey.times[cut_frame]:.2f} s" for cut_frame in survey.cuts[:5])
-        span = f"{survey.times[first_frame]:.2f} to {survey.times[end_frame - 1]:.2f} s"
-        notes.append(
-            f"the film is cut or the camera moves (at {cuts}); "
-            f"only the longest part is tracked, {span}"
-        )
-    if end_frame - first_frame < _MIN_FRAMES:
-        raise InputError(
-            f"expected at least {_MIN_FRAMES} frames without a cut, found {end_frame - first_frame}"
-        )
-    return first_frame, end_frame
 
 
 def _make_detector(pictures: list[RgbImage]) -> BallDetector:

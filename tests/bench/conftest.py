@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "robot"
 

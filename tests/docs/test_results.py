@@ -19,8 +19,8 @@ from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as SHOT_COLUMNS
 from bench.bounce_shot.shot_config import read_shot_config
-from bench.bounce_shot.shot_execution import get_shot_path, read_shot, store_shot
 from bench.bounce_shot.shot_sampling import draw_shots
+from bench.bounce_shot.shot_storage import get_shot_path, read_shot, store_shot
 from bench.bounce_shot.tuned_shots import TunedModel
 from sims.core.toml_validation import read_toml
 from sims.vision.pinhole_camera import FilmDescription, PinholeCamera, format_camera_file

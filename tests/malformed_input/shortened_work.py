@@ -56,7 +56,7 @@ SHORT = {
     "bench.benchmark.storage.provenance.distributions": _nothing,
     "bench.diagnosis.explain._diagnose_runs": _cut,
     "bench.conformance.check_suites._run_all_checks": _cut,
-    "bench.logs.film_tracking.write_video": _cut,
+    "bench.logs.film_rendering.write_video": _cut,
     "bench.figures.recording_figure.write_recording_figure": _nothing,
     "bench.figures.recording_figure.render_track_figure": lambda *_: (b"", b""),
     "bench.api.train.LossRecorder.write": _nothing,

@@ -19,7 +19,7 @@ from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.stored_study import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES
-from bench.logs.film_tracking import write_film as film
+from bench.logs.film_rendering import write_film as film
 from tests.bench.logs.log_writers import write_folder
 from tests.conftest import PLUGINS
 

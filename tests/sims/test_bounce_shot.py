@@ -10,12 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.bounce_shot.shot_config import BALL_KINDS, get_ball_kind
-from bench.bounce_shot.shot_planner import (
-    PlanningModel,
-    ShotGeometry,
-    compute_hoop_crossings,
-    plan_shot,
-)
+from bench.bounce_shot.shot_geometry import ShotGeometry, compute_hoop_crossings
+from bench.bounce_shot.shot_planner import PlanningModel, plan_shot
 from bench.bounce_shot.true_world import (
     AIR_DENSITY,
     CONTACT_SECONDS,

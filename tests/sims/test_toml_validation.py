@@ -14,6 +14,7 @@ from sims.core.toml_validation import (
     check_number_pair,
     check_range,
     format_value,
+    list_nested_names,
 )
 
 
@@ -106,3 +107,8 @@ def test_numbers_pairs_and_names():
 
 def test_a_long_value_is_quoted_in_part():
     assert len(format_value("x" * 10_000)) == 41
+
+
+def test_names_of_nested_tables_are_joined():
+    tables = {"q": {"hull": {"x": {"unit": "m"}}}, "q.arm": {"unit": "rad"}, "tau.arm": {}}
+    assert list_nested_names(tables) == ["q.hull.x", "q.arm", "tau.arm"]

@@ -40,7 +40,7 @@ def run_film(options: argparse.Namespace, print_line: PrintLine) -> CommandResul
         options: Options of `simgap film`.
         print_line: Prints a line of text.
     """
-    from bench.logs.film_tracking import write_film
+    from bench.logs.film_rendering import write_film
 
     frames, seconds = write_film(
         options.recording,

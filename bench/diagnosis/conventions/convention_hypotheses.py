@@ -22,10 +22,10 @@ import numpy as np
 from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
 from bench.logs.importing.joint_order import find_best_order
+from bench.logs.importing.normalised_positions import compute_range_scale
 from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, InputError, Simulator
 from sims.recording.column_mapping import list_mapped_files
-from sims.recording.log_formats.lerobot_dataset import range_scale
 from sims.recording.log_formats.log_columns import LogFile
 from sims.recording.log_formats.log_files import read_log
 from sims.recording.recording import Recording, Run
@@ -250,7 +250,7 @@ class HypothesisGenerator:
             changes: dict[str, SignalChange] = {}
             for joint in limited:
                 assert joint.range is not None
-                scale = range_scale(*joint.range, from_zero=low == 0.0)
+                scale = compute_range_scale(*joint.range, from_zero=low == 0.0)
                 for name in (joint.channels["q"], *joint.servo_inputs):
                     gain = scale.gain / self._signals[name].gain
                     changes[name] = SignalChange(name, gain, scale.offset)

@@ -16,8 +16,8 @@ from bench.diagnosis.conventions.convention_hypotheses import (
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from sims.core.files import write_files
 from sims.core.simulator import InputError
-from sims.core.toml_validation import toml_key, toml_text
-from sims.recording.recording_description import DeclaredSignals, dotted, read_meta
+from sims.core.toml_validation import join_nested_names, toml_key, toml_text
+from sims.recording.recording_description import DeclaredSignals, read_meta
 from sims.recording.unit_conversion import compute_unit_scale
 
 KINDS = ("channels", "inputs")
@@ -45,7 +45,7 @@ def correct_description(
         "inputs": {c.name: c.unit for c in declared.inputs},
     }
     for kind in KINDS:
-        corrected[kind] = dotted(corrected.get(kind, {}), units[kind])
+        corrected[kind] = join_nested_names(corrected.get(kind, {}), units[kind])
     for difference in differences:
         hypothesis = difference.hypothesis
         for kind in KINDS:

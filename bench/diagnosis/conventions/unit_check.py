@@ -44,7 +44,7 @@ from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
 from sims.recording.recording import Recording
-from sims.recording.recording_description import stated_columns
+from sims.recording.recording_description import read_stated_columns
 from sims.system_simulator import SystemSimulator
 
 MIN_BASE_RESIDUAL_SHARE = 0.1
@@ -296,7 +296,7 @@ class Subject:
             Channels, then inputs, with declared unit, recorded unit and conversion factors.
         """
         try:
-            conversions = stated_columns(self.recording.path, self.kind)
+            conversions = read_stated_columns(self.recording.path, self.kind)
         except InputError:
             # A recording made in memory has no description and is in SI units.
             conversions = {}

@@ -17,7 +17,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.report import effect_and_unit_text
 from bench.diagnosis.verdict import Verdict
 from bench.figures.figure_output import FigureFiles
-from bench.logs.importing.sample_selection import leave_out_settling
+from bench.logs.filter_settling import leave_out_settling
 from bench.logs.segmentation import segment_recording
 from bench.pages.html_page import HtmlPage
 from bench.pages.page_table import Table

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from bench.core.resource_estimates import check_recording_size
 from bench.diagnosis.evaluation.noise_floor import INTEGRATION_ERROR_SHARE, add_minimal_noise
 from bench.diagnosis.pipeline.contact_conditions import ContactConditions
 from bench.diagnosis.pipeline.left_out_segments import leave_out_unpredictable_segments
@@ -16,13 +17,11 @@ from bench.diagnosis.pipeline.simulated_runs import (
     SimulatedRuns,
     choose_engine,
 )
-from bench.logs.importing.sample_selection import (
-    fill_lost_commands,
-    leave_out_settling,
-    thin_recording,
-)
+from bench.logs.filter_settling import leave_out_settling
+from bench.logs.lost_samples import fill_lost_commands
 from bench.logs.quality.log_quality import check_recording_plausible
-from bench.logs.recording_loading import check_recording_size, load_joined
+from bench.logs.recording_joining import load_joined
+from bench.logs.sample_thinning import thin_recording
 from bench.logs.segmentation import segment_recording
 from bench.pages.text_format import joined
 from sims.core.simulator import InputError, Simulator

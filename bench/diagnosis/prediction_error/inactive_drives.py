@@ -43,14 +43,9 @@ from bench.diagnosis.kalman.measured_states import (
     compute_joint_forces,
     has_joint_forces,
 )
+from bench.logs.segmentation import split_without_masked
 from sims.core.simulator import Array, Simulator
-from sims.recording.drive_switches import (
-    DriveSwitch,
-    apply_drive_switches,
-    spans,
-    spans_of_runs,
-    split_without_masked,
-)
+from sims.recording.drive_switches import DriveSwitch, apply_drive_switches, format_run_spans, spans
 from sims.recording.recording import Recording, Run
 
 Mask = NDArray[np.bool_]
@@ -193,7 +188,7 @@ def _format_message(
         inactive_masks: (T,) mask of each run, of the samples that were left out.
     """
     joints = ", ".join(drive.joint for drive in drives)
-    sample_text = spans_of_runs(recording.runs, inactive_masks)
+    sample_text = format_run_spans(recording.runs, inactive_masks)
     noun = "joint" if len(drives) == 1 else "joints"
     symptom_text = (
         "the joints stand still" if drives[0].is_held else "the motion shows no force of them"

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.recording.log_formats.column_names import read_unit, split_unit
+from sims.recording.log_formats.unit_names import read_unit, split_unit
 from sims.recording.log_joining import MAX_REPEATED
 from sims.robot.robot_model import Joint
 

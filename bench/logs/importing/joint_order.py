@@ -186,7 +186,9 @@ MIN_SAMPLES = 20
 """Minimum number of samples for determining an order."""
 
 
-def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> list[int] | None:
+def find_order_by_commands(
+    commands: Sequence[Array], positions: Sequence[Array]
+) -> list[int] | None:
     """Find the order of positions that follows commands best, as a log may not name its columns.
 
     Args:
@@ -375,7 +377,7 @@ def _follow_commands(
     Returns:
         For each joint, the joint at whose index its column is; empty if nothing is exchanged.
     """
-    order = order_of_commands(servos.commands, servos.positions)
+    order = find_order_by_commands(servos.commands, servos.positions)
     if order is None:
         return {}
     joints = servos.joints

@@ -1,237 +1,26 @@
-"""Write a recording description for raw logs (`simgap import`), with every guess marked.
-
-The description is TOML.
-"""
+"""Find what raw logs contain, and describe them as a recording (`simgap import`)."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from bench.logs.importing.description_writer import DescriptionWriter
 from bench.logs.importing.import_result import POSITION_UNITS, ImportOptions, ImportResult
 from bench.logs.importing.joint_order import assign_order
-from bench.logs.importing.run_logs import RunLogs, group_logs_by_run, hold_signal
-from bench.logs.importing.servo_estimation import AddedServo, estimate_added_servo
+from bench.logs.importing.run_logs import RunLogs, group_logs_by_run
 from bench.logs.importing.signal_assignment import (
     ColumnAssigner,
-    Signal,
     SignalAssignment,
     assign_velocities,
 )
 from bench.logs.recording_loading import load_recording
 from sims.core.files import write_files
-from sims.core.simulator import Array, InputError
-from sims.core.toml_validation import check_known_names, toml_key, toml_text
-from sims.robot.dynamics.joint_scales import compute_joint_scales
-from sims.robot.robot_model import Joint, RobotModel
-
-FREE_GAINS = "actuator.stiffness", "actuator.damping"
-"""Free numbers of a servo that is missing in the model file."""
-
-
-class DescriptionWriter:
-    """Writer of the description of imported logs.
-
-    Args:
-        logs: Logs that are imported.
-        signals: Signals and their columns.
-        options: Information that the user states.
-        model: Model file of the robot.
-        folder: Folder in which the description will be written.
-        result: Result to which messages are added.
-    """
-
-    def __init__(
-        self,
-        logs: RunLogs,
-        signals: SignalAssignment,
-        options: ImportOptions,
-        model: Path,
-        folder: Path,
-        result: ImportResult,
-    ) -> None:
-        """Store the inputs; nothing is written yet.
-
-        Args:
-            logs: Files of the runs.
-            signals: Columns that were assigned to channels and inputs.
-            options: Facts that the user has stated.
-            model: Model file of the robot.
-            folder: Folder of the description, to which its paths are relative.
-            result: Result of the import, whose guesses are marked in the text.
-        """
-        self._logs, self._signals, self._options = logs, signals, options
-        self._model, self._folder, self._result = model, folder, result
-
-    def write(self) -> str:
-        """Return the description.
-
-        It has the time, the runs, actuators that are missing in the model file, channels, inputs
-        and extra columns. Guesses have a comment.
-
-        Returns:
-            Text of the TOML file.
-        """
-        servos = [
-            self._estimate_added_servo(*named_servo)
-            for named_servo in self._signals.added_servos.items()
-        ]
-        body = [*self._list_time_lines(), *self._run_lines()]
-        for servo in servos:
-            body += [
-                f"[actuators.{toml_key(servo.name)}]",
-                f"joint = {toml_text(servo.joint.name)}",
-                'kind = "position"  # guess: its commands are positions',
-                f"kp = {servo.kp:.4g}  # guess",
-                f"kv = {servo.kv:.4g}  # guess",
-                "",
-            ]
-        for kind, table in (
-            ("channels", self._signals.channels),
-            ("inputs", self._signals.inputs),
-        ):
-            for name, signal in table.items():
-                body += self._format_signal_lines(kind, name, signal)
-        for column in self._signals.switches:
-            body += [f"[extra.{toml_key(column.name)}]  # guess: zeros and ones"]
-            body += [*self._format_file_lines(column.file), f"column = {toml_text(column.name)}"]
-            body += ['unit = "1"', ""]
-        head = [*(f"# check: {line}" for line in self._result.checks)]
-        head += [f"model = {toml_text(self._make_relative(self._model))}"]
-        free_servos = [servo.name for servo in servos if servo.is_free]
-        if free_servos:
-            places = ["*"] if len(free_servos) == len(servos) else free_servos
-            names = [f"{number}@{place}" for place in places for number in FREE_GAINS]
-            name_list = ", ".join(map(toml_text, names))
-            head.append(f"free = [{name_list}]  # not known: they are estimated")
-        return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
-
-    def _list_time_lines(self) -> Iterator[str]:
-        """Yield the lines of the table `[time]`: a sampling rate (Hz) or the time stamp column."""
-        yield "[time]"
-        if self._logs.rate is not None:
-            yield f"rate = {float(self._logs.rate)!r}"
-        else:
-            yield f"column = {toml_text(self._logs.time_column)}"
-            yield f"unit = {toml_text(self._logs.time_unit)}  # guess"
-        yield ""
-
-    def _run_lines(self) -> Iterator[str]:
-        """Yield a table `[runs.NAME]` for each run: its file or folder, and whether it is held out.
-
-        A single run without a name has no table.
-        """
-        for run, files in self._logs.runs.items():
-            if run:
-                path = files.paths[0] if files.alone else files.folder
-                key = "file" if files.alone else "folder"
-                yield f"[runs.{toml_key(run)}]"
-                yield f"{key} = {toml_text(self._make_relative(path))}"
-                if run in self._options.held_out:
-                    yield "held_out = true"
-                yield ""
-
-    def _format_file_lines(self, file: str) -> list[str]:
-        """Return the line with the file of a signal; none if each run is one file."""
-        runs = self._logs.runs
-        if next(iter(runs.values())).alone:
-            return []
-        if "" in runs:
-            file = self._make_relative(runs[""].folder / file)
-        return [f"file = {toml_text(file)}"]
-
-    def _format_signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
-        """Return the lines of a channel or an input.
-
-        Args:
-            kind: table of the signal, ``channels`` or ``inputs``.
-            name: name of the signal, such as ``q.elbow``.
-            signal: its column, unit and scale.
-        """
-        column = signal.column
-        lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
-        lines += self._format_file_lines(column.file)
-        lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
-        # A stated scale shows that the user knows that positions are not normalised.
-        is_stated = self._options.position_unit == "deg" and name.startswith("q.")
-        if signal.scale != 1.0 or is_stated:
-            lines.append(f"scale = {signal.scale!r}")
-        if signal.offset:
-            lines.append(f"offset = {signal.offset!r}")
-        self._result.guessed.append(
-            f"{name}: {column.file}, column {column.name}, {signal.description}"
-        )
-        return [*lines, ""]
-
-    def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
-        """Estimate the gains of a servo that the model file lacks, and tell the user their origin.
-
-        If the log moves the joint, the gains are free: `explain` fits them, starting from values
-        measured from the response to the command, or else from those of a typical servo. This is
-        listed with the guesses. If the log does not move the joint, the gains are fixed and only
-        hold its position. The user has to check this, so it is listed with the checks.
-
-        Args:
-            name: name of the new servo.
-            joint: joint that it drives.
-        """
-        signals = self._signals
-        inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
-        servo = estimate_added_servo(name, joint, inertia, self._collect_servo_samples(name, joint))
-        frequency, damping = servo.response
-        gains = f"for {frequency:.3g} rad/s and a damping ratio of {damping:.2g}"
-        if servo.is_free:
-            origin = (
-                "as it follows its command" if servo.is_measured else "typical of a hobby servo"
-            )
-            self._result.guessed.append(
-                f"gains of the servo of {joint.name}: {gains}, {origin}; free"
-            )
-        else:
-            self._result.checks.append(
-                f"gains of the servo of {joint.name}: the log does not move this joint and cannot "
-                f"show them; kp = {servo.kp:.4g} and kv = {servo.kv:.4g} ({gains}) only hold its "
-                f"position and are not fitted; state those of the drive in "
-                f"[actuators.{toml_key(name)}], or import a log that moves the joint"
-            )
-        return servo
-
-    def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
-        """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
-
-        A command holds until the next one.
-
-        Args:
-            name: name of the servo.
-            joint: joint that it drives.
-        """
-        command = self._signals.inputs[f"u.{name}"]
-        position = self._signals.get_position(joint.name)
-        samples: list[tuple[Array, Array, Array]] = []
-        if position is None:
-            return samples
-        for run in self._logs.runs:
-            command_samples = self._logs.read(run, command.column)
-            measured = self._logs.read(run, position.column)
-            if command_samples is None or measured is None:
-                continue
-            times, values = measured
-            u = command.convert(joint.unit, hold_signal(*command_samples, times))
-            samples.append((times, u, position.convert(joint.unit, values)))
-        return samples
-
-    def _make_relative(self, path: Path) -> str:
-        """Return a path relative to the folder of the description, with forward slashes.
-
-        On another drive of Windows no relative path exists, so the path is absolute.
-        """
-        try:
-            return Path(os.path.relpath(path, self._folder)).as_posix()
-        except ValueError:
-            return path.resolve().as_posix()
+from sims.core.simulator import InputError
+from sims.core.toml_validation import check_known_names
+from sims.robot.robot_model import RobotModel
 
 
 def describe_logs(

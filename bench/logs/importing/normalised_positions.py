@@ -1,7 +1,14 @@
 """Normalised positions of LeRobot: -100 to 100 of a joint's range (0 to 100 for a gripper).
 
 They look like degrees: only a calibration file or the user can distinguish them, not the numbers of
-a dataset.
+a dataset. With the calibrated range r = range_max - range_min of a motor in encoder counts,
+N = 4096 counts per turn and the zero angle in the middle of the range, a position x is the angle
+
+    q = s x r / 200 * 360 / (N - 1),            x in -100 to 100                                 (1)
+    q = s (x - 50) r / 100 * 360 / (N - 1),     x in 0 to 100                                    (2)
+
+in degrees, where s is -1 if ``drive_mode`` is set. The counts include the homing offset already.
+(Formulas: huggingface/lerobot, src/lerobot/motors/motors_bus.py, ``_normalize``.)
 """
 
 from __future__ import annotations
@@ -16,12 +23,8 @@ from bench.logs.quality.quality_finding import Anomaly
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import read_toml
 from sims.recording.log_formats.lerobot_dataset import (
-    AngleScale,
     MotorRange,
-    compute_angle_scale,
     find_calibration,
-    motor_of,
-    range_scale,
     read_calibration,
     split_episode_path,
 )
@@ -51,7 +54,9 @@ class NormalisedPositions(NamedTuple):
     motors: Mapping[str, MotorRange]
     source: Path | None
 
-    def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
+    def get_position_scale(
+        self, column: str, values: Array, joint: Joint
+    ) -> tuple[str, AngleScale] | None:
         """Return the unit of a column's positions, and their conversion to it.
 
         The calibration of a motor gives angles in degrees. Without one, the normalised range is
@@ -68,13 +73,13 @@ class NormalisedPositions(NamedTuple):
                 range.
         """
         from_zero = "gripper" in column.lower() and float(np.nanmin(values)) >= 0.0
-        motor = motor_of(column, self.motors)
+        motor = find_motor(column, self.motors)
         # Encoder counts of a slide joint's motor are not metres, so the model's range is used.
         if motor is not None and joint.kind == "hinge":
             return "deg", compute_angle_scale(self.motors[motor], from_zero)
         if joint.range is None:
             return None
-        return joint.unit, range_scale(*joint.range, from_zero)
+        return joint.unit, compute_range_scale(*joint.range, from_zero)
 
     @property
     def description(self) -> str:
@@ -176,3 +181,58 @@ def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool
         and split_episode_path(description.parent / folder / "frames") is not None
         for folder in folders[:1]
     )
+
+
+COUNTS_PER_TURN = 4096
+"""Encoder counts per turn of a Feetech or Dynamixel servo."""
+
+
+class AngleScale(NamedTuple):
+    """Conversion of a normalised position to an angle: ``gain`` * position + ``offset``."""
+
+    gain: float
+    offset: float
+
+
+def find_motor(column: str, motors: Iterable[str]) -> str | None:
+    """Return the motor whose name is part of a column's name; the longest one if several match.
+
+    Returns:
+        The name of the motor; None if none matches.
+    """
+    matching_motors = [motor for motor in motors if motor.lower() in column.lower()]
+    return max(matching_motors, key=len, default=None)
+
+
+def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
+    """Return the conversion of a normalised position to an angle in degrees.
+
+    With the range r in counts and N = 4096 counts per turn, q = s x r / 200 * 360 / (N - 1) for x
+    in -100 to 100 (1), and q = s (x - 50) r / 100 * 360 / (N - 1) for x in 0 to 100 (2), in
+    degrees.
+
+    Args:
+        motor: Calibrated range of the motor.
+        from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
+            (1).
+    """
+    # The normalised position has a range of 100 or 200 percent over these degrees.
+    degrees = 360.0 / (COUNTS_PER_TURN - 1) * (motor.highest - motor.lowest)
+    sign = -1.0 if motor.reversed else 1.0
+    if from_zero:
+        return AngleScale(sign * degrees / 100.0, -sign * degrees / 2.0)
+    return AngleScale(sign * degrees / 200.0, 0.0)
+
+
+def compute_range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
+    """Return the conversion of a normalised position to the unit of its range.
+
+    Args:
+        lowest: Lower end of the range.
+        highest: Upper end of the range, in the same unit.
+        from_zero: Whether positions are 0 to 100 instead of -100 to 100.
+    """
+    width = highest - lowest
+    if from_zero:
+        return AngleScale(width / 100.0, lowest)
+    return AngleScale(width / 200.0, (highest + lowest) / 2.0)

@@ -26,7 +26,7 @@ from bench.logs.importing.normalised_positions import (
     is_lerobot,
 )
 from bench.logs.importing.run_logs import MAX_RUNS, RunLogs
-from bench.logs.quality.signal_checks import MIN_CORRELATION, VelocityComparison
+from bench.logs.quality.velocity_checks import MIN_CORRELATION, VelocityComparison
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import Run
@@ -486,7 +486,7 @@ class ColumnAssigner:
             origin = "the row of units" if column.units_row else "its name"
             return Signal(column, column.unit, placement, f"; in {column.unit} by {origin}")
         if self.normalised is not None:
-            scale = self.normalised.scale_of(column.name, column.values, joint)
+            scale = self.normalised.get_position_scale(column.name, column.values, joint)
             if scale is None:
                 reason = f"is normalised, and the range of {joint.name} is not known"
                 self._result.leave_out(column, reason)

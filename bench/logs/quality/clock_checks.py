@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.logs.importing.sample_selection import MAX_FILLED_SAMPLES, find_lost_samples
+from bench.logs.lost_samples import MAX_FILLED_SAMPLES, find_lost_samples
 from bench.logs.quality import pose_check
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding
 from sims.core.plain_values import join_first_names

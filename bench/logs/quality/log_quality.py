@@ -10,7 +10,14 @@ from collections.abc import Iterator
 
 from bench.core.resource_estimates import FORCE_HINT
 from bench.logs.importing.normalised_positions import check_normalised_positions
-from bench.logs.quality import clock_checks, pose_check, signal_checks
+from bench.logs.quality import (
+    clock_checks,
+    pose_check,
+    range_checks,
+    servo_checks,
+    signal_checks,
+    velocity_checks,
+)
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding
 from sims.core.simulator import InputError, Simulator
 from sims.recording.recording import Recording
@@ -32,14 +39,14 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     yield from signal_checks.check_quantisation(recording, kind)
     yield from signal_checks.check_saturation(recording, kind)
     yield from signal_checks.check_standstill(recording, kind)
-    yield from signal_checks.check_velocities(recording, kind)
+    yield from velocity_checks.check_velocities(recording, kind)
     yield from pose_check.find_overlaps(recording, kind)
 
 
 def check_recording_plausible(
     recording: Recording, kind: type[Simulator], force: bool = False
 ) -> list[str]:
-    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
+    """Reject impossible time stamps and robot positions, and return all other anomalies.
 
     Args:
         recording: Recording as it was read.
@@ -50,12 +57,14 @@ def check_recording_plausible(
         Texts of the anomalies, to be shown to the user.
 
     Raises:
-        InputError: An anomaly is certain and `force` is False; the message is one line.
+        InputError: An anomaly is certain, which means that no correct recording can have it, and
+            `force` is False; the message is one line.
     """
     # Positions first: their wrong units make stamps look implausible, but not vice versa.
     anomalies = [
         *find_log_anomalies(recording),
-        *pose_check.check_poses(recording, kind),
+        *range_checks.check_joint_ranges(recording, kind),
+        *servo_checks.check_servos(recording, kind),
         *clock_checks.find_anomalies(recording, kind),
         *pose_check.find_missing_base_poses(recording, kind),
         *(
@@ -63,10 +72,10 @@ def check_recording_plausible(
             for overlap in pose_check.find_overlaps(recording, kind)
         ),
     ]
-    for oddity in anomalies:
-        if oddity.certain and not force:
-            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
-    return [oddity.text for oddity in anomalies]
+    for anomaly in anomalies:
+        if anomaly.certain and not force:
+            raise InputError(f"{recording.path}: {anomaly.text}, {FORCE_HINT}")
+    return [anomaly.text for anomaly in anomalies]
 
 
 def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:

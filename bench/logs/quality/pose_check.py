@@ -1,12 +1,4 @@
-"""Check the recorded poses of a robot: contacts, accelerations, and the motion of a floating base.
-
-Joint limits and servo commands reveal wrong units (degrees), reversed signs and exchanged columns.
-The joint of a servo approximately follows its command: over the samples of all runs, with the
-command u and the position q about their means,
-
-    b = <u q> / <u^2>,    r = <u q> / sqrt(<u^2> <q^2>)                       (1)
-
-are the slope and the correlation.
+"""Check the recorded poses of a robot: contacts, overlaps, and initial poses of floating bodies.
 
 Initial poses are not estimated, and the same commands produce a different motion from a different
 initial pose.
@@ -16,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -178,90 +170,10 @@ def iterate_poses(
             yield data
 
 
-MAX_RANGE_EXCESS = 1.0
-"""Maximum plausible distance of a position beyond its joint's range, as a fraction of the range."""
-RANGE_TOLERANCE = 0.02
-"""Distance beyond a joint's range explained by noise or an offset, as a fraction of the range."""
-MAX_PLAUSIBLE_TURNS = 8.0
-"""Maximum plausible number of turns of a joint without limits."""
-MIN_FOLLOWING_CORRELATION = 0.9
-"""Minimum correlation r of (1) for a position that follows a command."""
-MAX_UNRELATED_CORRELATION = 0.7
-"""Maximum absolute correlation r of (1) for a position that does not follow a command."""
-MAX_REVERSED_SLOPE = -0.3
-"""Maximum slope b of (1) for a servo that follows its command with reversed sign."""
-DEGREE_SLOPE_RANGE = (40.0, 80.0)
-"""Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
 MIN_OVERLAP_METRES = 1e-3
 """Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
 MIN_OVERLAP_SHARE = 0.9
 """Smallest share of the recorded poses in which bodies overlap that do so by their shape."""
-_SMALLER_UNITS = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
-"""Smaller unit in which positions are often recorded, by SI unit: its value and name."""
-
-
-def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
-    """Find implausible positions of a robot; none for other systems.
-
-    Returns:
-        Anomalies of joint ranges and of servos.
-    """
-    if not kind.has_model:
-        return
-    robot: Any = kind
-    for joint in robot.robot.joints:
-        if joint.has_one_coordinate:
-            yield from _check_range(recording, joint)
-    yield from _check_servos(recording, robot.robot)
-
-
-def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
-    """Find positions beyond the limits of a joint, which a wrong unit or a wrong limit explains.
-
-    Far beyond the limits the anomaly is certain (a wrong unit), slightly beyond them it is not (the
-    limit may be wrong), nor for a joint without limits that turns very often. Only the first run
-    with such positions is reported.
-
-    Args:
-        recording: recording of the robot.
-        joint: joint of its model, with the range of its position.
-    """
-    column = f"q.{joint.name}"
-    unit, (smaller_unit, name) = joint.unit, _SMALLER_UNITS[joint.unit]
-    for run in recording.runs:
-        values = run.channels.get(column)
-        if values is None or not np.isfinite(values).any():
-            continue
-        extremes = np.array([np.nanmin(values), np.nanmax(values)])
-        extreme = float(extremes[np.argmax(np.abs(extremes))])
-        if joint.range is None:
-            if joint.kind == "hinge" and abs(extreme) > MAX_PLAUSIBLE_TURNS * 2.0 * np.pi:
-                turns = f"{abs(extreme) / (2.0 * np.pi):.3g} turns"
-                message = f"found {extreme:.4g} rad, {turns}; is the unit degrees?"
-                yield Anomaly(f"run {run.name}, column {column}: {message}", False)
-                return
-            continue
-        low, high = joint.range
-        tolerance = MAX_RANGE_EXCESS * (high - low)
-        if low - tolerance <= extremes[0] and extremes[1] <= high + tolerance:
-            excess = np.array([low - extremes[0], extremes[1] - high])
-            if excess.max() > RANGE_TOLERANCE * (high - low):
-                exceeded_end = int(excess.argmax())
-                stop = f"joint {joint.name} of the model stops at {(low, high)[exceeded_end]:.4g}"
-                message = (
-                    f"goes to {extremes[exceeded_end]:.4g} {unit}, and {stop}; is its range right?"
-                )
-                yield Anomaly(f"run {run.name}, column {column}: {message}", False)
-                return
-            continue
-        scaled = smaller_unit * extremes
-        is_within_limits = low - tolerance <= scaled[0] and scaled[1] <= high + tolerance
-        doubt = f"is the unit {name}?" if is_within_limits else "is the unit right?"
-        message = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
-        yield Anomaly(
-            f"run {run.name}, column {column}: {message}, found {extreme:.4g}; {doubt}", True
-        )
-        return
 
 
 def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
@@ -305,106 +217,6 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
                 "always acts between them",
                 f"{remedy} in {robot.path.name}",
             )
-
-
-class _Pair(NamedTuple):
-    """Slope and correlation of a position against a command, equation (1)."""
-
-    slope: float
-    correlation: float
-
-
-def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
-    """Find servos whose joint moves against the command, or by a factor that a wrong unit explains.
-
-    A joint follows its command if both correlate; then the slope (1) shows the factor. Joints that
-    follow each other's command are found as well, so all commands are compared with all positions.
-
-    Args:
-        recording: recording of a robot.
-        robot: model of the robot.
-    """
-    first = recording.runs[0]
-    servo_signals = [
-        (f"u.{a.name}", f"q.{a.joint}")
-        for a in robot.actuators
-        if a.kind == "position"
-        and f"u.{a.name}" in first.inputs
-        and f"q.{a.joint}" in first.channels
-    ]
-    pairs = {
-        (command, position): _compare_position_with_command(recording, command, position)
-        for command, _ in servo_signals
-        for _, position in servo_signals
-    }
-    for command, position in servo_signals:
-        pair = pairs[command, position]
-        if (
-            pair.correlation > MIN_FOLLOWING_CORRELATION
-            and DEGREE_SLOPE_RANGE[0] < pair.slope < DEGREE_SLOPE_RANGE[1]
-        ):
-            ratio_text = f"{pair.slope:.3g} times as far as {command} commands"
-            message = f"moves {ratio_text}; is its unit degrees?"
-            yield Anomaly(f"column {position}: {message}", True)
-        elif (
-            pair.correlation > MIN_FOLLOWING_CORRELATION
-            and 1.0 / DEGREE_SLOPE_RANGE[1] < pair.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
-        ):
-            ratio_text = f"1/{1.0 / pair.slope:.3g} of what {command} commands"
-            yield Anomaly(
-                f"column {position}: moves {ratio_text}; is the unit of {command} degrees?", False
-            )
-        elif pair.correlation < -MIN_FOLLOWING_CORRELATION and pair.slope < MAX_REVERSED_SLOPE:
-            yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
-    yield from _check_exchanged(servo_signals, pairs)
-
-
-def _check_exchanged(
-    servo_signals: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
-) -> Iterator[Anomaly]:
-    """Find pairs of joints that follow each other's command instead of their own.
-
-    Args:
-        servo_signals: names of command and position of each servo.
-        pairs: slope and correlation of each pair of a command and a position.
-    """
-    for i, (command, position) in enumerate(servo_signals):
-        for other_command, other_position in servo_signals[i + 1 :]:
-            crossed_pairs = pairs[command, other_position], pairs[other_command, position]
-            own_pairs = pairs[command, position], pairs[other_command, other_position]
-            if (
-                min(pair.correlation for pair in crossed_pairs) > MIN_FOLLOWING_CORRELATION
-                and max(abs(pair.correlation) for pair in own_pairs) < MAX_UNRELATED_CORRELATION
-            ):
-                subject = (
-                    f"columns {position} and {other_position}: each follows the other's command"
-                )
-                yield Anomaly(f"{subject}; are they swapped?", False)
-
-
-def _compare_position_with_command(recording: Recording, command: str, position: str) -> _Pair:
-    """Compute slope and correlation of a position against a command, eq. (1), over all runs.
-
-    With command u and position q about their means in each run, the slope is b = <u q> / <u^2> and
-    the correlation r = <u q> / sqrt(<u^2> <q^2>) (1). If one of them is constant, the result is
-    that of an inconspicuous servo: slope 1, correlation 0.
-
-    Args:
-        recording: recorded runs, with their channels, inputs and constants.
-        command: name of the input.
-        position: name of the channel.
-    """
-    squares = np.zeros(3)
-    for run in recording.runs:
-        u, q = run.inputs[command], run.channels[position]
-        is_finite = np.isfinite(u) & np.isfinite(q)
-        if is_finite.sum() > 1:
-            u, q = u[is_finite] - u[is_finite].mean(), q[is_finite] - q[is_finite].mean()
-            squares += np.array([u @ u, u @ q, q @ q])
-    uu, uq, qq = squares
-    if min(uu, qq) <= 0 or uq == 0:
-        return _Pair(slope=1.0, correlation=0.0)
-    return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
 
 
 def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:

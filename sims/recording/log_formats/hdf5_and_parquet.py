@@ -99,7 +99,7 @@ def is_hdf5(path: Path) -> bool:
     return path.suffix.lower() in ENDINGS and path.is_file()
 
 
-def group_of(path: Path) -> tuple[Path, str] | None:
+def split_group_path(path: Path) -> tuple[Path, str] | None:
     """Split a path into an HDF5 file and a group in it; None if it is not inside such a file."""
     if is_hdf5(path):
         return path, "/"

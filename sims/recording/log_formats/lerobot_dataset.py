@@ -6,16 +6,8 @@ distinguished by the column ``episode_index``. Entries of a list are named as in
 ``observation.state.shoulder_pan.pos``, or numbered where the dataset has no names. Images and
 videos are not read. (Layout: huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx.)
 
-A file has a table for each motor, ``{"elbow_flex": {"id": 3, "drive_mode": 0, "homing_offset": 85,
-"range_min": 820, "range_max": 3110}}``, in counts of the encoder. In a dataset, a position x is
--100 to 100 of that range, or 0 to 100 for a gripper. With the range r = range_max - range_min,
-N = 4096 counts per turn and the zero angle in the middle of the range, the angle is
-
-    q = s x r / 200 * 360 / (N - 1),            x in -100 to 100                                 (1)
-    q = s (x - 50) r / 100 * 360 / (N - 1),     x in 0 to 100                                    (2)
-
-in degrees, where s is -1 if ``drive_mode`` is set. The counts include the homing offset already.
-(Formulas: huggingface/lerobot, src/lerobot/motors/motors_bus.py, ``_normalize``.)
+A calibration file has a table for each motor, ``{"elbow_flex": {"id": 3, "drive_mode": 0,
+"homing_offset": 85, "range_min": 820, "range_max": 3110}}``, in counts of the encoder.
 """
 
 from __future__ import annotations
@@ -175,8 +167,6 @@ def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dic
     return files_by_episode
 
 
-COUNTS_PER_TURN = 4096
-"""Encoder counts per turn of a Feetech or Dynamixel servo."""
 MAX_FILE_BYTES = 1_000_000
 """Maximum size of a file that is read as a possible calibration, in bytes."""
 _KEYS = ("range_min", "range_max")
@@ -188,13 +178,6 @@ class MotorRange(NamedTuple):
     lowest: float
     highest: float
     reversed: bool
-
-
-class AngleScale(NamedTuple):
-    """Conversion of a normalised position to an angle: ``gain`` * position + ``offset``."""
-
-    gain: float
-    offset: float
 
 
 def read_calibration(path: Path) -> dict[str, MotorRange]:
@@ -250,50 +233,6 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
             if _get_motor_tables(document) is not None:
                 calibration_files.append(path)
     return calibration_files[0] if len(calibration_files) == 1 else None
-
-
-def motor_of(column: str, motors: Iterable[str]) -> str | None:
-    """Return the motor whose name is part of a column's name; the longest one if several match.
-
-    Returns:
-        The name of the motor; None if none matches.
-    """
-    matching_motors = [motor for motor in motors if motor.lower() in column.lower()]
-    return max(matching_motors, key=len, default=None)
-
-
-def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
-    """Return the conversion of a normalised position to an angle in degrees.
-
-    With the range r in counts and N = 4096 counts per turn, q = s x r / 200 * 360 / (N - 1) for x
-    in -100 to 100 (1), and q = s (x - 50) r / 100 * 360 / (N - 1) for x in 0 to 100 (2), in
-    degrees.
-
-    Args:
-        motor: Calibrated range of the motor.
-        from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
-            (1).
-    """
-    # The normalised position has a range of 100 or 200 percent over these degrees.
-    degrees = 360.0 / (COUNTS_PER_TURN - 1) * (motor.highest - motor.lowest)
-    sign = -1.0 if motor.reversed else 1.0
-    if from_zero:
-        return AngleScale(sign * degrees / 100.0, -sign * degrees / 2.0)
-    return AngleScale(sign * degrees / 200.0, 0.0)
-
-
-def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
-    """Return the conversion of a normalised position to the unit of its range.
-
-    Args:
-        lowest: Lower end of the range.
-        highest: Upper end of the range, in the same unit.
-        from_zero: Whether positions are 0 to 100 instead of -100 to 100.
-    """
-    width = highest - lowest
-    if from_zero:
-        return AngleScale(width / 100.0, lowest)
-    return AngleScale(width / 200.0, (highest + lowest) / 2.0)
 
 
 def _get_motor_tables(document: Any) -> Mapping[str, Mapping[str, Any]] | None:

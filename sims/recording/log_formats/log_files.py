@@ -17,7 +17,7 @@ import numpy as np
 from sims.core.files import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_and_parquet, lerobot_dataset, ros_bags
-from sims.recording.log_formats.column_names import arrays_by_name
+from sims.recording.log_formats.column_names import name_array_entries
 from sims.recording.log_formats.hdf5_and_parquet import read_numeric_columns
 from sims.recording.log_formats.log_columns import LogFile, convert_read_errors
 from sims.recording.log_formats.ros_bags import TIME_COLUMN
@@ -68,7 +68,7 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
     if episode is not None:
         files = lerobot_dataset.list_episode_files(*episode)
         return _read_files(files, _read_episode, path, *episode)
-    group = hdf5_and_parquet.group_of(path)
+    group = hdf5_and_parquet.split_group_path(path)
     if group is not None:
         return _read_files([group[0]], _read_group, path, *group)
     if ros_bags.is_bag(path):
@@ -190,7 +190,7 @@ def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list
         The log. Its messages call a row "entry" and count from 0. A matrix whose columns are named
         so can still be read, but is left out of lists of columns.
     """
-    named_columns, unlisted = arrays_by_name(
+    named_columns, unlisted = name_array_entries(
         columns, {name: name_list for name, name_list in texts.items() if name_list}
     )
     return LogFile(

@@ -22,12 +22,9 @@ import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import format_value
-from sims.recording.log_formats.column_names import (
-    name_list_entries,
-    name_numbered_columns,
-    read_unit,
-)
+from sims.recording.log_formats.column_names import name_list_entries, name_numbered_columns
 from sims.recording.log_formats.log_columns import MAX_COLUMNS, LogFile
+from sims.recording.log_formats.unit_names import read_unit
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Possible separators of the cells of a table; a blank means any number of blanks."""

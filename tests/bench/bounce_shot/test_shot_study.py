@@ -17,14 +17,16 @@ from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.benchmark.statistics.paired_tests import compute_proportion_interval
 from bench.bounce_shot import shot_study, tuned_shots
+from bench.bounce_shot.drop_recording import record_drop
 from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table
 from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import execute_shot
-from bench.bounce_shot.shot_sampling import build_pixel_runs, draw_shot, draw_shots, record_drop
+from bench.bounce_shot.shot_sampling import draw_shot, draw_shots
 from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from bench.bounce_shot.tuned_shots import (
     ShotInputs,
     TunedModel,
+    build_pixel_runs,
     select_transferable_effects,
     tune_and_plan,
 )

@@ -12,8 +12,8 @@ import pytest
 
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.score_extended import score_model
-from bench.logs.importing.sample_selection import leave_out_settling
-from bench.logs.recording_loading import load_joined
+from bench.logs.filter_settling import leave_out_settling
+from bench.logs.recording_joining import load_joined
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 NOISE = 5e-4

@@ -31,7 +31,7 @@ from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 from sims.extended_simulator import read_extended
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 from tests.bench.diagnosis.verdict_schema import check

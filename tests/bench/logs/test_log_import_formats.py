@@ -11,7 +11,7 @@ import pytest
 
 import simgap
 from bench.core.plugin_registries import make_robot_simulator
-from bench.logs.importing.joint_order import order_of_commands
+from bench.logs.importing.joint_order import find_order_by_commands
 from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
@@ -191,11 +191,11 @@ def test_numbers_of_joints_are_no_guess(tmp_path):
 
 def test_an_order_is_found_by_the_distance_of_positions_from_commands():
     u, q = COMMANDS.T, POSITIONS.T
-    assert order_of_commands(u, q) is None
-    assert order_of_commands(u, q[[1, 2, 0]]) == [2, 0, 1]
+    assert find_order_by_commands(u, q) is None
+    assert find_order_by_commands(u, q[[1, 2, 0]]) == [2, 0, 1]
     # Two joints with equal motion, or a few samples, do not determine the order.
-    assert order_of_commands([u[0], u[0]], [q[0], q[0]]) is None
-    assert order_of_commands(u[:, :9], q[[1, 2, 0]][:, :9]) is None
+    assert find_order_by_commands([u[0], u[0]], [q[0], q[0]]) is None
+    assert find_order_by_commands(u[:, :9], q[[1, 2, 0]][:, :9]) is None
 
 
 # -- units

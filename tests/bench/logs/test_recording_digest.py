@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bench.diagnosis.many_logs import list_logs
-from bench.logs.recording_loading import compute_recording_digest
+from bench.logs.recording_digest import compute_recording_digest
 from sims.core.files import CHUNK_BYTES
 
 DESCRIPTION = """model = "arm.xml"

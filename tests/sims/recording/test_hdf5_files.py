@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.logs.recording_loading import compute_recording_digest, load_recording
+from bench.logs.recording_digest import compute_recording_digest
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats.log_files import read_log
 from tests.bench.logs.log_writers import ARM

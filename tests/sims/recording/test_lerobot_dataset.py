@@ -5,7 +5,8 @@ import pandas
 import pytest
 
 import simgap
-from bench.logs.recording_loading import compute_recording_digest, load_recording
+from bench.logs.recording_digest import compute_recording_digest
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats.lerobot_dataset import is_dataset, list_episodes, split_episode_path
 from sims.recording.log_formats.log_files import read_log

@@ -6,11 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from sims.core.rotations import compute_yaw_pitch_roll
 from sims.core.simulator import InputError
-from sims.recording.recorded_poses import (
-    convert_quaternions,
-    find_recorded_bases,
-    list_channel_names,
-)
+from sims.recording.recorded_poses import convert_quaternions, find_recorded_bases
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 QUATERNION = [f"q.hull.{entry}" for entry in ("qw", "qx", "qy", "qz")]
@@ -69,8 +65,3 @@ def test_orientations_without_angles_are_refused(quaternion, message):
 )
 def test_bases_are_found_by_their_whole_pose(names, expected):
     assert find_recorded_bases(names) == expected
-
-
-def test_names_of_nested_tables_are_joined():
-    tables = {"q": {"hull": {"x": {"unit": "m"}}}, "q.arm": {"unit": "rad"}, "tau.arm": {}}
-    assert list_channel_names(tables) == ["q.hull.x", "q.arm", "tau.arm"]

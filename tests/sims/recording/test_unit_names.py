@@ -2,7 +2,7 @@
 
 import pytest
 
-from sims.recording.log_formats.column_names import read_unit, split_unit
+from sims.recording.log_formats.unit_names import read_unit, split_unit
 from sims.recording.unit_conversion import compute_unit_scale
 
 WITH_UNIT = {

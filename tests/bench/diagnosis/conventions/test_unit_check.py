@@ -23,7 +23,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.verdict import Cause, Verdict
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 from bench.logs.synthetic_recording import simulate_recording
 from sims.extended_simulator import FittedValue
 from sims.recording.unit_conversion import compute_unit_scale

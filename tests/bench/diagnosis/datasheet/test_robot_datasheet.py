@@ -15,7 +15,7 @@ from bench.diagnosis.datasheet.datasheet_content import (
     format_short_name,
 )
 from bench.diagnosis.datasheet.datasheet_subject import make_subject
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 from tests.bench.diagnosis.sample_report_data import make_report

@@ -14,7 +14,7 @@ from bench.diagnosis.report.consistency_section import (
     name_missing_physics,
 )
 from bench.diagnosis.validation.run_consistency import _compute_student_p_value
-from bench.logs.recording_loading import load_joined
+from bench.logs.recording_joining import load_joined
 from sims import effects
 from sims.core.simulator import InputError
 from sims.systems.ball import Ball

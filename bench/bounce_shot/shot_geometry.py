@@ -1,0 +1,124 @@
+"""Geometry of incline and hoop, and where the path of a ball crosses a height."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+
+
+@dataclass(frozen=True)
+class ShotGeometry:
+    """Geometry of a shot.
+
+    Heights count from the point of the incline below the release, where x = 0.
+
+    Attributes:
+        angle: Angle of the incline, which descends towards x, rad.
+        hoop_x: Centre of the hoop, a horizontal ring, m.
+        hoop_z: Height of the hoop, m.
+        hoop_radius: Radius of the hoop, m.
+    """
+
+    angle: float
+    hoop_x: float
+    hoop_z: float
+    hoop_radius: float
+
+    def __post_init__(self) -> None:
+        """Check that the incline descends, and that the hoop is in front of it and above it.
+
+        Raises:
+            InputError: the scene is impossible.
+        """
+        if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
+            raise InputError(
+                "expected an incline between 0 and a right angle and a hoop in front of it,"
+                f" found {self}"
+            )
+        if self.hoop_z <= -self.hoop_x * math.tan(self.angle):
+            raise InputError(f"expected a hoop above the incline, found {self}")
+
+    def compute_contact_height(self, radius: float) -> float:
+        """Return the height of the centre of a ball that touches the incline at x = 0, m."""
+        return radius / math.cos(self.angle)
+
+
+def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
+    """Return the points where paths cross the hoop's plane downwards.
+
+    Only the flight after the first bounce counts: from where z first rises to where it rises again.
+    With the sample before the plane at height z1 and the one after it at z2, the hoop's plane at
+    height h is crossed on the chord between them, at the share
+
+        (z1 - h) / (z1 - z2)                                               (1)
+
+    Args:
+        path: Centres x, y, z of the ball (n, T, 3), m.
+        scene: Geometry of the shot.
+
+    Returns:
+        Points x, y (n, 2), m; NaN for paths that do not cross.
+    """
+    path = np.asarray(path, dtype=np.float64)
+    x, y, z = np.moveaxis(path, -1, 0)
+    with np.errstate(invalid="ignore"):
+        rises = z[:, 1:] > z[:, :-1]
+        falls = z[:, 1:] < z[:, :-1]
+        has_risen = np.logical_or.accumulate(rises, axis=1)
+        fallen = np.logical_or.accumulate(has_risen & falls, axis=1)
+        rises_again = np.logical_or.accumulate(fallen & rises, axis=1)
+        # Downward only: a ball that crosses upwards has not scored.
+        is_above = z[:, :-1] > scene.hoop_z
+        is_below = z[:, 1:] <= scene.hoop_z
+        down = has_risen & ~rises_again & is_above & is_below
+    first = np.argmax(down, axis=1)
+    rows = np.arange(len(z))
+    high = z[rows, first]
+    low = z[rows, first + 1]
+    is_crossed = down.any(axis=1)  # for paths without a crossing, `first` is 0 and unused
+    share = (high - scene.hoop_z) / np.where(is_crossed, high - low, 1.0)  # (1)
+    at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])
+    at_y = y[rows, first] + share * (y[rows, first + 1] - y[rows, first])
+    crossing_points = np.stack([at_x, at_y], axis=1)
+    result: Array = np.where(is_crossed[:, None], crossing_points, np.nan)
+    return result
+
+
+def find_descent_index(path: Array, height: float) -> int:
+    """Return the index of the sample after which a path descends through a height after its bounce.
+
+    The height is that of the hoop. The path before the bounce is ignored, because the ball falls
+    through the same height after its release.
+
+    Args:
+        path: positions, (T, 3).
+        height: height, m.
+
+    Returns:
+        Index of the sample; the last index if the path does not descend through the height.
+    """
+    heights = path[:, 2]
+    # Before its bounce, the ball falls through the same heights.
+    has_risen = np.logical_or.accumulate(heights[1:] > heights[:-1])
+    down = np.flatnonzero(has_risen & (heights[:-1] > height) & (heights[1:] <= height))
+    return int(down[0]) if down.size else len(heights) - 1
+
+
+_MIN_DRAWN_DEPTH = 0.12
+"""Distance below the hoop down to which paths are drawn, m."""
+
+
+def find_path_end(path: Array, scene: ShotGeometry) -> int:
+    """Return the number of samples to draw of a path, up to 0.12 m below the hoop after its bounce.
+
+    How it continues is not of interest.
+
+    Args:
+        path: positions, (T, 3).
+        scene: incline and hoop.
+    """
+    return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

@@ -1,0 +1,64 @@
+"""Leave out the start of runs in which the filters of a robot's actuators settle.
+
+The activation of a filter at the start of a run is not recorded. For a robot at rest it equals the
+first command, MuJoCo starts it at zero, and in a log that was cut out of a motion it can have any
+value. After a few time constants nothing depends on it, and the commands up to then are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording, Run
+
+LARGEST_SHARE = 0.5
+"""Maximum share of a run that may be left out."""
+
+
+def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
+    """Leave out the first samples of runs whose first activations (filter outputs) are not known.
+
+    A filter before an actuator depends on commands before the run; after a few time constants this
+    is forgotten. A run keeps all of its samples if its filters take more than half of it to settle,
+    or if the robot has floating bodies, whose later poses are not recorded; its filters then begin
+    at the first commands.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+
+    Returns:
+        The recording, and a message for the user, which is empty if nothing is left out.
+    """
+    if not kind.has_model:
+        return recording, ""
+    robot: Any = kind
+    if robot.system.floating_state_units or not robot.system.activations:
+        return recording, ""
+    from sims.robot.dynamics.activation_filters import activation_filters, compute_settling_time
+
+    runs: list[Run] = []
+    seconds = 0.0
+    longest = compute_settling_time(robot.robot, {})
+    for run in recording.runs:
+        run = replace(run, memory=max(run.memory, longest))
+        settling = 0.0 if run.before else compute_settling_time(robot.robot, run.initial)
+        first = int(np.searchsorted(run.times, run.times[0] + settling))
+        if settling > 0 and settling <= LARGEST_SHARE * (run.times[-1] - run.times[0]):
+            seconds = max(seconds, settling)
+            run = run.part(slice(first, None))
+        runs.append(run)
+    if not seconds:
+        return recording, ""
+    filters = activation_filters(robot.robot)
+    names = ", ".join(state_filter.actuator.name for state_filter in filters)
+    note = (
+        f"the first {seconds:.3g} s of runs are left out, in which the filters of {names} settle: "
+        "their first activations are not recorded (state them if they are known: "
+        f'[runs.NAME.initial] "{filters[0].state}" = 0.0)'
+    )
+    return replace(recording, runs=tuple(runs)), note

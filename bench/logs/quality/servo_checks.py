@@ -1,0 +1,132 @@
+"""Check whether the joints of a robot follow the commands of their position servos.
+
+The joint of a servo approximately follows its command: over the samples of all runs, with the
+command u and the position q about their means,
+
+    b = <u q> / <u^2>,    r = <u q> / sqrt(<u^2> <q^2>)                       (1)
+
+are the slope and the correlation. They reveal wrong units (degrees), reversed signs and exchanged
+columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.logs.quality.quality_finding import Anomaly
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording
+
+MIN_FOLLOWING_CORRELATION = 0.9
+"""Minimum correlation r of (1) for a position that follows a command."""
+MAX_UNRELATED_CORRELATION = 0.7
+"""Maximum absolute correlation r of (1) for a position that does not follow a command."""
+MAX_REVERSED_SLOPE = -0.3
+"""Maximum slope b of (1) for a servo that follows its command with reversed sign."""
+DEGREE_SLOPE_RANGE = (40.0, 80.0)
+"""Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
+
+
+class _Regression(NamedTuple):
+    """Slope and correlation of a position against a command, equation (1)."""
+
+    slope: float
+    correlation: float
+
+
+def check_servos(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Find servos whose joint moves against the command, or by a factor that a wrong unit explains.
+
+    A joint follows its command if both correlate; the slope of the position against the command
+    then shows the factor, ideally 1. Joints that follow each other's command are found as well, so
+    all commands are compared with all positions.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system; only robots have servos.
+    """
+    if not kind.has_model:
+        return
+    robot: Any = kind
+    first_run = recording.runs[0]
+    # Name of the command and of the position of each recorded servo.
+    servo_signals = [
+        (f"u.{a.name}", f"q.{a.joint}")
+        for a in robot.robot.actuators
+        if a.kind == "position"
+        and f"u.{a.name}" in first_run.inputs
+        and f"q.{a.joint}" in first_run.channels
+    ]
+    regressions = {
+        (command, position): _regress_position_on_command(recording, command, position)
+        for command, _ in servo_signals
+        for _, position in servo_signals
+    }
+    for command, position in servo_signals:
+        slope, correlation = regressions[command, position]
+        min_degree_slope, max_degree_slope = DEGREE_SLOPE_RANGE
+        is_following = correlation > MIN_FOLLOWING_CORRELATION
+        if is_following and min_degree_slope < slope < max_degree_slope:
+            ratio_text = f"{slope:.3g} times as far as {command} commands"
+            message = f"moves {ratio_text}; is its unit degrees?"
+            yield Anomaly(f"column {position}: {message}", True)
+        elif is_following and 1.0 / max_degree_slope < slope < 1.0 / min_degree_slope:
+            ratio_text = f"1/{1.0 / slope:.3g} of what {command} commands"
+            yield Anomaly(
+                f"column {position}: moves {ratio_text}; is the unit of {command} degrees?", False
+            )
+        elif correlation < -MIN_FOLLOWING_CORRELATION and slope < MAX_REVERSED_SLOPE:
+            yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
+    yield from _check_exchanged(servo_signals, regressions)
+
+
+def _check_exchanged(
+    servo_signals: list[tuple[str, str]], regressions: dict[tuple[str, str], _Regression]
+) -> Iterator[Anomaly]:
+    """Find pairs of joints that follow each other's command instead of their own.
+
+    Args:
+        servo_signals: names of command and position of each servo.
+        regressions: slope and correlation of each position against each command, by the names of
+            command and position.
+    """
+    for i, (command, position) in enumerate(servo_signals):
+        for other_command, other_position in servo_signals[i + 1 :]:
+            crossed = regressions[command, other_position], regressions[other_command, position]
+            own = regressions[command, position], regressions[other_command, other_position]
+            if (
+                min(pair.correlation for pair in crossed) > MIN_FOLLOWING_CORRELATION
+                and max(abs(pair.correlation) for pair in own) < MAX_UNRELATED_CORRELATION
+            ):
+                subject = (
+                    f"columns {position} and {other_position}: each follows the other's command"
+                )
+                yield Anomaly(f"{subject}; are they swapped?", False)
+
+
+def _regress_position_on_command(recording: Recording, command: str, position: str) -> _Regression:
+    """Compute slope and correlation of a position against a command, over all runs.
+
+    With command u and position q about their means in each run, and sums <> over all samples, the
+    slope is b = <u q> / <u^2> and the correlation r = <u q> / sqrt(<u^2> <q^2>) (1). If one of them
+    is constant, or both are unrelated, the result leads to no finding: slope 1, correlation 0.
+
+    Args:
+        recording: recorded runs, with their channels, inputs and constants.
+        command: name of the input.
+        position: name of the channel.
+    """
+    products = np.zeros(3)
+    for run in recording.runs:
+        u, q = run.inputs[command], run.channels[position]
+        is_finite = np.isfinite(u) & np.isfinite(q)
+        if is_finite.sum() > 1:
+            u, q = u[is_finite] - u[is_finite].mean(), q[is_finite] - q[is_finite].mean()
+            products += np.array([u @ u, u @ q, q @ q])
+    uu, uq, qq = products
+    if min(uu, qq) <= 0 or uq == 0:
+        return _Regression(slope=1.0, correlation=0.0)
+    return _Regression(float(uq / uu), float(uq / np.sqrt(uu * qq)))

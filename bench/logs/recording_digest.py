@@ -1,0 +1,77 @@
+"""Hash the files of a recording, to detect whether it has changed."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+from sims.core.files import hash_file
+from sims.core.simulator import InputError
+from sims.recording.column_mapping import list_mapped_files
+from sims.recording.log_formats.hdf5_and_parquet import split_group_path
+from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
+from sims.recording.log_formats.ros_bags import split_bag_path
+from sims.recording.recording_description import get_description_path
+
+_INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
+
+
+def compute_recording_digest(path: Path, further_text: str = "") -> str:
+    """Hash a recording: its table, its description, the mapped logs and bags, and its model.
+
+    Args:
+        path: Path of its table or description.
+        further_text: Further text that is part of the hash.
+
+    Raises:
+        InputError: The table or the description cannot be read.
+    """
+    digest = hashlib.sha256(further_text.encode())
+    description = get_description_path(path)
+    for file in dict.fromkeys([path, description]):
+        try:
+            digest.update(file.read_bytes())
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    for file in list_mapped_files(description):
+        digest.update(compute_content_digest(file))
+    return digest.hexdigest()
+
+
+def compute_content_digest(path: Path) -> bytes:
+    """Return a hash of the content of a file, a model file with its includes, a bag or an episode.
+
+    The hash tells whether a recording has changed since it was explained. A bag is a folder or file
+    of ROS, hashed as a whole; an episode of a LeRobot dataset consists of several files. Missing
+    files contribute nothing; reading them later reports the error.
+    """
+    episode = split_episode_path(path)
+    if episode is not None:
+        try:
+            return b"".join(compute_content_digest(file) for file in list_episode_files(*episode))
+        except InputError:
+            return b""
+    bag = split_bag_path(path) or split_group_path(path)
+    root = path if bag is None else bag[0]
+    files = sorted(root.rglob("*")) if bag is not None and root.is_dir() else [root]
+    content = hashlib.sha256()
+    for file in files if root.suffix.lower() != ".xml" else _list_included_files(root):
+        if file.is_file():
+            file_stat = file.stat()
+            content.update(hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
+    return content.digest()
+
+
+def _list_included_files(model: Path) -> list[Path]:
+    """Return a model file and the files that it includes, directly or through others.
+
+    They are searched in the folder of the model.
+    """
+    files = [model]
+    # Files that are appended here are visited later in this loop.
+    for file in files:
+        names = _INCLUDE.findall(file.read_bytes()) if file.is_file() else []
+        included_files = [model.parent / name.decode(errors="replace") for name in names]
+        files += [included for included in dict.fromkeys(included_files) if included not in files]
+    return files

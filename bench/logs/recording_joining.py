@@ -1,0 +1,154 @@
+"""Join several recordings of one system into one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.logs.recording_loading import load_recording
+from sims.core.plain_values import format_count
+from sims.core.root_mean_square import compute_rms
+from sims.core.simulator import InputError, Simulator
+from sims.recording.recording import MAX_FOLDS, Recording, split_held_out
+
+
+def load_joined(
+    sources: Sequence[str | Path | Recording],
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
+    fix_base: bool = False,
+) -> tuple[Recording, type[Simulator]]:
+    """Read several recordings, join them into one, and find their simulator.
+
+    Each recording is read and, unless the runs are few, divided into runs for fitting and held-out
+    runs on its own. Then the runs are renamed, as several logs may have the same run names, and
+    put together.
+
+    Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
+    runs that it would hold out alone, at least one. A constant that the recordings state
+    differently becomes a constant of the runs; a noise that they state differently is replaced by
+    its root mean square.
+
+    Args:
+        sources: Paths of the tables, or recordings in memory.
+        system: Registered system to use instead of the one that the recordings name.
+        model: Model file of a robot to use instead of the one that the recordings name.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        prepared: Function applied to each recording before its runs are divided.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
+
+    Returns:
+        The joined recording, and the simulator class of its system.
+
+    Raises:
+        InputError: One cannot be read, or they are not of one system with the same channels.
+    """
+    loaded = [
+        load_recording(source, system, model, free, divide=False, fix_base=fix_base)
+        for source in sources
+    ]
+    if prepared is not None:
+        loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
+    first_recording, kind = loaded[0]
+    if len(loaded) == 1:
+        return split_held_out(first_recording, folds=True), kind
+    for recording, other_kind in loaded[1:]:
+        _refuse_other(first_recording, kind, recording, other_kind)
+    recordings = [recording for recording, _ in loaded]
+    runs_of_all = [run for recording in recordings for run in recording.runs]
+    is_cross_validated = len(runs_of_all) <= MAX_FOLDS and not any(
+        run.held_out for run in runs_of_all
+    )
+    if not is_cross_validated:
+        recordings = [split_held_out(recording) for recording in recordings]
+    names = make_log_names([recording.path for recording in recordings])
+    common_constants = {
+        key: value
+        for key, value in first_recording.constants.items()
+        if all(recording.constants.get(key) == value for recording in recordings)
+    }
+    default_values = {c.name: c.value for c in kind.constants}
+    stated_keys = {key for recording in recordings for key in recording.constants}
+    differing = stated_keys - common_constants.keys()
+    runs = [
+        replace(
+            run,
+            name=f"{name}: {run.name}",
+            log=name,
+            constants={
+                **{key: default_values.get(key, np.nan) for key in differing},
+                **{key: value for key, value in recording.constants.items() if key in differing},
+                **run.constants,
+            },
+        )
+        for name, recording in zip(names, recordings, strict=True)
+        for run in recording.runs
+    ]
+    joined_recording = replace(
+        first_recording,
+        title=f"{first_recording.title or first_recording.path.stem} and "
+        + format_count(len(loaded) - 1, "more log"),
+        constants=common_constants,
+        # The noise of a channel for which some recording states none is not known.
+        noise={
+            name: compute_rms([recording.noise[name] for recording in recordings])
+            for name in first_recording.noise
+            if all(name in recording.noise for recording in recordings)
+        },
+        runs=tuple(runs),
+        notes=tuple(note for recording in recordings for note in recording.notes),
+    )
+    if is_cross_validated:
+        joined_recording = split_held_out(joined_recording, folds=True)
+    return joined_recording, kind
+
+
+def _refuse_other(
+    first: Recording, kind: type[Simulator], other: Recording, other_kind: type[Simulator]
+) -> None:
+    """Reject a recording that cannot be joined with the first one.
+
+    Both must be of one system (robots: one model file) and have the same channels and inputs, since
+    the joined recording is fitted with one simulator.
+
+    Raises:
+        InputError: System, model file, channels or inputs of the recordings differ.
+    """
+    robots = kind.has_model and other_kind.has_model
+    if (kind.has_model or other_kind.has_model) != robots or other_kind.name != kind.name:
+        raise InputError(
+            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of "
+            f"{other_kind.name}; explain it by itself"
+        )
+    if robots and vars(other_kind)["source_digest"] != vars(kind)["source_digest"]:
+        raise InputError(
+            f"{other.path}: expected the model file, the actuators and the free numbers of "
+            f"{first.path}, found others; state the same, or give --model and --free"
+        )
+    first_run, other_run = first.runs[0], other.runs[0]
+    for signal_type, first_names, other_names in (
+        ("channels", set(first_run.channels), set(other_run.channels)),
+        ("inputs", set(first_run.inputs), set(other_run.inputs)),
+    ):
+        if first_names != other_names:
+            raise InputError(
+                f"{other.path}: expected the {signal_type} of {first.path}, "
+                f"{', '.join(sorted(first_names))}, found "
+                f"{', '.join(sorted(other_names)) or 'none'}"
+            )
+
+
+def make_log_names(paths: Sequence[Path]) -> list[str]:
+    """Return a short name for each log: its stem, with its folder if stems repeat."""
+    stems = [path.stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    qualified_names = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(qualified_names)) == len(qualified_names):
+        return qualified_names
+    return [f"{number}/{name}" for number, name in enumerate(qualified_names, start=1)]

@@ -1,0 +1,137 @@
+"""Thin out the samples of slow motion.
+
+Neighbouring samples of a slow motion share the rounding errors of an encoder and vibrations that no
+model of the robot contains: at 500 Hz and more they, and not the motion, decide a likelihood. Each
+k-th sample is kept, with the largest k that preserves all motion: the other samples follow from a
+cubic spline through the kept ones (C. de Boor, A Practical Guide to Splines, 1978, chapter 4) as
+well as from one through every second sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sims.core.root_mean_square import compute_rms
+from sims.core.simulator import Array, Simulator
+from sims.recording.recording import Recording, Run
+
+MAX_UNCHANGED_RATE = 400.0
+"""Sampling rate in Hz up to which a recording is kept unchanged."""
+MIN_THINNED_RATE = 100.0
+"""Minimum sampling rate in Hz after thinning."""
+MAX_ERROR_RATIO = 1.25
+"""Maximum ratio of the interpolation error to that of keeping every second sample."""
+NEGLIGIBLE_ERROR_SHARE = 1e-4
+"""Negligible interpolation error as a fraction of a channel's range: a simulation's accuracy."""
+MIN_AVAILABLE_SHARE = 0.9
+"""Minimum share of available samples of each channel."""
+MIN_RUN_SAMPLES = 40
+"""Minimum number of samples that each run must keep."""
+
+
+def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
+    """Keep each k-th sample of a robot's recording if these samples contain all motion.
+
+    Inputs with zero-order hold are averaged between the samples that are kept.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+
+    Returns:
+        The recording, and a message for the user, which is empty if it is unchanged.
+    """
+    rate = min(
+        (
+            float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
+            for run in recording.runs
+        ),
+        default=0.0,
+    )
+    if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
+        return recording, ""
+    stride = next(
+        (
+            k
+            for k in range(round(rate / MIN_THINNED_RATE), 1, -1)
+            if _preserves_motion(recording, k)
+        ),
+        1,
+    )
+    if stride == 1:
+        return recording, ""
+    runs = tuple(_thin_run(run, stride) for run in recording.runs)
+    note = (
+        f"sampled at {rate:.4g} Hz, much faster than the motion: one sample in {stride} is "
+        "used, and the mean of the inputs between them"
+    )
+    return replace(recording, runs=runs), note
+
+
+def _preserves_motion(recording: Recording, stride: int) -> bool:
+    """Return whether every k-th sample still shows the whole motion.
+
+    The motion between the kept samples is interpolated by a spline. If every second sample is kept,
+    the error of this is only noise. With every k-th one it may hardly be larger.
+
+    Args:
+        recording: recorded runs, with their channels, inputs and constants.
+        stride: the number k.
+    """
+    for run in recording.runs:
+        if run.times.size < MIN_RUN_SAMPLES * stride:
+            return False
+        for values in run.channels.values():
+            if np.isfinite(values).mean() < MIN_AVAILABLE_SHARE:
+                return False
+            min_error = NEGLIGIBLE_ERROR_SHARE * float(np.ptp(values[np.isfinite(values)]))
+            allowed_error = max(
+                MAX_ERROR_RATIO * _compute_interpolation_error(run.times, values, 2), min_error
+            )
+            if _compute_interpolation_error(run.times, values, stride) > allowed_error:
+                return False
+    return True
+
+
+def _compute_interpolation_error(times: Array, values: Array, stride: int) -> float:
+    """Return the RMS error of a cubic spline through every k-th sample at the other samples.
+
+    Args:
+        times: (T,) times in seconds.
+        values: (T,) signal, NaN where missing.
+        stride: the number k.
+    """
+    # Import SciPy here, since only fast recordings need it.
+    from scipy.interpolate import CubicSpline
+
+    is_recorded = np.isfinite(values)
+    is_node = is_recorded & (np.arange(times.size) % stride == 0)
+    first, last = np.flatnonzero(is_node)[[0, -1]]
+    is_left_out = is_recorded & ~is_node
+    is_left_out[:first] = is_left_out[last:] = False
+    if not is_left_out.any():
+        return 0.0
+    errors = CubicSpline(times[is_node], values[is_node])(times[is_left_out]) - values[is_left_out]
+    return compute_rms(errors)
+
+
+def _thin_run(run: Run, stride: int) -> Run:
+    """Keep every k-th sample of a run, and average its inputs from each one to the next.
+
+    Inputs that are interpolated linearly between samples are not averaged.
+
+    Args:
+        run: recorded run: times, channels and inputs.
+        stride: the number k.
+    """
+    thinned_run = run.part(slice(None, None, stride))
+    first = np.arange(0, run.times.size, stride)
+    spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
+    inputs = dict(thinned_run.inputs)
+    for name in thinned_run.inputs:
+        if name not in run.linear:
+            weighted_sums = np.add.reduceat(run.inputs[name] * spans, first)
+            inputs[name] = weighted_sums / np.add.reduceat(spans, first)
+    return replace(thinned_run, inputs=inputs)
