@@ -209,7 +209,7 @@ class ShotConfig:
         planned_inertia: what it takes for their moment of inertia over mass x radius^2.
         friction: the world's.
         filmed: height in pixels of the film from which the recorded drop is tracked
-            (`bounce_shot.shot_sampling`); 0 for heights with the experiment's noise instead of a
+            (`bounce_shot.drop_recording`); 0 for heights with the experiment's noise instead of a
             film.
         rows: tuners that get the pixel rows of the film instead of heights in metres, and not the
             camera: those that compare simulated heights with rows, such as tunenet-vision.

@@ -3,7 +3,7 @@
 No code in this module uses the true ball. The models are those of the tuners, in the original
 simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
 itself. Heights are shifted as if every ball had the radius of the experiment, so that one trained
-network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.shot_sampling`).
+network serves all balls. Vision tuners get the pixel rows of the tracked film instead.
 """
 
 from __future__ import annotations
