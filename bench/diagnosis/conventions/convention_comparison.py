@@ -41,8 +41,9 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.friction_form_verdict import make_soft_kind
-from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
+from bench.diagnosis.kalman.linearised_filter import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.measured_states import compute_joint_forces, has_joint_forces
 from bench.diagnosis.prediction_error.filters_with_effects import (
     GAUSS_NEWTON_STEPS,
@@ -559,7 +560,7 @@ class ConventionComparison:
             name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
         ]
         probes = [probe for name in names for probe in iterate_first_probes(evaluator, (), name)]
-        selected = identify(filtered, filtered.columns(probes))
+        selected = identify(filtered, compute_columns(filtered, probes))
         samples = int(filtered.runs.recorded.sum())
         # 3. Filters with the effects.
         best, penalty = filtered.log_likelihood, 0.0

@@ -110,7 +110,7 @@ class RunEvaluator:
             (`bench.diagnosis.fitting.linearised_runs`).
         cached_responses: responses to effects that have no linearisation, by name and coefficients.
         filtered_runs: the runs of a robot as followed by a state filter, or None
-            (`bench.diagnosis.kalman.candidate_responses`).
+            (`bench.diagnosis.kalman.linearised_filter`).
         identified: parameters of a robot identified by prediction errors; None if there are none.
         state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
             follows the runs of a robot; else None.
@@ -716,7 +716,7 @@ class RunEvaluator:
 
         Args:
             filtered_runs: filtered runs, a
-                `bench.diagnosis.kalman.candidate_responses.FollowedRuns`.
+                `bench.diagnosis.kalman.linearised_filter.FollowedRuns`.
         """
         self.filtered_runs = filtered_runs
         initial_states = filtered_runs.get_first_states()

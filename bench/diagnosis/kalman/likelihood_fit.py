@@ -17,7 +17,8 @@ from typing import TypeAlias
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import Bounds
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import compute_parameter_responses
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from sims.core.simulator import Array
 
 Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
@@ -135,7 +136,7 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
     )
     displaced = np.flatnonzero(sizes)
     places = np.array(list(bounds), dtype=np.intp)[displaced]
-    responses = followed.compute_parameter_responses(places.tolist(), sizes[displaced])
+    responses = compute_parameter_responses(followed, places.tolist(), sizes[displaced])
     derivatives = np.zeros((*responses.shape[:3], len(bounds)))
     derivatives[..., displaced] = responses
     return derivatives.reshape(-1, len(bounds))

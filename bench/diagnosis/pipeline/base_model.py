@@ -22,7 +22,7 @@ from sims.core.simulator import Array
 from sims.recording.recorded_poses import ANGLES
 
 if TYPE_CHECKING:
-    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
 MAX_ROTATION_ERROR = 0.5
 """Maximum error in rad of the simulated orientation of a floating body.
@@ -123,7 +123,7 @@ class BaseModel:
         if runs.fitting.filtered_runs is None or not self.is_usable:
             return True
         # These imports are needed for robots only.
-        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+        from bench.diagnosis.kalman.linearised_filter import FollowedRuns
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         theta = self.fit.fit.theta
@@ -236,7 +236,7 @@ def filter_runs(runs: SimulatedRuns) -> None:
     then estimates the initial states.
     """
     # This import is needed for robots only.
-    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
     context = runs.context
     context.search_control.begin_stage("computing prediction errors")

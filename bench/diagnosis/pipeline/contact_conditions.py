@@ -9,7 +9,7 @@ from bench.diagnosis.explain_options import ExplainOptions
 from sims.core.simulator import Simulator
 
 if TYPE_CHECKING:
-    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""

@@ -20,7 +20,7 @@ def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:
     and all of them are kept; likewise those for measuring.
     """
     # This import is needed for robots only.
-    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
     left_out: list[str] = []
     for evaluator in runs.evaluators:

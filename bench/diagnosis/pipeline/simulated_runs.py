@@ -28,7 +28,7 @@ from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
 if TYPE_CHECKING:
-    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
 
 class DiagnosisContext:
@@ -190,7 +190,7 @@ class SimulatedRuns:
     def nominal_filter(self) -> FollowedRuns:
         """Runs for fitting of a robot, filtered with the numbers of the model file."""
         # This import is needed for robots only.
-        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+        from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
         return FollowedRuns.follow(self.fitting, self.fitting.get_nominal_theta(), self.noise)
 

@@ -26,11 +26,12 @@ from bench.diagnosis.evaluation.parameter_bounds import (
 )
 from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import (
     Follow,
     maximise_innovation_likelihood,
 )
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.filters_with_effects import has_many_shapes
 from bench.diagnosis.prediction_error.regression_columns import group_coefficients, list_probes
 from bench.diagnosis.prediction_error.regression_selection import regress
@@ -188,7 +189,7 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
     evaluator = followed.evaluator
     names = [name for name in evaluator.library if not has_many_shapes(name)]
     evaluator.search_control.begin_stage(f"testing {len(names)} effects with the base parameters")
-    columns = followed.columns(list_probes(evaluator, (), names))
+    columns = compute_columns(followed, list_probes(evaluator, (), names))
     regression = regress(followed, [columns])
     gains = regression.compute_net_gains()
     best_gain = best.log_likelihood - followed.log_likelihood

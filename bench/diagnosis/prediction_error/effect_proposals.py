@@ -20,8 +20,8 @@ from bench.diagnosis.evaluation.parameter_bounds import (
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.filters_with_effects import (
     JOINT_MODEL,
     SERVO_MODEL,

@@ -20,8 +20,8 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.effect import Effect, members_of
@@ -554,11 +554,11 @@ class ModelFilters:
         )
         if not followed.has_expected_innovations:
             return start
-        states = followed.improved_first_states
-        refined = SettledSimulations(followed, states).refine(start)
-        refined_states = followed.fit_settled_states(refined.theta, states)
-        cost = followed.compute_squares(start.theta, states).sum()
-        if followed.compute_squares(refined.theta, refined_states).sum() < cost:
+        states, fitter = followed.improved_first_states, followed.first_state_fitter
+        refined = SettledSimulations(fitter, states).refine(start)
+        refined_states = fitter.fit_settled_states(refined.theta, states)
+        cost = fitter.compute_squares(start.theta, states).sum()
+        if fitter.compute_squares(refined.theta, refined_states).sum() < cost:
             start, states = refined, refined_states
         return replace(
             start,

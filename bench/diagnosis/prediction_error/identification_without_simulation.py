@@ -32,12 +32,13 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import Columns
 from bench.diagnosis.kalman.likelihood_fit import (
     MIN_STEP_GAIN,
     compute_information,
     maximise_innovation_likelihood,
 )
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 from bench.diagnosis.prediction_error.regression_columns import (

@@ -23,6 +23,7 @@ import numpy as np
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.regression_selection import Regression, group_probes
 from bench.diagnosis.prediction_error.response_products import GramMatrices
@@ -88,7 +89,7 @@ class OutputErrorScores:
     def simulations(self) -> SettledSimulations:
         """Simulations from the first states of the base model."""
         base = self.context.filters.base
-        return SettledSimulations(base, base.get_first_states())
+        return SettledSimulations(base.first_state_fitter, base.get_first_states())
 
     def list_starts(self) -> list[FitStart]:
         """Return starts with one effect each, the one with the smallest residual first.
@@ -119,13 +120,14 @@ class OutputErrorScores:
         """Regression (1) of the residual of the base model on the candidates of the library."""
         context, followed = self.context, self.context.filters.base
         library = context.columns.library
-        responses = followed.sensitivities(library)
+        responses = compute_sensitivities(followed, library)
         for column, probe in enumerate(library.probes):
             if self._changes_geometry(probe):
                 responses[..., column] = self._simulate_geometry(probe)
-        target = followed.simulate_residuals(followed.theta, followed.get_first_states())
+        fitter = followed.first_state_fitter
+        target = fitter.simulate_residuals(followed.theta, followed.get_first_states())
         projected = self.simulations.project(
-            np.concatenate([followed.scale_by_noise(responses), target[..., None]], axis=3)
+            np.concatenate([fitter.scale_by_noise(responses), target[..., None]], axis=3)
         )
         products = projected.transpose(0, 2, 1) @ projected
         contains = {

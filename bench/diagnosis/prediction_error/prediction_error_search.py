@@ -40,6 +40,7 @@ from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
     add_to_dry_friction,
     add_to_model,
@@ -352,7 +353,7 @@ class PredictionErrorSearch(EffectSearch):
         if not is_fitted or not self.has_contact_jumps:
             return model
         fit = refine_with_wide_differences(
-            filters.get_similar_filter(model),
+            filters.get_similar_filter(model).first_state_fitter,
             model.fit,
             get_bounds_by_index(self.evaluator, model.effects),
         )
@@ -551,5 +552,6 @@ class PredictionErrorSearch(EffectSearch):
         They are linearised about the measured motion.
         """
         library = self._search_context.columns.library
-        values = self._search_context.filters.base.sensitivities(library, np.float32)
+        base = self._search_context.filters.base
+        values = compute_sensitivities(base, library, np.float32)
         return self.base_model.fit, DirectionSet(library.probes, values)

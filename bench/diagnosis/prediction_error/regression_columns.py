@@ -20,7 +20,12 @@ from bench.diagnosis.evaluation.parameter_bounds import (
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
-from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import (
+    Columns,
+    compute_columns,
+    compute_sensitivities,
+)
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.filters_with_effects import (
     FilteredSet,
     ModelFilters,
@@ -75,7 +80,7 @@ class LibraryColumns:
             evaluator = self.filters.evaluator
             names = [name for name in evaluator.library if not has_many_shapes(name)]
             evaluator.search_control.begin_stage(f"testing {len(names)} effects", 1)
-            self._library = self.filters.base.columns(self.probes(names))
+            self._library = compute_columns(self.filters.base, self.probes(names))
         return self._library
 
     @property
@@ -97,7 +102,7 @@ class LibraryColumns:
         if self._hats is None:
             probes, _ = list_hat_probes(self.filters.evaluator)
             named = [replace(probe, effect=JointHatForce.name) for probe in probes]
-            self._hats = replace(self.filters.base.columns(named), probes=tuple(probes))
+            self._hats = replace(compute_columns(self.filters.base, named), probes=tuple(probes))
         return self._hats
 
     def take_over(self, other: LibraryColumns) -> None:
@@ -107,7 +112,7 @@ class LibraryColumns:
 
     def add(self, names: Sequence[str]) -> None:
         """Add effects to the candidates of the library."""
-        self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
+        self._library = self.library.joined(compute_columns(self.filters.base, self.probes(names)))
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return small trial coefficients (probes) of effects; their responses are regressors."""
@@ -172,8 +177,10 @@ class LibraryColumns:
         """
         evaluator, followed = self.filters.evaluator, self.filters.base
         tangents = [_make_tangent_probes(evaluator, name, start.theta) for name in start.effects]
-        columns = followed.columns([probe for effect_probes in tangents for probe in effect_probes])
-        responses = followed.sensitivities(columns)
+        columns = compute_columns(
+            followed, [probe for effect_probes in tangents for probe in effect_probes]
+        )
+        responses = compute_sensitivities(followed, columns)
         indices, derivatives, first_column = list[int](), [], 0
         for name, (whole_change, *displaced) in zip(start.effects, tangents, strict=True):
             for k, probe in enumerate(displaced):
@@ -265,7 +272,7 @@ def build_regression_about(
         first_column = count + len(probes)
         own_columns[name] = list(range(first_column, first_column + len(tangents)))
         probes += tangents
-    parts = [*columns, followed.columns(probes)] if probes else columns
+    parts = [*columns, compute_columns(followed, probes)] if probes else columns
     always = range(count, count + len(probes))
     return ModelRegression(regress(current.followed, parts, always=always), own_columns)
 

@@ -41,8 +41,14 @@ import numpy as np
 
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
-from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import (
+    Columns,
+    compute_columns,
+    compute_responses,
+    compute_step_error_response,
+)
 from bench.diagnosis.kalman.filter_and_smoother import IndexArray, Mask
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.response_products import InnerProducts, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
@@ -540,7 +546,7 @@ def shows_step_errors(followed: FollowedRuns) -> bool:
 
     They do if the recorded motion is one of continuous time, and do not if the engine generated it.
     """
-    return regress(followed, [followed.columns([])]).shows_nuisance([])
+    return regress(followed, [compute_columns(followed, [])]).shows_nuisance([])
 
 
 def identify(followed: FollowedRuns, columns: Columns, first: Regression | None = None) -> Selected:
@@ -618,8 +624,8 @@ def regress(
     # Shapes: R runs, T samples, C channels, K candidates; the arrays of a run have rows T C.
     responses = np.concatenate(
         [
-            *(followed.responses(part) for part in columns),
-            followed.step_error_response()[..., None].astype(np.float32),
+            *(compute_responses(followed, part) for part in columns),
+            compute_step_error_response(followed)[..., None].astype(np.float32),
         ],
         axis=3,
     )

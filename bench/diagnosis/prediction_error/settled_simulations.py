@@ -27,7 +27,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.settled_first_states import FirstStateFitter
 from sims.core.simulator import Array
 from sims.robot.dynamics.contact_states import KnownJacobians
 
@@ -57,11 +57,11 @@ class SettledSimulations:
     """Simulations of the pieces of a robot on the ground from settled first states.
 
     Attributes:
-        followed: linearised model of the pieces.
+        fitter: simulates the pieces, and settles their first states.
         states: (R, 2 D) first positions and velocities of D coordinates in R pieces.
     """
 
-    followed: FollowedRuns
+    fitter: FirstStateFitter
     states: Array
 
     @cached_property
@@ -79,7 +79,7 @@ class SettledSimulations:
             start: start whose coefficients are improved by Gauss-Newton steps.
         """
         theta = start.theta
-        bounds = get_bounds_by_index(self.followed.evaluator, start.effects)
+        bounds = get_bounds_by_index(self.fitter.evaluator, start.effects)
         residual = self.compute_residual(theta)
         for _ in range(MAX_REFINEMENTS):
             columns = []
@@ -120,12 +120,12 @@ class SettledSimulations:
         Args:
             theta: (P,) parameters of the model.
         """
-        residual = self.followed.simulate_residuals(theta, self._settle(theta))
+        residual = self.fitter.simulate_residuals(theta, self._settle(theta))
         return self.project(residual[..., None]).reshape(-1)
 
     def get_difference(self, place: int) -> float:
         """Return the finite change of a coefficient, by its index in theta."""
-        low, high = self.followed.evaluator.parameters[place].bounds
+        low, high = self.fitter.evaluator.parameters[place].bounds
         return DIFFERENCE_SHARE * (float(high) - float(low))
 
     def simulate_settled(self, theta: Array) -> Array:
@@ -134,15 +134,15 @@ class SettledSimulations:
         Args:
             theta: (P,) parameters of the model.
         """
-        return self.followed.simulate(theta, self._settle(theta))
+        return self.fitter.simulate(theta, self._settle(theta))
 
     def _settle(self, theta: Array) -> Array:
         """Return the first states (R, 2 D), settled for a model that may have another geometry."""
-        return self.followed.settle(theta, self.states, True, self._known_jacobians)
+        return self.fitter.settle(theta, self.states, True, self._known_jacobians)
 
     def project(self, values: Array) -> Array:
         """Return P v of (1), (R, n, K), for values v (R, T, C, K) in units of the noise."""
-        bases = self.followed.first_state_factors.q
+        bases = self.fitter.factors.q
         runs, samples, channels, count = values.shape
         rows = np.zeros((runs, bases.shape[1], count))
         rows[:, : samples * channels] = values.reshape(runs, -1, count)
@@ -151,12 +151,12 @@ class SettledSimulations:
 
 
 def refine_with_wide_differences(
-    followed: FollowedRuns, fit: TrajectoryFit, bounds: Mapping[int, Bounds]
+    fitter: FirstStateFitter, fit: TrajectoryFit, bounds: Mapping[int, Bounds]
 ) -> TrajectoryFit:
     """Refine the coefficients of a robot on the ground by wide difference quotients (2).
 
     Args:
-        followed: linearised model of the pieces, with parameters near those of the fit.
+        fitter: simulates the pieces, and fits first states with a linearisation near the fit.
         fit: fit with derivatives by small differences.
         bounds: bounds of the refined coefficients, by index in theta.
 
@@ -166,8 +166,8 @@ def refine_with_wide_differences(
         computed anew. The given fit is returned if a simulation fails.
     """
     theta = fit.theta
-    states = followed.fit_settled_states(theta, fit.initial_states)
-    residual = followed.simulate_residuals(theta, states)
+    states = fitter.fit_settled_states(theta, fit.initial_states)
+    residual = fitter.simulate_residuals(theta, states)
     squares = _sum_squares(residual)
     jacobian = fit.jacobian.copy()
     columns, places = list[Array](), list[int]()
@@ -175,12 +175,12 @@ def refine_with_wide_differences(
         if place not in bounds:
             continue
         places.append(place)
-        norm = np.sqrt(_sum_squares(followed.scale_by_noise(fit.parameter_jacobian[..., column])))
-        quotient = _compute_wide_quotient(followed, theta, states, place, bounds[place], norm)
-        if not np.isfinite(quotient[np.isfinite(followed.evaluator.observed)]).all():
+        norm = np.sqrt(_sum_squares(fitter.scale_by_noise(fit.parameter_jacobian[..., column])))
+        quotient = _compute_wide_quotient(fitter, theta, states, place, bounds[place], norm)
+        if not np.isfinite(quotient[np.isfinite(fitter.evaluator.observed)]).all():
             return fit
         jacobian[..., column] = quotient
-        columns.append(np.nan_to_num(followed.scale_by_noise(quotient)).reshape(-1))
+        columns.append(np.nan_to_num(fitter.scale_by_noise(quotient)).reshape(-1))
     if not columns or not np.isfinite(squares):
         return fit
     derivatives = np.stack(columns, axis=1)
@@ -189,31 +189,31 @@ def refine_with_wide_differences(
         tried = theta.copy()
         for place, change in zip(places, step.tolist(), strict=True):
             tried[place] = np.clip(theta[place] + change, *bounds[place])
-        tried_states = followed.fit_settled_states(tried, states)
-        tried_residual = followed.simulate_residuals(tried, tried_states)
+        tried_states = fitter.fit_settled_states(tried, states)
+        tried_residual = fitter.simulate_residuals(tried, tried_states)
         if not _sum_squares(tried_residual) < squares:
             break
         theta, states, residual = tried, tried_states, tried_residual
         squares = _sum_squares(residual)
-    if squares > _sum_squares(followed.scale_by_noise(followed.evaluator.observed - fit.simulated)):
+    if squares > _sum_squares(fitter.scale_by_noise(fitter.evaluator.observed - fit.simulated)):
         return replace(fit, jacobian=jacobian, is_own_jacobian=True)
     return replace(
         fit,
         theta=theta,
         initial_states=states,
-        simulated=followed.simulate(theta, states),
+        simulated=fitter.simulate(theta, states),
         jacobian=jacobian,
         is_own_jacobian=True,
     )
 
 
 def _compute_wide_quotient(
-    followed: FollowedRuns, theta: Array, states: Array, place: int, bounds: Bounds, norm: float
+    fitter: FirstStateFitter, theta: Array, states: Array, place: int, bounds: Bounds, norm: float
 ) -> Array:
     """Compute the difference quotient (2) by one coefficient, (R, T, C).
 
     Args:
-        followed: linearised model of the pieces.
+        fitter: simulates the pieces, and fits their first states.
         theta: (P,) parameters.
         states: (R, 2 D) first states.
         place: index of the coefficient in theta.
@@ -228,12 +228,10 @@ def _compute_wide_quotient(
             changed = theta.copy()
             changed[place] = np.clip(theta[place] + sign * half, low, high)
             ends.append(changed[place])
-            simulated.append(
-                followed.simulate(changed, followed.fit_settled_states(changed, states))
-            )
+            simulated.append(fitter.simulate(changed, fitter.fit_settled_states(changed, states)))
         difference = simulated[0] - simulated[1]
         quotient: Array = difference / max(ends[0] - ends[1], np.finfo(float).tiny)
-        response = 0.5 * np.sqrt(_sum_squares(followed.scale_by_noise(difference)))
+        response = 0.5 * np.sqrt(_sum_squares(fitter.scale_by_noise(difference)))
         if MIN_RESPONSE < response < MAX_RESPONSE or not np.isfinite(response):
             break
         # Inverted, because the response may be zero.

@@ -1,12 +1,13 @@
-"""Tests of the filter of a model whose parameters differ from those of a known filter."""
+"""Tests of the responses of a filter to changes of parameters."""
 
 import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns, _linearise_run
+from bench.diagnosis.kalman.candidate_responses import compute_parameter_responses
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns, linearise_run
 
 
 @pytest.fixture(scope="module")
@@ -16,47 +17,18 @@ def followed(example_arm):
     return FollowedRuns.follow(example_arm, example_arm.get_nominal_theta(), noise)
 
 
-def with_effect(followed, name, coefficient):
-    """Return the parameters with one effect."""
-    theta = followed.theta.copy()
-    theta[followed.evaluator.coefficient_slices[name]] = coefficient
-    return theta
-
-
-@pytest.mark.parametrize(
-    ("effect", "size", "is_reused"),
-    [
-        ("sensor.bias@q.elbow", 0.01, True),
-        ("force.bias@elbow", 0.01, True),
-        ("drag.linear@elbow", 0.05, False),
-    ],
-)
-def test_jacobians_are_computed_again_only_if_an_effect_changes_them(
-    followed, monkeypatch, effect, size, is_reused
-):
-    theta = with_effect(followed, effect, size)
-    reused = followed.with_parameters(theta)
-    before, after = (one.linear[0]._tangent.quotients for one in (followed, reused))
-    assert (before is after) == is_reused
-    # The likelihood is that of new Jacobians.
-    monkeypatch.setattr(FollowedRuns, "_has_jacobians_of", lambda *_: False)
-    renewed = followed.with_parameters(theta)
-    assert reused.log_likelihood == pytest.approx(renewed.log_likelihood, abs=0.5)
-    assert abs(reused.log_likelihood - followed.log_likelihood) > 5.0
-
-
 def test_parameter_responses_are_differences_of_whole_filters(followed):
     """The filter keeps its gains, because its Jacobians and its noise stay the same."""
     slices = followed.evaluator.coefficient_slices
     names = ("drag.linear@elbow", "mass.scale@forearm", "sensor.gain@q.elbow")
     places = [slices[name].start for name in names]
     sizes = np.array([1e-3, -1e-3, 1e-3])
-    responses = followed.compute_parameter_responses(places, sizes)
+    responses = compute_parameter_responses(followed, places, sizes)
     for column, (place, size) in enumerate(zip(places, sizes, strict=True)):
         theta = followed.theta.copy()
         theta[place] += size
         linear = [
-            _linearise_run(
+            linearise_run(
                 followed.evaluator, theta, followed.noise, run, one.trajectory, one
             ).interval_maps()
             for run, one in enumerate(followed.linear)

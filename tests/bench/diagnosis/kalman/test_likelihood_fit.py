@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman import likelihood_fit
 from tests.bench.diagnosis.simulated_logs import write_log
 
 CARRIAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
@@ -55,13 +55,13 @@ def answer(tmp_path_factory):
 
 
 def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypatch):
-    filters, respond = [], FollowedRuns.compute_parameter_responses
+    filters, respond = [], likelihood_fit.compute_parameter_responses
 
-    def counted(self, places, sizes):
+    def counted(followed, places, sizes):
         filters.append(places)
-        return respond(self, places, sizes)
+        return respond(followed, places, sizes)
 
-    monkeypatch.setattr(FollowedRuns, "compute_parameter_responses", counted)
+    monkeypatch.setattr(likelihood_fit, "compute_parameter_responses", counted)
     stopped = explain(write_carriage_log(tmp_path), force=True, stop=lambda: bool(filters)).answer
     assert len(filters) == 1
     assert stopped.cut.reason == "interrupt"

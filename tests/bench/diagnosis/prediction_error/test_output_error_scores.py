@@ -72,7 +72,7 @@ def test_the_response_to_a_radius_is_that_of_rolling(scores):
     change = response[-1] - response[20]
     left, right = (evaluator.channels.index(f"q.{side}") for side in SIDES)
     base = scores.context.filters.base
-    simulated = base.simulate(base.theta, base.get_first_states())
+    simulated = base.first_state_fitter.simulate(base.theta, base.get_first_states())
     turned = np.ptp(simulated[1, 20:, left])
     heading = simulated[1, -1, yaw]
     forward = change[x] * np.cos(heading) + change[y] * np.sin(heading)
