@@ -44,10 +44,10 @@ from bench.diagnosis.friction_form_verdict import make_soft_kind
 from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import MAX_LINEARISATIONS, FollowedRuns
-from bench.diagnosis.kalman.measured_states import compute_joint_forces, has_joint_forces
+from bench.diagnosis.kalman.measured_joint_forces import compute_joint_forces, has_joint_forces
+from bench.diagnosis.prediction_error.effects_at_joints import MANY_SHAPES
 from bench.diagnosis.prediction_error.filters_with_effects import (
     GAUSS_NEWTON_STEPS,
-    MANY_SHAPES,
     make_soft_friction_models,
 )
 from bench.diagnosis.prediction_error.regression_columns import group_coefficients

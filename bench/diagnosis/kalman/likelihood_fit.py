@@ -11,12 +11,13 @@ accelerations contain the noise of the innovations that they should explain, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import Bounds
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.candidate_responses import compute_parameter_responses
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from sims.core.simulator import Array
@@ -31,6 +32,27 @@ MAX_HALVINGS = 3
 """Maximum number of times that a step without gain is halved."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
+
+
+class Information(NamedTuple):
+    """Fisher information of parameters.
+
+    Attributes:
+        places: indices of the n parameters in theta.
+        matrix: (n, n) information.
+    """
+
+    places: list[int]
+    matrix: Array
+
+    def select(self, places: list[int]) -> Information:
+        """Return the information of some of the parameters if the others are known.
+
+        Args:
+            places: indices of these parameters in theta.
+        """
+        rows = [self.places.index(i) for i in places]
+        return Information(places, self.matrix[np.ix_(rows, rows)])
 
 
 def maximise_innovation_likelihood(
@@ -109,16 +131,41 @@ def compute_likelihood_step(
     return step, float(change @ cross - 0.5 * change @ information @ change)
 
 
-def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
-    """Return the Fisher information (n, n) of some parameters in the innovations.
+def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Information:
+    """Return the Fisher information of some parameters in the innovations.
 
     Args:
         followed: the runs, filtered with the present parameters.
         bounds: bounds of the n parameters, by index.
     """
-    rows = _compute_derivatives(followed, bounds)
-    information: Array = rows.T @ rows
-    return information
+    derivatives = _compute_derivatives(followed, bounds)
+    return Information(list(bounds), derivatives.T @ derivatives)
+
+
+def compute_wald_statistics(
+    evaluator: RunEvaluator, theta: Array, names: Sequence[str], information: Information
+) -> dict[str, float]:
+    """Return the loss in twice the log-likelihood without each effect of a set (Wald statistic).
+
+    It is c' V^-1 c for the k coefficients c of the effect and their covariance V, which contains
+    the uncertainty by all other parameters. So no fit without the effect is needed. Pseudo-inverses
+    allow parameters that the data do not determine.
+
+    Args:
+        evaluator: the runs.
+        theta: (P,) parameters of the set.
+        names: its effects.
+        information: Fisher information of all parameters of the set.
+    """
+    covariance = np.linalg.pinv(information.matrix, hermitian=True)
+    statistics = {}
+    for name in names:
+        effect_places = evaluator.get_coefficient_indices(name)
+        effect_rows = [information.places.index(i) for i in effect_places]
+        inverse = np.linalg.pinv(covariance[np.ix_(effect_rows, effect_rows)], hermitian=True)
+        c = theta[effect_places]
+        statistics[name] = float(c @ inverse @ c)
+    return statistics
 
 
 def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:

@@ -39,8 +39,8 @@ from bench.diagnosis.kalman.settled_first_states import (
 )
 from sims.core.effect import members_of
 from sims.core.simulator import Array
-from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
-from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
+from sims.robot.dynamics.active_effects import TIME_DEPENDENT_EFFECTS
+from sims.robot.dynamics.joint_scales import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_about_recording import (
     MeasuredLinear,
     SingleArray,

@@ -174,7 +174,7 @@ def _search_and_decide(search: EffectSearch, runs: SimulatedRuns) -> DiagnosisRe
                 propose_contact_effects(search, runs.evaluators)
         return diagnose(search, runs.validation)
     # This import is needed for robots only.
-    from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
+    from bench.diagnosis.prediction_error.robot_diagnosis import Confirmation
 
     with runs.record_widened_ranges():
         return answer(Confirmation(search, runs.validation))

@@ -32,7 +32,7 @@ from bench.diagnosis.kalman.likelihood_fit import (
     maximise_innovation_likelihood,
 )
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.filters_with_effects import has_many_shapes
+from bench.diagnosis.prediction_error.effects_at_joints import has_many_shapes
 from bench.diagnosis.prediction_error.regression_columns import group_coefficients, list_probes
 from bench.diagnosis.prediction_error.regression_selection import regress
 from sims.core.simulator import Array

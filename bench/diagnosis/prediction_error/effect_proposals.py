@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import (
     compute_coefficient_bounds,
     get_bounds_by_index,
@@ -22,15 +23,17 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.filters_with_effects import (
+from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
     SERVO_MODEL,
-    FilteredSet,
-    ModelFilters,
     get_joint_name,
     get_servo_input,
     list_similar_shifts,
-    offset_from_command,
+)
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    OFFSET_THRESHOLD,
+    FilteredSet,
+    ModelFilters,
 )
 from bench.diagnosis.prediction_error.regression_columns import (
     LibraryColumns,
@@ -216,7 +219,9 @@ class EffectProposals:
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         coefficients = {
-            f"sensor.bias@q.{place}": offset_from_command(evaluator, self.filters.noise, joint)
+            f"sensor.bias@q.{place}": _compute_offset_from_command(
+                evaluator, self.filters.noise, joint
+            )
         }
         friction = f"friction.coulomb@{place}"
         if friction in evaluator.library:
@@ -353,6 +358,35 @@ class EffectProposals:
         if followed is self.filters.base:
             self._base_steps[name] = step
         return step
+
+
+def _compute_offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
+    """Return the mean difference in rad or m of a joint's readings from its servo's command.
+
+    It is a first guess of an encoder offset. The command acts on the actuator, so it is multiplied
+    by the gear to get a joint position.
+
+    Args:
+        evaluator: the runs.
+        noise: sensor noise.
+        joint: index of the joint.
+
+    Returns:
+        The difference; zero without a servo, or if it is within `OFFSET_THRESHOLD` standard
+        deviations of the noise, so that noise alone does not start an effect.
+    """
+    system, servo = evaluator.simulator.system, get_servo_input(evaluator, joint)
+    channel = system.coordinates[joint]
+    if not servo or channel not in evaluator.channels:
+        return 0.0
+    column = evaluator.channels.index(channel)
+    differences = [
+        run.observed[:, column] - system.gear(joint) * run.scenario.inputs[servo]
+        for run in evaluator.prepared_runs
+        if servo in run.scenario.inputs
+    ]
+    offset = float(np.nanmean(np.concatenate(differences))) if differences else 0.0
+    return offset if abs(offset) > OFFSET_THRESHOLD * noise.sigma[column] else 0.0
 
 
 @dataclass(frozen=True)

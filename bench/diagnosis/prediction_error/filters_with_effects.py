@@ -1,4 +1,4 @@
-"""Kalman filters that follow the runs with effects in the model, and the effects at each joint.
+"""Kalman filters that follow the runs with effects in the model.
 
 Regression is linear about the base model; a filter with an effect in its model is not. With the
 right effects it needs no process noise, so its likelihood can compare sets of effects before any of
@@ -7,47 +7,29 @@ them is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import clip_coefficients, get_bounds_by_index
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
+from bench.diagnosis.prediction_error.effects_at_joints import (
+    get_joint_name,
+    get_only_joint,
+    has_series,
+)
 from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.search.scored_models import ScoredModelSet
-from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
-from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.loop_closure import coupled_joints
 from sims.robot.robot_simulator import RobotSimulator
 
-JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
-"""Effects of the standard joint model, tried at the joint with the largest missing force."""
-SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
-"""Effects of the standard servo model, tried at the servo of the same joint."""
-MANY_SHAPES = frozenset(
-    {
-        "force.periodic",
-        "force.ripple",
-        "friction.position",
-        "friction.stribeck",
-        "friction.warming",
-        "sensor.slip",
-        "state.limit",
-    }
-)
-"""Effects with many candidate shapes, tried only if simpler effects leave a force missing."""
-EFFECTS_AT_SEVERAL_JOINTS = frozenset({"joint.axis", "joint.coupling", "joint.zero"})
-"""Effects at a joint that change the forces at other joints as well."""
 MIN_MISSING_FORCE_SHARE = 0.05
 """Minimum loss without the process noise of a joint at which a force is missing there.
 
@@ -56,229 +38,6 @@ the others are below 0.001 of it.
 """
 OFFSET_THRESHOLD = 10.0
 """Minimum difference of positions, as a multiple of the noise, that is an encoder offset."""
-
-
-def get_joint_name(evaluator: RunEvaluator, joint: int) -> str:
-    """Return the name of a joint.
-
-    Args:
-        evaluator: the runs.
-        joint: index of the joint.
-    """
-    coordinate: str = evaluator.simulator.system.coordinates[joint]
-    return coordinate.removeprefix("q.")
-
-
-def get_servo_input(evaluator: RunEvaluator, joint: int) -> str:
-    """Return the input of the position servo of a joint; empty if it has none.
-
-    Args:
-        evaluator: the runs.
-        joint: index of the joint.
-    """
-    return str(getattr(evaluator.simulator.system, "servos", {}).get(joint, ""))
-
-
-def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool:
-    """Return whether an effect acts at one of the given joints.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect.
-        joints: indices of the joints.
-    """
-    names = {get_joint_name(evaluator, joint) for joint in joints}
-    return any(
-        member.coordinate in joints or member.signal.partition(".")[2] in names
-        for member in members_of(evaluator.available_effects[name])
-    )
-
-
-def _list_joints(evaluator: RunEvaluator, name: str) -> set[int]:
-    """Return the indices of the joints at which an effect acts."""
-    count = len(evaluator.simulator.system.coordinates)
-    return {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
-
-
-def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
-    """Return the single joint at which an effect changes the generalised force.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect.
-
-    Returns:
-        Index of the joint; None for effects at bodies and sensors, and of families, series joints
-        and joints of a kinematic loop, which change the forces at other joints as well.
-    """
-    member, *others = members_of(evaluator.available_effects[name])
-    if (
-        others
-        or member.coordinate is None
-        or member.hook == "sensor"
-        or member.of in EFFECTS_AT_SEVERAL_JOINTS
-        or is_series_effect(member)
-        or any(member.coordinate in group for group in _list_coupled_joints(evaluator))
-    ):
-        return None
-    joint: int = member.coordinate
-    return joint
-
-
-def _list_coupled_joints(evaluator: RunEvaluator) -> list[set[int]]:
-    """Return the groups of joints of a robot that constraints of its model couple."""
-    assert isinstance(evaluator.simulator, RobotSimulator)
-    velocities = evaluator.simulator.addresses.velocities.tolist()
-    return coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
-
-
-def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
-    """Return the effects of the joint and servo models at the joint where an effect acts.
-
-    These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
-    often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
-    left out.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect; at a body, the joints are those that carry it.
-    """
-    joints = _list_joints(evaluator, name)
-    if evaluator.available_effects[name].at == "body":
-        joints = _list_joints_of_body(evaluator, name.partition("@")[2])
-    return {
-        other
-        for other in evaluator.library
-        if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
-        and not other.endswith("@*")
-        and acts_at_joint(evaluator, other, joints)
-    }
-
-
-def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
-    """Return the delays and lags that may change the readings as a given delay or lag does.
-
-    A command that comes late changes the readings nearly as sensors that read late do. Similar are
-    delays and lags at the same joint, and those at all places. An effect that has a single place,
-    as the command of a robot with one drive, is similar to both.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect; the result is empty if it is neither a delay nor a lag.
-    """
-    if not is_time_shift(evaluator.available_effects[name]):
-        return []
-    joints = _list_joints(evaluator, name)
-
-    def has_one_place(effect: str) -> bool:
-        return f"{effect.partition('@')[0]}@*" not in evaluator.library
-
-    return [
-        other
-        for other in evaluator.library
-        if other != name
-        and is_time_shift(evaluator.available_effects[other])
-        and acts_at_joint(evaluator, other, joints)
-        and (
-            other.endswith("@*") == name.endswith("@*")
-            or has_one_place(other)
-            or has_one_place(name)
-        )
-    ]
-
-
-def is_time_shift(effect: Effect) -> bool:
-    """Return whether an effect is a delay or a lag, with one coefficient."""
-    return [c.of for c in effect.coefficients] == ["shift"]
-
-
-def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:
-    """Return the joints that move a body against the body before it.
-
-    The inertia of such a body and the armature of its joint may have the same effect.
-
-    Args:
-        evaluator: the runs of a robot.
-        body: name of the body; empty for an effect at all bodies.
-    """
-    assert isinstance(evaluator.simulator, RobotSimulator)
-    model = evaluator.simulator.robot.compiled
-    owners = [
-        model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]
-    ]
-    return {joint for joint, owner in enumerate(owners) if owner == body}
-
-
-def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
-    """Return the names of an effect at the other joints of its kinematic loop.
-
-    It may act equivalently there, because a filter gives little information on unmeasured joints.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect.
-
-    Returns:
-        Names of effects with coefficients in the evaluator; empty if the effect does not act at a
-        joint, or if no constraint of the model couples the joint to others.
-    """
-    law, _, place = name.partition("@")
-    count = len(evaluator.simulator.system.coordinates)
-    joints = {get_joint_name(evaluator, joint): joint for joint in range(count)}
-    if place not in joints:
-        return []
-    groups = _list_coupled_joints(evaluator)
-    others = {joint for group in groups if joints[place] in group for joint in group}
-    names = [
-        f"{law}@{get_joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})
-    ]
-    return [other for other in names if other in evaluator.coefficient_slices]
-
-
-def has_series(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
-    """Return whether some effects are joints in series with others, which have their own states.
-
-    Args:
-        evaluator: the runs, with all available effects.
-        names: names of effects.
-    """
-    return any(is_series_effect(evaluator.available_effects[name]) for name in names)
-
-
-def has_many_shapes(name: str) -> bool:
-    """Return whether an effect is one of `MANY_SHAPES`."""
-    return name.partition("@")[0] in MANY_SHAPES
-
-
-def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
-    """Return the mean difference in rad or m of a joint's readings from its servo's command.
-
-    It is a first guess of an encoder offset. The command acts on the actuator, so it is multiplied
-    by the gear to get a joint position.
-
-    Args:
-        evaluator: the runs.
-        noise: sensor noise.
-        joint: index of the joint.
-
-    Returns:
-        The difference; zero without a servo, or if it is within `OFFSET_THRESHOLD` standard
-        deviations of the noise, so that noise alone does not start an effect.
-    """
-    system, servo = evaluator.simulator.system, get_servo_input(evaluator, joint)
-    channel = system.coordinates[joint]
-    if not servo or channel not in evaluator.channels:
-        return 0.0
-    column = evaluator.channels.index(channel)
-    differences = [
-        run.observed[:, column] - system.gear(joint) * run.scenario.inputs[servo]
-        for run in evaluator.prepared_runs
-        if servo in run.scenario.inputs
-    ]
-    offset = float(np.nanmean(np.concatenate(differences))) if differences else 0.0
-    return offset if abs(offset) > OFFSET_THRESHOLD * noise.sigma[column] else 0.0
-
-
 RELINEARISATION_THRESHOLD = 100.0
 """Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
 GAUSS_NEWTON_STEPS = 2

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +35,7 @@ from bench.diagnosis.kalman.candidate_responses import Columns
 from bench.diagnosis.kalman.likelihood_fit import (
     MIN_STEP_GAIN,
     compute_information,
+    compute_wald_statistics,
     maximise_innovation_likelihood,
 )
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
@@ -48,7 +48,6 @@ from bench.diagnosis.prediction_error.regression_columns import (
 from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
 from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
 from bench.diagnosis.search.fit_starts import add_effect_to_start
-from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0
 """Minimum duration in seconds of each run of a long recording."""
@@ -75,27 +74,6 @@ MIN_STEP_GAIN_SHARE = 0.003
 far."""
 MAX_STATE_ITERATIONS = 4
 """Maximum number of iterations for the initial states of the simulated runs."""
-
-
-class Information(NamedTuple):
-    """Fisher information of parameters.
-
-    Attributes:
-        places: indices of the n parameters in theta.
-        matrix: (n, n) information.
-    """
-
-    places: list[int]
-    matrix: Array
-
-    def select(self, places: list[int]) -> Information:
-        """Return the information of some of the parameters if the others are known.
-
-        Args:
-            places: indices of these parameters in theta.
-        """
-        rows = [self.places.index(i) for i in places]
-        return Information(places, self.matrix[np.ix_(rows, rows)])
 
 
 @dataclass(frozen=True)
@@ -215,32 +193,6 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
     return FilteredSet(best, tuple(names))
 
 
-def compute_wald_statistics(
-    evaluator: RunEvaluator, theta: Array, names: Sequence[str], information: Information
-) -> dict[str, float]:
-    """Return the loss in twice the log-likelihood without each effect of a set (Wald statistic).
-
-    It is c' V^-1 c for the k coefficients c of the effect and their covariance V, which contains
-    the uncertainty by all other parameters. So no fit without the effect is needed. Pseudo-inverses
-    allow parameters that the data do not determine.
-
-    Args:
-        evaluator: the runs.
-        theta: (P,) parameters of the set.
-        names: its effects.
-        information: Fisher information of all parameters of the set.
-    """
-    covariance = np.linalg.pinv(information.matrix, hermitian=True)
-    statistics = {}
-    for name in names:
-        effect_places = evaluator.get_coefficient_indices(name)
-        effect_rows = [information.places.index(i) for i in effect_places]
-        inverse = np.linalg.pinv(covariance[np.ix_(effect_rows, effect_rows)], hermitian=True)
-        c = theta[effect_places]
-        statistics[name] = float(c @ inverse @ c)
-    return statistics
-
-
 def _compute_min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
     """Return the minimum gain of an effect of a set in twice the log-likelihood.
 
@@ -275,7 +227,7 @@ def _prune_set(
     followed, names, lost_gain = current.followed, list(current.names), 0.0
     # The information is computed once; removing an effect only removes its rows and columns.
     bounds = _get_bounds(context, names)
-    information = Information(list(bounds), compute_information(followed, bounds))
+    information = compute_information(followed, bounds)
     min_gains = {name: _compute_min_gain(context, current, name) for name in names}
     while True:
         gains = compute_wald_statistics(

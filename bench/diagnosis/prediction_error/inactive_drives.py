@@ -3,8 +3,9 @@
 If a drive is switched off, if a servo is limp after a fault, or after an emergency stop, the
 commands continue. Effects of the library could only imitate this. Velocities and accelerations are
 estimated from positions alone, and from them three forces at each joint and sample
-(`kalman.measured_states`): the force f that the motion requires by inverse dynamics, the force τ of
-the model's drive, and the force g that holds the joint still. Three hypotheses have the residuals
+(`kalman.measured_joint_forces`): the force f that the motion requires by inverse dynamics, the
+force τ of the model's drive, and the force g that holds the joint still. Three hypotheses have the
+residuals
 
     on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
 
@@ -38,7 +39,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.diagnosis.kalman.measured_states import (
+from bench.diagnosis.kalman.measured_joint_forces import (
     JointForces,
     compute_joint_forces,
     has_joint_forces,

@@ -13,11 +13,11 @@ residual of a set is only noise. The order is:
        before it if servos reach their limits, simulate single effects at several coefficients, and
        fit the best of them (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
-       is missing (`simulated_fits`).
+       is missing (`regression_columns`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
        (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
-       filters with the effect in the model (`competing_models`).
+       filters with the effect in the model (`forward_selection_by_filters`).
     5. Try one effect in place of several (`competing_models`).
     6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`).
 
@@ -42,11 +42,8 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, Trajecto
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
-    add_to_dry_friction,
-    add_to_model,
     fit_competing_models,
     fit_single_in_place,
-    select_in_model,
 )
 from bench.diagnosis.prediction_error.dry_friction_fits import (
     check_fit,
@@ -55,10 +52,12 @@ from bench.diagnosis.prediction_error.dry_friction_fits import (
     fit_dry_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import (
-    FilteredSet,
-    acts_at_joint,
-    has_series,
+from bench.diagnosis.prediction_error.effects_at_joints import acts_at_joint, has_series
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
+from bench.diagnosis.prediction_error.forward_selection_by_filters import (
+    add_to_dry_friction,
+    add_to_model,
+    select_in_model,
 )
 from bench.diagnosis.prediction_error.identification_without_simulation import (
     IdentifiedSet,
@@ -89,7 +88,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_nearly_explained,
     remove_idle_effects,
     select_more_likely,
-    select_with_shapes,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
     fit_likely_effects,
@@ -234,7 +232,7 @@ class PredictionErrorSearch(EffectSearch):
             best = select_more_likely(best, fit_likely_effects(context, self._likely_starts))
         selected_with_shapes = selected
         if self._should_continue(best):
-            selected_with_shapes = select_with_shapes(context, selected)
+            selected_with_shapes = context.columns.select_with_shapes(selected)
             best = select_more_likely(best, fit_quick_selection(context, selected_with_shapes))
             check_simple_friction(context, best)
         if self._should_continue(best):

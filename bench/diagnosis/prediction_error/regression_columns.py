@@ -26,11 +26,8 @@ from bench.diagnosis.kalman.candidate_responses import (
     compute_sensitivities,
 )
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.filters_with_effects import (
-    FilteredSet,
-    ModelFilters,
-    has_many_shapes,
-)
+from bench.diagnosis.prediction_error.effects_at_joints import acts_at_joint, has_many_shapes
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, ModelFilters
 from bench.diagnosis.prediction_error.regression_selection import (
     Regression,
     Selected,
@@ -126,6 +123,36 @@ class LibraryColumns:
         selected = identify(self.filters.base, library, self.base_regression)
         self.filters.numerics = selected.numerics
         return selected
+
+    def select_with_shapes(self, selected: Selected) -> Selected:
+        """Select again with effects of many shapes, at the joints where a force is missing.
+
+        These effects, such as forces of any period, are many and slow to test, so they are left out
+        of the first selection.
+
+        Args:
+            selected: the first selection.
+
+        Returns:
+            The new selection; the first one if the library has no such effects at these joints.
+        """
+        evaluator, missing_forces = self.filters.evaluator, selected.followed.missing_forces
+        # A selection that leaves no force missing but does not explain simulated runs is wrong.
+        if not missing_forces.any():
+            missing_forces = self.filters.base.missing_forces
+        joints = np.flatnonzero(missing_forces).tolist()
+        effects_with_shapes = [
+            name
+            for name in evaluator.library
+            if has_many_shapes(name) and acts_at_joint(evaluator, name, joints)
+        ]
+        if not effects_with_shapes:
+            return selected
+        evaluator.search_control.begin_stage(
+            f"testing {len(effects_with_shapes)} effects with several coefficients", 1
+        )
+        self.add(effects_with_shapes)
+        return self.select()
 
     def start(self, groups: Sequence[DirectionGroup], coefficients: Sequence[Array]) -> FitStart:
         """Return a start with a set of groups of columns.

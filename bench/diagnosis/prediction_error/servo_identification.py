@@ -37,15 +37,12 @@ from bench.diagnosis.evaluation.parameter_bounds import (
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.levenberg_marquardt_step import RIDGE_SHARE
+from bench.diagnosis.kalman.likelihood_fit import Information, compute_wald_statistics
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import (
+from bench.diagnosis.prediction_error.effects_at_joints import (
     SERVO_MODEL,
     get_joint_name,
     get_servo_input,
-)
-from bench.diagnosis.prediction_error.identification_without_simulation import (
-    Information,
-    compute_wald_statistics,
 )
 from sims.core.simulator import Array
 

@@ -18,11 +18,7 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import (
-    FilteredSet,
-    acts_at_joint,
-    has_many_shapes,
-)
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
@@ -451,33 +447,3 @@ def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
         for effect in effects
         for member in members_of(effect)
     )
-
-
-def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
-    """Select again with effects of many shapes, at the joints where a force is missing.
-
-    These effects, such as forces of any period, are many and slow to test, so they are left out of
-    the first selection.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        selected: the previous selection.
-
-    Returns:
-        The new selection; the previous one if the library has no such effects at these joints.
-    """
-    evaluator, missing_forces = context.evaluator, selected.followed.missing_forces
-    # A selection that leaves no force missing but does not explain simulated runs is wrong.
-    if not missing_forces.any():
-        missing_forces = context.filters.base.missing_forces
-    joints = np.flatnonzero(missing_forces).tolist()
-    effects_with_shapes = [
-        n for n in evaluator.library if has_many_shapes(n) and acts_at_joint(evaluator, n, joints)
-    ]
-    if not effects_with_shapes:
-        return selected
-    evaluator.search_control.begin_stage(
-        f"testing {len(effects_with_shapes)} effects with several coefficients", 1
-    )
-    context.columns.add(effects_with_shapes)
-    return context.columns.select()

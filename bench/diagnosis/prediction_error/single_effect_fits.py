@@ -17,7 +17,7 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import (
+from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
     SERVO_MODEL,
     acts_at_joint,

@@ -7,10 +7,7 @@ import pytest
 
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import competing_models, single_effect_fits
-from bench.diagnosis.prediction_error.filters_with_effects import (
-    FilteredSet,
-    list_joint_model_effects,
-)
+from bench.diagnosis.prediction_error.effects_at_joints import list_joint_model_effects
 from sims.effects.drag import LinearDrag
 
 JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")
@@ -58,56 +55,3 @@ def test_a_competing_effect_is_simulated_at_several_coefficients(
     start = FitStart(("drag.linear@elbow",), np.ones(1), np.zeros((1, 2)))
     confirmed = competing_models._confirm(context, best, competing, start)
     assert [start.theta[0] for start in (confirmed,) if start] == expected
-
-
-def _follow(names, log_likelihood, force):
-    """Return a filter of a set that lacks a force at one of two joints."""
-    followed = SimpleNamespace(
-        theta=np.zeros(1),
-        log_likelihood=log_likelihood,
-        force=np.array([force, 0.0]),
-        missing_forces=np.array([force > 0.0, False]),
-        has_missing_force=force > 0.0,
-    )
-    return FilteredSet(followed, names)
-
-
-@pytest.mark.parametrize(
-    ("remaining_force", "expected"), [(0.2, ["b", "a", "c"]), (0.8, ["b", "e", "a", "c", "d"])]
-)
-def test_effects_that_regression_missed_are_tried_unless_a_force_is_replaced(
-    remaining_force, expected
-):
-    """The three with the largest gains by regression come first; b is the likeliest of them."""
-    likelihoods = {"a": 100.0, "b": 5000.0, "c": 50.0, "d": 10.0, "e": 4000.0}
-    tried = []
-
-    def follow_with_effects(theta, names, steps=1):
-        tried.append(names[-1])
-        return _follow(names, likelihoods[names[-1]], remaining_force)
-
-    starts = [SimpleNamespace(theta=np.zeros(1), effects=(name,)) for name in likelihoods]
-    search_control = SimpleNamespace(
-        begin_stage=lambda *_: None, advance=lambda: None, check_not_stopped=lambda: None
-    )
-    context = SimpleNamespace(
-        evaluator=SimpleNamespace(search_control=search_control),
-        proposals=SimpleNamespace(of=lambda _: starts),
-        filters=SimpleNamespace(
-            follow_with_effects=follow_with_effects,
-            improve=lambda larger_set: larger_set,
-            penalty=lambda _: 10.0,
-            compute_gain=lambda followed: 2.0 * followed.log_likelihood,
-        ),
-        columns=SimpleNamespace(library=SimpleNamespace(probes=())),
-        extended_sets={},
-    )
-    compared = competing_models.try_one_more_effect(context, _follow((), 0.0, 1.0))
-    assert compared[0].names == ("b",)
-    assert set(tried) == set(expected)
-    # A filter that is hardly likelier has the same extensions; one that is much likelier has not.
-    count = len(tried)
-    assert competing_models.try_one_more_effect(context, _follow((), 5.0, 1.0)) is compared
-    assert len(tried) == count
-    competing_models.try_one_more_effect(context, _follow((), 100.0, 1.0))
-    assert len(tried) > count

@@ -1,15 +1,13 @@
 """The joints at which forces are missing decide which effects are fitted."""
 
 import re
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from bench.diagnosis.prediction_error import competing_models
-from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, get_only_joint
+from bench.diagnosis.prediction_error.effects_at_joints import get_only_joint
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from tests.bench.diagnosis.arm_model import ARM
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
@@ -104,31 +102,3 @@ def test_wrong_dampings_of_two_joints_are_found(tmp_path):
 )
 def test_most_effects_at_a_joint_act_there_alone(example_arm, effect, joint):
     assert get_only_joint(example_arm, effect) == joint
-
-
-@pytest.mark.parametrize(
-    ("remaining_forces", "expected_size"),
-    [
-        # The second effect replaces the force at one of two joints, the third at the other.
-        ([[1.0, 0.05], [0.02, 0.05], [0.01, 0.05]], 4),
-        # The second effect replaces nothing, but the third one does.
-        ([[0.9, 0.8], [0.9, 0.1], [0.1, 0.1]], 4),
-        # The second and the third effect replace nothing, so no fourth one is added.
-        ([[0.9, 0.8], [0.8, 0.7], [0.1, 0.1]], 3),
-    ],
-)
-def test_a_set_grows_while_effects_replace_missing_forces(
-    monkeypatch, remaining_forces, expected_size
-):
-    missing = np.ones(2, dtype=bool)
-    forces = [np.ones(2), *(np.array(force) for force in remaining_forces)]
-    sets = [
-        FilteredSet(SimpleNamespace(force=force, missing_forces=missing), tuple("abcd"[: i + 1]))
-        for i, force in enumerate(forces)
-    ]
-    monkeypatch.setattr(
-        competing_models, "_list_larger_that_pay", lambda _, current: [sets[len(current.names)]]
-    )
-    monkeypatch.setattr(competing_models, "make_filtered_start", lambda *_: None)
-    monkeypatch.setattr(competing_models, "select_lowest_of_each", lambda *_: [])
-    assert len(competing_models._grow_set(None, sets[0]).names) == expected_size
