@@ -26,7 +26,7 @@ import pandas as pd
 import psutil
 import tomli_w
 
-from bench.benchmark.isolation.tuner_processes import remove_stale_folders
+from bench.benchmark.isolation.temporary_folders import remove_stale_folders
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.benchmark.storage.run_journal import read_statuses
 from tests.conftest import PLUGINS

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from bench.benchmark.runner.stored_study import Study
+    from bench.benchmark.runner.study_base import Study
     from bench.benchmark.storage.run_status import StudyOutcome
 
 _SHOT_TABLE_COLUMNS = {

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError
+from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.problem.experiment import (
     Experiment,
     TunerEntry,
@@ -20,13 +20,9 @@ from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import ProgressFactory
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated
+from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
-from bench.benchmark.runner.tuner_training import (
-    TrainingRequest,
-    TrainingResult,
-    get_weights_folder,
-    train_or_load,
-)
+from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.core.plugin_registries import simulators, tuners
 from bench.figures.loss_figure import write_loss_figure
 from methods.learning.training_data import TrainingBudgetTooSmallError

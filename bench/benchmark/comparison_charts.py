@@ -7,16 +7,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.error_curves import (
-    format_bin_labels,
-    select_checkpoints,
-    select_distance_checkpoints,
-)
+from bench.benchmark.statistics.error_curves import select_checkpoints, select_distance_checkpoints
 from bench.benchmark.statistics.training_amortisation import (
     AT_ONCE,
     NEVER,
@@ -277,7 +274,7 @@ def _make_median_chart(
         _select_panels_with_data(panels),
         {table: medians},
         side_by_side,
-        _make_notes(view, statistics.find_coinciding_curves(keys)),
+        _make_notes(view, _find_coinciding_tuners(statistics, keys)),
     )
 
 
@@ -581,3 +578,104 @@ def _make_tuner_series(
 def _select_panels_with_data(panels: Sequence[Panel]) -> list[Panel]:
     """Select the panels with data; at least one, since its axes show what is missing."""
     return [panel for panel in panels if panel.series] or list(panels[:1])
+
+
+_MAX_INVISIBLE_DIFFERENCE = 0.02
+"""Relative difference of errors that is not visible on a logarithmic axis."""
+
+
+def _find_coinciding_tuners(
+    statistics: ComparisonStatistics, panels: Sequence[tuple[str, str]]
+) -> dict[str, str]:
+    """Find tuners whose curves are hidden below another curve in all panels of a chart.
+
+    Args:
+        statistics: statistics of the comparison, with its median curves.
+        panels: metric and range of targets of each panel.
+
+    Returns:
+        Note by tuner, such as ``same as hybrid up to 2``.
+    """
+    curves_by_tuner: dict[str, list[pd.Series[float]]] = {}
+    for metric, kind in panels:
+        medians = statistics.compute_median_curves(metric, kind)
+        for tuner, curve in medians.groupby("tuner", sort=False):
+            curves_by_tuner.setdefault(str(tuner), []).append(
+                curve.set_index("simulations")["median"]
+            )
+    return find_coinciding_curves(curves_by_tuner)
+
+
+def find_coinciding_curves(
+    curves_by_tuner: Mapping[str, Sequence[pd.Series[float]]],
+) -> dict[str, str]:
+    """Find curves that cannot be seen because another one is drawn above them.
+
+    A reader would miss a tuner in the figure, so a note names the tuner that covers it. A curve
+    coincides with a later one up to k simulations if the two differ by less than
+    `_MAX_INVISIBLE_DIFFERENCE` in every panel up to k, and if the error has halved by then. Before
+    that most tuners are equal.
+
+    Args:
+        curves_by_tuner: curves of each tuner in drawing order, one per panel: medians by number of
+            simulations.
+
+    Returns:
+        Note by tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
+    """
+    notes = {}
+    names = list(curves_by_tuner)
+    for place, name in enumerate(names):
+        longest = 0
+        for upper_name in names[place + 1 :]:
+            if len(curves_by_tuner[upper_name]) != len(curves_by_tuner[name]):
+                continue
+            pairs = list(zip(curves_by_tuner[name], curves_by_tuner[upper_name], strict=True))
+            upto = min(
+                _count_equal_simulations(hidden_curve, upper_curve)
+                for hidden_curve, upper_curve in pairs
+            )
+            has_progress = any(
+                (hidden_curve.loc[:upto] < 0.5 * hidden_curve.iloc[0]).any()
+                for hidden_curve, _ in pairs
+            )
+            if upto > longest and has_progress:
+                longest = upto
+                is_complete = all(upto == hidden_curve.index[-1] for hidden_curve, _ in pairs)
+                notes[name] = f"same as {upper_name}" + ("" if is_complete else f" up to {upto}")
+    return notes
+
+
+def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) -> int:
+    """Return the largest number of simulations up to which two curves look the same; 0 for none.
+
+    Args:
+        first: errors, by number of simulations.
+        second: errors of another tuner, by number of simulations.
+    """
+    points = first.index.intersection(second.index)
+    first_errors, second_errors = first[points].to_numpy(), second[points].to_numpy()
+    is_equal = np.logical_and.accumulate(
+        np.abs(first_errors - second_errors)
+        <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(first_errors, second_errors)
+    )
+    return int(points[is_equal][-1]) if is_equal.any() else 0
+
+
+def format_bin_labels(table: pd.DataFrame) -> list[str]:
+    """Return labels of the groups of `compute_medians_by_distance`, with numbers of targets.
+
+    Args:
+        table: Result of `compute_medians_by_distance`, with the limits of each bin.
+    """
+    first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
+    names = []
+    for bin_index in range(max(first, default=0) + 1):
+        row = first.get(bin_index)
+        if row is None:
+            names.append("inside\nn=0")
+            continue
+        limits = [f"{row[end]:.2f}" for end in ("beyond", "to")]
+        name = "–".join(dict.fromkeys(limits)) if bin_index else "inside"
+        names.append(f"{name}\nn={row['targets']}")
+    return names

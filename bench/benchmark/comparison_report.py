@@ -20,7 +20,7 @@ from bench.benchmark.comparison_page import (
     list_mean_seconds,
     render_page,
 )
-from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE, without_isolation
+from bench.benchmark.isolation.process_errors import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.statistics.error_curves import build_summary

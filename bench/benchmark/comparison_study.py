@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.benchmark.runner.stored_study import PrintLine, Study
+from bench.benchmark.runner.study_base import PrintLine, Study
 from bench.benchmark.storage.csv_reader import RunsTable
 from bench.benchmark.storage.result_file_consistency import (
     check_journal_statuses,
@@ -15,11 +15,7 @@ from bench.benchmark.storage.result_file_consistency import (
     check_rows_match_statuses,
     check_runs,
 )
-from bench.benchmark.storage.result_folder import (
-    read_comparison,
-    read_salt,
-    write_results,
-)
+from bench.benchmark.storage.result_folder import read_comparison, write_results
 from bench.benchmark.storage.run_journal import (
     JOURNAL_FILE,
     JOURNAL_REMEDY,
@@ -36,6 +32,7 @@ from bench.benchmark.storage.run_status import (
     RunEnd,
     StudyOutcome,
 )
+from bench.benchmark.storage.secret_salt import read_salt
 from sims.core.files import write_atomically
 from sims.core.simulator import InputError
 
@@ -43,7 +40,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
-    from bench.benchmark.runner.stored_study import PreparedStudy
+    from bench.benchmark.runner.study_base import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 
@@ -107,7 +104,7 @@ class Comparison(Study):
         Raises:
             InputError: the stored plan or runs do not belong to the configuration.
         """
-        from bench.benchmark.runner.tuner_training import get_weights_folder
+        from bench.benchmark.runner.trained_weights import get_weights_folder
 
         self.results = results
         # Tuners must not access true parameters, results of other tuners, or earlier trainings.

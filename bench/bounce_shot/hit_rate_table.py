@@ -6,7 +6,7 @@ import math
 
 import pandas as pd
 
-from bench.benchmark.statistics.paired_tests import compute_proportion_interval
+from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.figures.style import get_mark_style
 from bench.pages.chart import Axis, Panel, make_method_series

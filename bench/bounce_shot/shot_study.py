@@ -14,21 +14,12 @@ import numpy as np
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.runner.experiment_runner import (
-    ProgressFactory,
-    check_classes_importable,
-    check_tuners,
-    no_progress,
-)
-from bench.benchmark.runner.plugin_discovery import describe_plugins
-from bench.benchmark.runner.stored_study import PreparedStudy, PrintLine, Study
+from bench.benchmark.runner.experiment_runner import ProgressFactory, check_tuners, no_progress
+from bench.benchmark.runner.plugin_discovery import check_classes_importable, describe_plugins
+from bench.benchmark.runner.study_base import PreparedStudy, PrintLine, Study
+from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
-from bench.benchmark.runner.tuner_training import (
-    TrainingRequest,
-    TrainingResult,
-    get_weights_folder,
-    train_or_load,
-)
+from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from sims.core.plain_values import to_json_value
 
 if TYPE_CHECKING:
-    from bench.benchmark.runner.stored_study import Study
+    from bench.benchmark.runner.study_base import Study
 
 
 JsonDocument = dict[str, Any]

@@ -12,17 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_layers import (
-    PROJECT_ROOT,
-    KilledExternallyError,
-    RunEndedError,
-)
+from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT
+from bench.benchmark.isolation.process_errors import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.tuner_processes import IsolatedRun, TunerSpec
+from bench.benchmark.runner.preloadable_packages import find_preloadable_packages
 from bench.benchmark.runner.tuner_loop import RunTrace, drive_tuner
-from bench.benchmark.runner.tuner_process_reuse import (
-    find_preloadable_packages,
-    start_isolated_tuner,
-)
+from bench.benchmark.runner.tuner_process_reuse import start_isolated_tuner
 from bench.conformance.check_base import (
     Check,
     CheckError,

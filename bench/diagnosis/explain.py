@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.benchmark.runner.worker_pools import limit_to_one_thread
+from bench.benchmark.isolation.resource_limits import limit_to_one_thread
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.parameter_bounds import describe_unusual_values
 from bench.diagnosis.evaluation.search_control import STAGES

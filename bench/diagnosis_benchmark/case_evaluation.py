@@ -15,20 +15,21 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     ProtocolError,
     pack_arrays,
     unpack_arrays,
 )
+from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import (
     START_TIMEOUT_SECONDS,
     IsolatedProcess,
     TunerSpec,
 )
-from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_part_process
-from bench.benchmark.runner.tuner_training import read_weights
+from bench.benchmark.runner.retry_after_kill import retry_if_killed
+from bench.benchmark.runner.trained_weights import read_weights
+from bench.benchmark.runner.tuner_process_reuse import start_part_process
 from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process

@@ -9,19 +9,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
+from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.code_digest import hash_class_source
-from bench.benchmark.runner.experiment_runner import (
-    ProgressFactory,
+from bench.benchmark.runner.experiment_runner import ProgressFactory, no_progress
+from bench.benchmark.runner.plugin_discovery import (
+    announce_installed,
     check_classes_importable,
-    no_progress,
+    list_compared_parts,
 )
-from bench.benchmark.runner.plugin_discovery import announce_installed, list_compared_parts
-from bench.benchmark.runner.stored_study import PreparedStudy, PrintLine, Study
+from bench.benchmark.runner.study_base import PreparedStudy, PrintLine, Study
+from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
 from bench.benchmark.runner.tuner_process_reuse import make_part_spec
-from bench.benchmark.runner.tuner_training import TrainingResult, get_weights_folder
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,

@@ -18,8 +18,8 @@ from bench.benchmark.runner.code_digest import (
     hash_package_versions,
     hash_source_folders,
 )
-from bench.benchmark.runner.tuner_process_reuse import retry_if_killed
-from bench.benchmark.runner.tuner_training import (
+from bench.benchmark.runner.retry_after_kill import retry_if_killed
+from bench.benchmark.runner.trained_weights import (
     TrainingResult,
     WeightsError,
     get_weights_folder,

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.paired_tests import compute_proportion_interval, correct_holm
+from bench.benchmark.statistics.paired_tests import correct_holm
+from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
 from bench.diagnosis_benchmark.case_generation.recording_conditions import CASE_KINDS

@@ -15,7 +15,7 @@ import pandas as pd
 
 from bench.benchmark.comparison_report import format_failures
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.runner.stored_study import PrintLine, Study
+from bench.benchmark.runner.study_base import PrintLine, Study
 from bench.benchmark.statistics.comparison_statistics import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
     read_comparison,

@@ -8,27 +8,25 @@ of comparisons.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.runner.stored_study import PrintLine, Study
-from bench.benchmark.storage.result_folder import (
-    CONFIGURATION_FILE,
-    read_salt,
-)
+from bench.benchmark.runner.study_base import PrintLine, Study
+from bench.benchmark.storage.result_folder import CONFIGURATION_FILE
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
 )
+from bench.benchmark.storage.secret_salt import read_salt
 from bench.core.plugin_registries import simulators
 from bench.misspecification.calibration import (
+    EXTENDED,
     MODEL_LABELS,
     PLAIN,
-    make_base_experiment,
-    make_extended_experiment,
     write_calibration_recording,
 )
 from sims.extended_simulator import list_effect_coefficients, open_extended
@@ -36,7 +34,7 @@ from sims.extended_simulator import list_effect_coefficients, open_extended
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
-    from bench.benchmark.runner.stored_study import PreparedStudy
+    from bench.benchmark.runner.study_base import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 CALIBRATION_FILE = "calibration.csv"
@@ -166,7 +164,7 @@ class MisspecificationStudy(Study):
             # A public salt is already part of the experiment.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
-            from bench.benchmark.runner.stored_study import prepare_study
+            from bench.benchmark.runner.study_base import prepare_study
 
             comparison = Comparison.begin(prepare_study(plan, self.plugins, folder, jobs, secret))
         if comparison.results is not None:
@@ -241,3 +239,46 @@ class MisspecificationStudy(Study):
         from bench.misspecification.misspecification_report import write_report
 
         return write_report(self, print_line)
+
+
+def make_base_experiment(experiment: Experiment) -> Experiment:
+    """Make the experiment in the original simulator, which lacks the hidden effects."""
+    return _make_comparison_experiment(experiment, PLAIN, experiment.settings)
+
+
+def make_extended_experiment(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
+    """Make the experiment in the extended simulator.
+
+    The tuned parameters remain the same. The missing effects act with the coefficients that explain
+    fitted.
+
+    Args:
+        experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
+        effects: coefficients by name of the effect.
+    """
+    settings = dict(experiment.settings)
+    # An effect that is tuned stays tuned, although explain fitted its coefficients too.
+    tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
+    fixed_effects = {name: values for name, values in effects.items() if name not in tuned}
+    settings["fixed"] = {**settings.get("fixed", {}), **fixed_effects}
+    return _make_comparison_experiment(experiment, EXTENDED, settings)
+
+
+def _make_comparison_experiment(
+    experiment: Experiment, model: str, settings: Mapping[str, Any]
+) -> Experiment:
+    """Make the experiment of one of the two comparisons: the same targets in another simulator.
+
+    Args:
+        experiment: the experiment of the study.
+        model: `PLAIN` or `EXTENDED`, which is added to name and title.
+        settings: settings of the simulator, such as its fixed effects.
+    """
+    return replace(
+        experiment,
+        name=f"{experiment.name}-{model}",
+        title=f"{experiment.title or experiment.name} ({model})",
+        same_targets_as=experiment.name,
+        settings=settings,
+        calibration=None,
+    )

@@ -1,4 +1,4 @@
-"""Tables of a page: named columns, sortable grids, and intervals drawn in a cell.
+"""Tables of a page: named columns and sortable grids.
 
 Importing pandas takes longer than drawing a figure, and the report of `explain` only needs rows,
 columns and CSV.
@@ -10,8 +10,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from io import StringIO
-from math import isfinite
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -192,85 +191,3 @@ def select_initial_rows(grid: DataGrid, frame: pd.DataFrame | Table) -> list[dic
     missing = [row for row in rows if is_missing(row[name])]
     present = [row for row in rows if not is_missing(row[name])]
     return sorted(present, key=lambda row: row[name], reverse=direction == "down") + missing
-
-
-SCALE_WIDTH = 180.0
-"""Width of the scale; the drawing is 200 wide, with margins for the marks."""
-_MARGIN = 10.0
-
-
-class DrawnInterval(NamedTuple):
-    """An interval with its estimate, in the coordinates of the drawing.
-
-    Attributes:
-        kind: Class of the style sheet.
-        value: Position of the estimate.
-        low: Position of the lower end.
-        high: Position of the upper end.
-        y: Vertical position.
-    """
-
-    kind: str
-    value: float
-    low: float
-    high: float
-    y: int
-
-
-class IntervalDrawing(NamedTuple):
-    """Content of a drawing that is 200 wide.
-
-    Attributes:
-        rows: Intervals from top to bottom.
-        height: Height of the drawing.
-        radius: Radius of the estimates' marks.
-        band: Left edge and width of the interval behind the others; None for none.
-    """
-
-    rows: tuple[DrawnInterval, ...]
-    height: int
-    radius: float
-    band: tuple[float, float] | None = None
-
-
-def draw_intervals(
-    intervals: Sequence[tuple[str, float, float, float]],
-    band: tuple[float, float] | None = None,
-    distance: int = 14,
-) -> IntervalDrawing | None:
-    """Arrange intervals on one scale, which ends with the outermost of them, for a drawing in SVG.
-
-    Args:
-        intervals: Class of the style sheet, estimate, lower and upper end of each.
-        band: Lower and upper end of an interval behind the others, clipped to the drawing.
-        distance: Vertical distance between two intervals, in CSS pixels.
-
-    Returns:
-        The drawing; None if an end is not finite, or all of them are equal.
-    """
-    low = min(interval[2] for interval in intervals)
-    high = max(interval[3] for interval in intervals)
-    values = [number for interval in intervals for number in interval[1:]]
-    if not all(map(isfinite, values)) or high <= low:
-        return None
-    scale = SCALE_WIDTH / (high - low)
-
-    def to_pixels(value: float) -> float:
-        """Return the horizontal position of a value, within the drawing, in CSS pixels."""
-        return round(min(max(_MARGIN + (value - low) * scale, 0.0), SCALE_WIDTH + 2 * _MARGIN), 1)
-
-    rows = tuple(
-        DrawnInterval(
-            kind,
-            to_pixels(value),
-            to_pixels(begin),
-            to_pixels(end),
-            distance // 2 + 1 + distance * i,
-        )
-        for i, (kind, value, begin, end) in enumerate(intervals)
-    )
-    band_extent = None
-    if band is not None:
-        # A narrow band is drawn 1.5 pixels wide, so that it remains visible.
-        band_extent = to_pixels(band[0]), max(to_pixels(band[1]) - to_pixels(band[0]), 1.5)
-    return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

@@ -20,7 +20,7 @@ from bench.core.random_streams import generate_salt
 
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
-    from bench.benchmark.runner.stored_study import PrintLine, Study
+    from bench.benchmark.runner.study_base import PrintLine, Study
 
 
 def begin_studies(
@@ -46,7 +46,7 @@ def begin_studies(
             behind.
     """
     from bench.benchmark.problem.experiment import expand_sweep
-    from bench.benchmark.runner.stored_study import prepare_study
+    from bench.benchmark.runner.study_base import prepare_study
 
     def begin(part: Experiment, place: Path | None) -> Study:
         return get_study_class(part).begin(prepare_study(part, plugins, place, jobs, salt))

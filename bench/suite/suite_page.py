@@ -17,32 +17,28 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
 from bench.benchmark.comparison_report import REPORT_FILE
-from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, make_method_series
 from bench.pages.html_page import HtmlPage
 from bench.pages.template import render_text
 from bench.suite.suite_runs import (
-    CURVES_FILE,
     SuiteRuns,
     collect_suite_runs,
+    find_stored_runs,
     list_comparison_folders,
     merge_runs,
     read_suite_runs,
     write_suite_runs,
 )
-from bench.suite.suite_statistics import FREE, SuiteTables
+from bench.suite.suite_statistics import FREE, SuiteTables, build_guide, choose_segments
 from sims.core.files import write_atomically
 
-GUIDE_COLUMNS = ["property", "value", "cells", "simulations", "best", "best_untrained"]
 LOSS_CHECKPOINTS = (10, 100)
 """Numbers of simulations at which losses of the reference methods are listed."""
 LOSS_FACTOR = 3.0
 """Ratio to the smallest error above which a method counts as losing."""
 REFERENCE_TUNERS = ("hybrid", "tunenet")
 """Methods of this project, whose losses the page lists."""
-RANK_TOLERANCE = 0.5
-"""Difference from the lowest mean rank up to which the headline keeps a method."""
 _SIGNIFICANCE = 0.05
 """Significance level of the tests against the best method."""
 MAX_PRINTED_RATIO = 1e4
@@ -64,28 +60,6 @@ def build_headline(tables: SuiteTables) -> str:
     )
 
 
-def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
-    """Choose as few methods as possible, each near the lowest mean rank at its checkpoints.
-
-    Args:
-        means: mean ranks, a row per tuner, a column per number of simulations.
-
-    Returns:
-        Methods, each with the last number of simulations for which it is chosen.
-    """
-    is_near_best = means <= means.min() + RANK_TOLERANCE
-    checkpoints = [int(str(k)) for k in means]
-    segments, start = [], 0
-    while start < len(checkpoints):
-        segment_lengths = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
-        longest = segment_lengths.index[segment_lengths == segment_lengths.max()]
-        stop = start + int(segment_lengths.max())
-        tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
-        segments.append((tuner, checkpoints[stop - 1]))
-        start = stop
-    return segments
-
-
 def join_segments(segments: Sequence[tuple[str, int]]) -> str:
     """Describe which method is best up to which number of simulations.
 
@@ -98,35 +72,6 @@ def join_segments(segments: Sequence[tuple[str, int]]) -> str:
     *first, (last, _) = segments
     words = [f"{name} up to {k} simulation{'' if k == 1 else 's'}" for name, k in first]
     return ", ".join([*words, f"then {last}" if words else last])
-
-
-def build_guide(tables: SuiteTables) -> pd.DataFrame:
-    """Build the decision guide: the best method for each kind of problem and budget.
-
-    Returns:
-        Columns `GUIDE_COLUMNS`: best of all methods, and best of those that need no training.
-    """
-    trained = tables.get_trained_tuners()
-    lines = []
-    rows = tables.profile
-    overall = tables.ranks[tables.ranks["training"] == FREE]
-    overall = overall.assign(property="all problems", value="")
-    frame = pd.concat([overall[rows.columns], rows], ignore_index=True)
-    for (name, value, k), group in frame.groupby(["property", "value", "simulations"], sort=False):
-        group = group.sort_values("mean_rank", kind="stable")
-        untrained = group[~group["tuner"].isin(trained)]
-        # An equal rank goes to the method that is named first in the ranking.
-        lines.append(
-            (
-                name,
-                value,
-                int(group["cells"].iloc[0]),
-                k,
-                group["tuner"].iloc[0],
-                untrained["tuner"].iloc[0] if len(untrained) else "",
-            )
-        )
-    return pd.DataFrame(lines, columns=GUIDE_COLUMNS)
 
 
 def describe_tests(tables: SuiteTables) -> list[str]:
@@ -407,8 +352,6 @@ def _list_columns(frame: pd.DataFrame) -> list[tuple[str, str, int]]:
 
 
 PrintLine = Callable[[str], None]
-_REFERENCE_NAME = "suite"
-"""Folder of the stored runs among the reference results."""
 _MAX_PRINTED_TUNERS = 30
 """Maximum number of tuners in the printed table."""
 
@@ -440,23 +383,6 @@ def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
     _print_results(tables, new_runs, print_line)
     print_line(f"report  {folder / REPORT_FILE}")
     return tables
-
-
-def find_stored_runs(version: str) -> SuiteRuns | None:
-    """Return the stored runs of a version of a suite; None if there are none.
-
-    They are read from the reference results of this project.
-
-    Args:
-        version: Version of the suite, which changes when its problems change.
-    """
-    for place in REFERENCE_FOLDERS:
-        folder = place / _REFERENCE_NAME
-        if (folder / CURVES_FILE).is_file():
-            stored = read_suite_runs(folder)
-            if stored.version == version:
-                return stored
-    return None
 
 
 def _print_results(tables: SuiteTables, new_runs: SuiteRuns, print_line: PrintLine) -> None:

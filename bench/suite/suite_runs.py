@@ -18,6 +18,7 @@ import pandas as pd
 from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.misspecification.calibration import MODEL_LABELS, PLAIN
@@ -426,3 +427,24 @@ def read_suite_runs(folder: Path) -> SuiteRuns:
             f"{folder}: expected the stored runs of a suite ({CURVES_FILE}, {CELLS_FILE}), found "
             f"{str(error).splitlines()[0]:.200}; restore the file or run the suite again"
         ) from None
+
+
+_REFERENCE_NAME = "suite"
+"""Folder of the stored runs among the reference results."""
+
+
+def find_stored_runs(version: str) -> SuiteRuns | None:
+    """Return the stored runs of a version of a suite; None if there are none.
+
+    They are read from the reference results of this project.
+
+    Args:
+        version: Version of the suite, which changes when its problems change.
+    """
+    for place in REFERENCE_FOLDERS:
+        folder = place / _REFERENCE_NAME
+        if (folder / CURVES_FILE).is_file():
+            stored = read_suite_runs(folder)
+            if stored.version == version:
+                return stored
+    return None

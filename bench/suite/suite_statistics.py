@@ -15,12 +15,9 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from bench.benchmark.statistics.bootstrap import compute_percentile_interval, draw_target_resamples
 from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.expected_running_time import (
-    compute_effort,
-    compute_percentile_interval,
-    draw_target_resamples,
-)
+from bench.benchmark.statistics.expected_running_time import compute_effort
 from bench.benchmark.statistics.paired_tests import (
     compare_pair,
     compute_log_errors,
@@ -402,3 +399,61 @@ def _rank_tuners(medians: pd.DataFrame) -> pd.DataFrame:
     """Rank the tuners, one a column, in each row; equal errors share a rank."""
     # Rounding gives errors that differ by the last bit the same rank.
     return medians.round(9).rank(axis=1)
+
+
+GUIDE_COLUMNS = ["property", "value", "cells", "simulations", "best", "best_untrained"]
+
+
+RANK_TOLERANCE = 0.5
+"""Difference from the lowest mean rank up to which the headline keeps a method."""
+
+
+def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
+    """Choose as few methods as possible, each near the lowest mean rank at its checkpoints.
+
+    Args:
+        means: mean ranks, a row per tuner, a column per number of simulations.
+
+    Returns:
+        Methods, each with the last number of simulations for which it is chosen.
+    """
+    is_near_best = means <= means.min() + RANK_TOLERANCE
+    checkpoints = [int(str(k)) for k in means]
+    segments, start = [], 0
+    while start < len(checkpoints):
+        segment_lengths = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
+        longest = segment_lengths.index[segment_lengths == segment_lengths.max()]
+        stop = start + int(segment_lengths.max())
+        tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
+        segments.append((tuner, checkpoints[stop - 1]))
+        start = stop
+    return segments
+
+
+def build_guide(tables: SuiteTables) -> pd.DataFrame:
+    """Build the decision guide: the best method for each kind of problem and budget.
+
+    Returns:
+        Columns `GUIDE_COLUMNS`: best of all methods, and best of those that need no training.
+    """
+    trained = tables.get_trained_tuners()
+    lines = []
+    rows = tables.profile
+    overall = tables.ranks[tables.ranks["training"] == FREE]
+    overall = overall.assign(property="all problems", value="")
+    frame = pd.concat([overall[rows.columns], rows], ignore_index=True)
+    for (name, value, k), group in frame.groupby(["property", "value", "simulations"], sort=False):
+        group = group.sort_values("mean_rank", kind="stable")
+        untrained = group[~group["tuner"].isin(trained)]
+        # An equal rank goes to the method that is named first in the ranking.
+        lines.append(
+            (
+                name,
+                value,
+                int(group["cells"].iloc[0]),
+                k,
+                group["tuner"].iloc[0],
+                untrained["tuner"].iloc[0] if len(untrained) else "",
+            )
+        )
+    return pd.DataFrame(lines, columns=GUIDE_COLUMNS)

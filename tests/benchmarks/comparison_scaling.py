@@ -21,7 +21,7 @@ from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import prepare_experiment
 from bench.benchmark.runner.run_in_worker import RunOutcome
 from bench.benchmark.runner.run_scoring import build_rows, make_status
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.runner.tuner_loop import RunTrace
 from bench.benchmark.runner.worker_pools import LocalPool
 from bench.benchmark.storage.result_folder import read_comparison, write_results

@@ -12,7 +12,7 @@ import tomli_w
 from bench.benchmark.comparison_figures import FIGURE_FILES
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.statistics.error_curves import ERROR_METRICS
 from bench.benchmark.statistics.paired_tests import PAIR_COLUMNS
 from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS

@@ -16,7 +16,7 @@ from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.runner.experiment_runner import run_experiment
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES
 from bench.logs.film_rendering import write_film as film

@@ -1,39 +1,22 @@
-"""Processes of isolated tuners, seen from the harness: start, exchange of messages, and end.
-
-Folders of killed processes are deleted by the next process that makes one.
-"""
+"""Processes of isolated tuners, seen from the harness: exchange of messages, and end."""
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
-import os
-import shutil
 import signal
 import socket
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.benchmark.isolation import fork_server
-from bench.benchmark.isolation.isolation_layers import (
-    PROJECT_ROOT,
-    AffinityController,
-    KilledExternallyError,
-    RunEndedError,
-    describe_exit,
-    list_readable_paths,
-    with_isolation,
-)
+from bench.benchmark.isolation.cpu_affinity import AffinityController
 from bench.benchmark.isolation.message_channel import (
     MAX_PROPOSAL_BYTES,
     MAX_TEXT_BYTES,
@@ -44,88 +27,17 @@ from bench.benchmark.isolation.message_channel import (
     pack_arrays,
     to_printable,
 )
-from methods.tuner import Array, Proposal, Task, TunerGenerator
-from sims.core.files import lock_file
-from sims.engines.compiled import machine_code as compiled
-
-_FOLDER_PREFIX = "simgap-tuner-"
-_EXIT_WAIT_SECONDS = 5.0
-"""Time in seconds that the fork server has to end after its link is closed."""
-
-
-class LockedFolder(NamedTuple):
-    """Temporary folder that is locked by this process.
-
-    Attributes:
-        path: path of the folder.
-        lock: file descriptor with the lock; the folder is in use while it is open.
-    """
-
-    path: str
-    lock: int
-
-    def remove(self) -> None:
-        """Delete the folder and release its lock."""
-        shutil.rmtree(self.path, ignore_errors=True)
-        os.close(self.lock)
-
-
-def create_locked_folder() -> LockedFolder:
-    """Create a new locked folder.
-
-    The lock shows other processes that the folder is in use; folders of ended processes are removed
-    first.
-
-    Returns:
-        The folder and its open lock, which is held until the process ends.
-    """
-    remove_stale_folders()
-    while True:
-        path = tempfile.mkdtemp(prefix=_FOLDER_PREFIX)
-        lock = _lock_folder(path, is_blocking=True)
-        # Between creation and lock another process may have removed the folder as unused.
-        if lock is not None and os.path.isdir(path):
-            return LockedFolder(path, lock)
-
-
-def remove_stale_folders() -> None:
-    """Delete the folders of processes that were killed."""
-    for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
-        lock = _lock_folder(str(path), is_blocking=False)
-        if lock is not None:
-            LockedFolder(str(path), lock).remove()
-
-
-def _lock_folder(path: str, is_blocking: bool) -> int | None:
-    """Lock a folder, so that no other process uses or deletes it, and return the descriptor.
-
-    Args:
-        path: path of the folder.
-        is_blocking: True to wait for the lock.
-
-    Returns:
-        File descriptor; None if another process has the lock, or the folder does not exist.
-    """
-    try:
-        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    try:
-        lock_file(lock, is_blocking)
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
-
-
-_BOOTSTRAP_CODE = (
-    "import sys; sys.path[:] = {path!r}; "
-    "from bench.benchmark.isolation.fork_server import serve_fork_requests; "
-    "serve_fork_requests({descriptor})"
+from bench.benchmark.isolation.process_errors import (
+    KilledExternallyError,
+    RunEndedError,
+    describe_exit,
+    with_isolation,
 )
-_PRELOADED_MODULES = ("numpy.random", "bench.benchmark.isolation.tuner_server")
-_NUMERICAL_VARIABLE_PREFIXES = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
-"""Prefixes of environment variables that determine how numerical libraries compute."""
+from methods.tuner import Array, Proposal, Task, TunerGenerator
+
+if TYPE_CHECKING:
+    from bench.benchmark.isolation.fork_server_client import ForkServerClient
+
 START_TIMEOUT_SECONDS = 60.0
 """Timeout in seconds for the start of a process and for building a tuner."""
 _EXTERNAL_KILL_SIGNALS = (-9, -15)
@@ -161,176 +73,6 @@ NOTHING_WRITTEN = Written(0, ())
 def _format_file_name(name: object) -> str:
     """Convert a file name to text that fits into one line."""
     return " ".join(to_printable(str(name)[:100]).split())
-
-
-class ForkServerClient:
-    """Client of the fork server that starts tuner processes; see `isolation.fork_server`."""
-
-    def __init__(self) -> None:
-        """Start the fork server in a new interpreter, which imports the modules that tuners need.
-
-        The server runs in an empty scratch folder (`_folder`, locked while in use) and searches no
-        current folder for modules. `_loaded` are the modules that it has already imported;
-        processes that it forks start fast, because they inherit these modules.
-        """
-        self._place: LockedFolder | None = create_locked_folder()
-        self._folder = self._place.path
-        self._loaded: set[str] = set()
-        self._link, server_link = socket.socketpair()
-        path = [place for place in sys.path if place not in ("", str(PROJECT_ROOT))] + [
-            str(PROJECT_ROOT)
-        ]
-        code = _BOOTSTRAP_CODE.format(path=path, descriptor=server_link.fileno())
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
-            pass_fds=[server_link.fileno()],
-            env=_make_environment(self._folder),
-            cwd=self._folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        server_link.close()
-        atexit.register(self.close)
-        self._send_request({}, _PRELOADED_MODULES)
-
-    def _send_request(
-        self, request: Mapping[str, Any], modules: Iterable[str], descriptors: tuple[int, ...] = ()
-    ) -> None:
-        """Send a request, with modules to be loaded that have not been loaded before.
-
-        Args:
-            request: request as JSON values.
-            modules: names of modules that the service will need.
-            descriptors: file descriptors to pass to the server.
-        """
-        missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
-        try:
-            fork_server.send_request(self._link, {**request, "modules": missing}, descriptors)
-        except OSError:
-            self.close()
-            raise KilledExternallyError("the fork server has ended") from None
-        self._loaded.update(missing)
-
-    @property
-    def is_alive(self) -> bool:
-        """True if the fork server can start another process."""
-        return self._process.poll() is None
-
-    def start_process(
-        self,
-        service: str,
-        files: Iterable[str] = (),
-        memory: int = 0,
-        hidden: Iterable[str] = (),
-        modules: Iterable[str] = (),
-    ) -> IsolatedProcess:
-        """Start an isolated process, by a request to the fork server.
-
-        Two pipes for messages and a control socket to its supervisor are made. Their ends for the
-        process are sent with the request and closed here.
-
-        Args:
-            service: module and function that the process runs, as ``MODULE:FUNCTION``; it gets a
-                message channel, the access policy and the active isolation layers.
-            files: files that it may read, in addition to Python and its packages.
-            memory: memory limit in MiB; 0 for no limit.
-            hidden: folders that it must not access, in addition to the working directory.
-            modules: modules that the fork server loads first; never those of plugins, because the
-                next process would inherit their effects.
-
-        Returns:
-            Handle of the process.
-
-        Raises:
-            KilledExternallyError: the fork server is gone.
-        """
-        request = {
-            "service": service,
-            "folder": self._folder,
-            "readable": [*list_readable_paths((*hidden, str(Path.cwd()))), *files],
-            "memory": memory,
-        }
-        (reading, child_writing), (child_reading, writing) = os.pipe(), os.pipe()
-        control, child_control = socket.socketpair()
-        descriptors = child_control.fileno(), child_reading, child_writing
-        try:
-            self._send_request(request, modules, descriptors)
-        except KilledExternallyError:
-            control.close()
-            os.close(reading)
-            os.close(writing)
-            raise
-        finally:
-            child_control.close()
-            os.close(child_reading)
-            os.close(child_writing)
-        return IsolatedProcess(self, control, MessageChannel(reading, writing))
-
-    def empty_shared_folder(self) -> None:
-        """Delete the content of the folder that processes without their own folder share."""
-        for path in Path(self._folder).iterdir():
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-
-    def close(self) -> None:
-        """End the fork server and every process that it started, and delete their scratch folder.
-
-        The server ends by itself when its link is closed; it is killed if this takes longer than
-        `_EXIT_WAIT_SECONDS`.
-        """
-        atexit.unregister(self.close)
-        self._link.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=_EXIT_WAIT_SECONDS)
-        self._process.kill()
-        self._process.wait()
-        if self._place is not None:
-            self._place.remove()
-            self._place = None
-        # Workers that have ended may have left their folders.
-        remove_stale_folders()
-
-
-def _make_environment(folder: str) -> dict[str, str]:
-    """Return the environment variables of tuner processes.
-
-    Only variables that numerical libraries and Python need are inherited, because others could pass
-    information to a tuner. Unless the user has set it, the number of numerical threads is one.
-
-    Args:
-        folder: Private folder of the process, which becomes its home and its place for temporary
-            files.
-    """
-    inherited_names = (
-        "PATH",
-        "LANG",
-        "LC_ALL",
-        "LD_LIBRARY_PATH",
-        "CUDA_VISIBLE_DEVICES",
-        "SYSTEMROOT",
-    )
-    variables = {name: os.environ[name] for name in inherited_names if name in os.environ}
-    # Libraries would otherwise compute differently, and results would differ in the last digits.
-    variables |= {
-        name: value
-        for name, value in os.environ.items()
-        if name.startswith(_NUMERICAL_VARIABLE_PREFIXES)
-    }
-    # Compiled steps are loaded from the cache folder before the process is isolated.
-    variables["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
-    single_thread = dict.fromkeys(
-        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-    )
-    return {
-        **single_thread,
-        **variables,
-        "HOME": folder,
-        "TMPDIR": folder,
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
 
 
 class IsolatedProcess:

@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.benchmark.isolation.cpu_affinity import set_processor
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import (
     MAX_HARNESS_MESSAGE_BYTES,
@@ -263,9 +264,9 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         answer = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
         if answer.kind != b"E":
             raise GeneratorExit
-        # The flags say on which processor to run, see `isolation_layers.AffinityController`.
+        # The flags say on which processor to run, see `cpu_affinity.AffinityController`.
         if answer.flags:
-            _set_processor(answer.flags - 1)
+            set_processor(answer.flags - 1)
         numbers, point_count = answer.to_array(), answer.size
         used_simulations += point_count
         proposals = numbers[: point_count * dim].reshape(point_count, dim)
@@ -276,18 +277,6 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         proposals.setflags(write=False)
         losses.setflags(write=False)
         proposal = steps.send(Evaluation(proposals, observations, losses))
-
-
-def _set_processor(processor: int) -> None:
-    """Run on the processor that the harness uses, where alternating is faster."""
-    with suppress(OSError, AttributeError):
-        os.sched_setaffinity(
-            0, {processor} if processor < _ANY_PROCESSOR else range(os.cpu_count() or 1)
-        )
-
-
-_ANY_PROCESSOR = 254
-"""Processor number that represents all processors."""
 
 
 class _RemoteTrainingSimulator:

@@ -1,4 +1,4 @@
-"""Parse the tables of an experiment file: tuners, sweeps over values, and a suite's version.
+"""Parse the tables of an experiment file: tuners, sweeps, named effects, and a suite's version.
 
 A suite is an experiment file that names its problems with their hashes. A hash covers everything in
 the problem's file that determines its results, and the model and the recording in its folder.
@@ -19,6 +19,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from sims import effects
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, get_type_hints_of, make_error, read_toml
 
@@ -281,3 +282,25 @@ def check_problem_hash(
             f"{expected.get(name, 'one in [problem_hashes]')}; a changed problem needs a new "
             'version: raise the number in suite = "..." and write the new hash'
         )
+
+
+def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
+    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
+    return sorted(find_named_effects(*settings) & set(effects.list_names()))
+
+
+def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
+    """Return all effect names in settings, also those that a plugin may define later.
+
+    Args:
+        settings: Tables of an experiment's simulator, with `effects` and `fixed` effects by name.
+    """
+    names: set[str] = set()
+    for table in settings:
+        for key in ("effects", "fixed"):
+            value = table.get(key, ())
+            # Values of a wrong type are reported by the simulator.
+            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
+                # An effect at a place of a robot is the effect without the place.
+                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
+    return names

@@ -21,6 +21,7 @@ from typing import Any
 
 from bench import __version__
 from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_tables import list_effect_names
 from bench.benchmark.problem.recording_observations import find_recording
 from sims import effects
 from sims.core.simulator import InputError
@@ -339,25 +340,3 @@ def _list_plugin_packages() -> frozenset[str]:
 def hash_effect_sources(*settings: Mapping[str, Any]) -> list[str]:
     """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
     return [hash_class_source(effects.get_effect(name)) for name in list_effect_names(*settings)]
-
-
-def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
-    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
-    return sorted(find_named_effects(*settings) & set(effects.list_names()))
-
-
-def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
-    """Return all effect names in settings, also those that a plugin may define later.
-
-    Args:
-        settings: Tables of an experiment's simulator, with `effects` and `fixed` effects by name.
-    """
-    names: set[str] = set()
-    for table in settings:
-        for key in ("effects", "fixed"):
-            value = table.get(key, ())
-            # Values of a wrong type are reported by the simulator.
-            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                # An effect at a place of a robot is the effect without the place.
-                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
-    return names

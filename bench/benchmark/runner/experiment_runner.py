@@ -6,43 +6,32 @@ Every run is stored as soon as it has ended.
 from __future__ import annotations
 
 import math
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError, import_resource_module
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
+from bench.benchmark.isolation.process_errors import RunEndedError
+from bench.benchmark.isolation.resource_limits import import_resource_module
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
-from bench.benchmark.runner.code_digest import list_effect_names
 from bench.benchmark.runner.plugin_discovery import (
+    check_classes_importable,
     describe_plugins,
-    list_compared_parts,
     must_build_isolated,
 )
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest, execute_run
-from bench.benchmark.runner.run_scoring import (
-    Notes,
-    build_rows,
-    make_status,
-    make_unfinished_outcome,
-)
+from bench.benchmark.runner.run_scoring import build_rows, make_status, make_unfinished_outcome
+from bench.benchmark.runner.trained_weights import TrainingResult, WeightsError
+from bench.benchmark.runner.tuner_author_notes import Notes
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
-from bench.benchmark.runner.tuner_training import (
-    TrainingRequest,
-    TrainingResult,
-    WeightsError,
-    build_tuner,
-    train_or_load,
-)
+from bench.benchmark.runner.tuner_training import TrainingRequest, build_tuner, train_or_load
 from bench.benchmark.runner.worker_pools import (
     Call,
     Pool,
@@ -52,7 +41,7 @@ from bench.benchmark.runner.worker_pools import (
 )
 from bench.benchmark.storage.run_journal import RunJournal
 from bench.benchmark.storage.run_status import RunStatus
-from bench.core.plugin_registries import PartUnavailableError, effects, simulators, tuners
+from bench.core.plugin_registries import PartUnavailableError, tuners
 from sims.core.simulator import InputError
 
 ProgressFactory = Callable[[str, int], Callable[[], None]]
@@ -184,58 +173,6 @@ def check_tuners(experiment: Experiment) -> dict[str, str]:
         except PartUnavailableError as error:
             skipped[entry.label] = error.reason
     return skipped
-
-
-def check_classes_importable(experiment: Experiment, workers: bool = True) -> None:
-    """Raise an error for classes that exist in this process only, if other processes need them.
-
-    A worker is a new interpreter, so that no tuner finds the true parameters in its memory. It
-    loads plugin files and installed packages, but does not import the script or notebook that calls
-    simgap, and so does not have classes that are defined there. The process of a tuner is a new
-    interpreter, too.
-
-    Args:
-        experiment: configuration of the experiment.
-        workers: True if worker processes simulate; otherwise only tuners have processes.
-
-    Raises:
-        InputError: the simulator, a tuner, a diagnoser or an effect is such a class.
-    """
-    used_parts = list_compared_parts(experiment)
-    if workers:
-        effect_names = list_effect_names(experiment.settings, experiment.world)
-        simulated = [] if experiment.model else [(simulators, experiment.simulator)]
-        used_parts = [*simulated, *used_parts, *((effects, name) for name in effect_names)]
-    for registry, name in used_parts:
-        registered = registry.snapshot().get(name)
-        if registered is not None and registered.path is None:
-            raise make_unreachable_error(registry.kind, name, registered.part)
-
-
-def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
-    """Make the error for a class that worker processes cannot load, and say how to solve it.
-
-    A class of a module file can be passed as a plugin. A class of the main script, a notebook or an
-    interactive session must be moved to a file first.
-
-    Args:
-        kind: kind of the class, such as ``tuner``.
-        name: name under which it is registered.
-        part: the class.
-    """
-    file = getattr(sys.modules.get(part.__module__), "__file__", None)
-    is_main = part.__module__ == "__main__"
-    place = str(Path(file).resolve()) if file else "this session"
-    source = f"the script {place}" if file and is_main else place
-    must_move = is_main or not file
-    plugin = f"{name}.py" if must_move else place
-    move = f"put it into a file of its own, say {plugin}, and " if must_move else ""
-    name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
-    return InputError(
-        f"{kind} {name}: class {part.__qualname__} is defined in {source}, which "
-        f"worker processes do not import; {move}pass {name_argument}plugins=[{plugin!r}], or pass "
-        "jobs=0, which runs everything in this process"
-    )
 
 
 @numeric_warnings_silenced()

@@ -1,4 +1,4 @@
-"""Inspect plugin files and installed plugins in an isolated process.
+"""Inspect plugins in an isolated process, and refuse classes that other processes cannot load.
 
 The code of a plugin with tuners or diagnosers never runs in a process that has true parameters.
 """
@@ -6,6 +6,7 @@ The code of a plugin with tuners or diagnosers never runs in a process that has 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,18 +14,27 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from bench.benchmark.isolation.isolation_layers import AccessPolicy, RunEndedError, with_isolation
+from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import MessageChannel, to_printable
+from bench.benchmark.isolation.process_errors import RunEndedError, with_isolation
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.runner.code_digest import compute_digest, find_named_effects, hash_class_source
+from bench.benchmark.problem.experiment_tables import find_named_effects, list_effect_names
+from bench.benchmark.runner.code_digest import compute_digest, hash_class_source
+from bench.benchmark.runner.retry_after_kill import retry_if_killed
 from bench.benchmark.runner.tuner_process_reuse import (
     get_fork_server,
     make_tuner_spec,
-    retry_if_killed,
     start_isolated_tuner,
 )
 from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase
-from bench.core.plugin_registries import REGISTRIES, diagnosers, load_plugins, tuners
+from bench.core.plugin_registries import (
+    REGISTRIES,
+    diagnosers,
+    effects,
+    load_plugins,
+    simulators,
+    tuners,
+)
 from methods.tuner import Tuner
 from sims.core.registry import PartUnavailableError, Registry
 from sims.core.simulator import InputError
@@ -136,6 +146,58 @@ def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str
     """List the tuners or diagnosers of an experiment, each with its registry."""
     names = [(tuners, entry.tuner) for entry in experiment.tuners]
     return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]
+
+
+def check_classes_importable(experiment: Experiment, workers: bool = True) -> None:
+    """Raise an error for classes that exist in this process only, if other processes need them.
+
+    A worker is a new interpreter, so that no tuner finds the true parameters in its memory. It
+    loads plugin files and installed packages, but does not import the script or notebook that calls
+    simgap, and so does not have classes that are defined there. The process of a tuner is a new
+    interpreter, too.
+
+    Args:
+        experiment: configuration of the experiment.
+        workers: True if worker processes simulate; otherwise only tuners have processes.
+
+    Raises:
+        InputError: the simulator, a tuner, a diagnoser or an effect is such a class.
+    """
+    used_parts = list_compared_parts(experiment)
+    if workers:
+        effect_names = list_effect_names(experiment.settings, experiment.world)
+        simulated = [] if experiment.model else [(simulators, experiment.simulator)]
+        used_parts = [*simulated, *used_parts, *((effects, name) for name in effect_names)]
+    for registry, name in used_parts:
+        registered = registry.snapshot().get(name)
+        if registered is not None and registered.path is None:
+            raise make_unreachable_error(registry.kind, name, registered.part)
+
+
+def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
+    """Make the error for a class that worker processes cannot load, and say how to solve it.
+
+    A class of a module file can be passed as a plugin. A class of the main script, a notebook or an
+    interactive session must be moved to a file first.
+
+    Args:
+        kind: kind of the class, such as ``tuner``.
+        name: name under which it is registered.
+        part: the class.
+    """
+    file = getattr(sys.modules.get(part.__module__), "__file__", None)
+    is_main = part.__module__ == "__main__"
+    place = str(Path(file).resolve()) if file else "this session"
+    source = f"the script {place}" if file and is_main else place
+    must_move = is_main or not file
+    plugin = f"{name}.py" if must_move else place
+    move = f"put it into a file of its own, say {plugin}, and " if must_move else ""
+    name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
+    return InputError(
+        f"{kind} {name}: class {part.__qualname__} is defined in {source}, which "
+        f"worker processes do not import; {move}pass {name_argument}plugins=[{plugin!r}], or pass "
+        "jobs=0, which runs everything in this process"
+    )
 
 
 def _list_extended_names(paths: Iterable[str]) -> set[str]:

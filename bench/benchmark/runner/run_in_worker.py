@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError, limited_memory
+from bench.benchmark.isolation.process_errors import RunEndedError
+from bench.benchmark.isolation.resource_limits import limited_memory
 from bench.benchmark.isolation.tuner_processes import (
     NOTHING_WRITTEN,
     IsolatedRun,
@@ -26,22 +27,16 @@ from bench.benchmark.isolation.tuner_processes import (
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.retry_after_kill import RepeatedRequests, retry_if_killed
+from bench.benchmark.runner.trained_weights import read_weights
 from bench.benchmark.runner.tuner_loop import (
     Evaluate,
     ProposalEvaluator,
     RunTrace,
     drive_tuner,
 )
-from bench.benchmark.runner.tuner_process_reuse import (
-    RepeatedRequests,
-    retry_if_killed,
-    start_isolated_tuner,
-)
-from bench.benchmark.runner.tuner_training import (
-    build_tuner,
-    load_trained_tuner,
-    read_weights,
-)
+from bench.benchmark.runner.tuner_process_reuse import start_isolated_tuner
+from bench.benchmark.runner.tuner_training import build_tuner, load_trained_tuner
 from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.core.random_streams import make_rng, make_seed_words
 from methods.tuner import Task, Tuner

@@ -1,10 +1,7 @@
-"""Score a run in the parent process, build its result rows, and collect notes for tuner authors."""
+"""Score a run in the parent process, and build its result rows."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from dataclasses import dataclass, field
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -148,68 +145,3 @@ def _build_parameter_columns(
 def _prepend_nan(values: Any) -> Any:
     """Prepend NaN, for k = 0 before any simulation, to the values of simulations 1..k."""
     return np.concatenate([[np.nan], values])
-
-
-SLOW_IMPORTS = 1.0
-"""Minimum import time of a run, in seconds, for suggesting one process for several runs."""
-_MAX_NAMED_FILES = 3
-"""Maximum number of file names in a note."""
-
-
-@dataclass
-class _OfTuner:
-    """Information about the runs of one tuner."""
-
-    files: int = 0
-    names: dict[str, None] = field(default_factory=dict)
-    unnamed: bool = False
-    import_seconds: list[float] = field(default_factory=list)
-
-
-@dataclass
-class Notes:
-    """Collected information of runs, by tuner label.
-
-    Attributes:
-        isolation: isolation of the experiment, ``run`` or ``tuner``.
-    """
-
-    isolation: str
-    _tuners: dict[str, _OfTuner] = field(default_factory=lambda: defaultdict(_OfTuner))
-
-    def add(self, label: str, outcome: RunOutcome) -> None:
-        """Add the information of one run.
-
-        Args:
-            label: label of the tuner.
-            outcome: outcome of the run.
-        """
-        tuner = self._tuners[label]
-        written = outcome.written
-        tuner.files += written.files
-        tuner.names |= dict.fromkeys(written.names)
-        tuner.unnamed = tuner.unnamed or written.files > len(written.names)
-        if outcome.import_seconds:
-            tuner.import_seconds.append(outcome.import_seconds)
-
-    def lines(self) -> list[str]:
-        """Return a line for each tuner whose files were discarded or whose imports are slow."""
-        lines = []
-        for label, tuner in self._tuners.items():
-            if tuner.files:
-                files = "1 file" if tuner.files == 1 else f"{tuner.files} files"
-                names = ", ".join(list(tuner.names)[:_MAX_NAMED_FILES])
-                suffix = ", …" if tuner.unnamed or len(tuner.names) > _MAX_NAMED_FILES else ""
-                were = "was" if tuner.files == 1 else "were"
-                lines.append(
-                    f"{files} written by tuner {label} ({names}{suffix}) {were} discarded with its "
-                    "sandbox"
-                )
-            seconds = median(tuner.import_seconds or [0.0])
-            runs = len(tuner.import_seconds)
-            if self.isolation == "run" and runs > 1 and seconds >= SLOW_IMPORTS:
-                lines.append(
-                    f"tuner {label}: its imports take {seconds:.1f} s in each of {runs} runs; with "
-                    "--isolation tuner, all runs of one seed share them"
-                )
-        return lines

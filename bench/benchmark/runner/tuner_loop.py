@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.message_channel import to_points
+from bench.benchmark.isolation.process_errors import KilledExternallyError, RunEndedError
 from methods.tuner import Array, Evaluation, Proposal, Task, Tuner, TunerGenerator
 
 if TYPE_CHECKING:

@@ -2,50 +2,26 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
-from bench.benchmark.isolation.tuner_processes import (
-    ForkServerClient,
-    IsolatedProcess,
-    IsolatedTuner,
-    TunerSpec,
-)
+from bench.benchmark.isolation.fork_server_client import ForkServerClient
+from bench.benchmark.isolation.process_errors import RunEndedError
+from bench.benchmark.isolation.tuner_processes import IsolatedProcess, IsolatedTuner, TunerSpec
 from bench.benchmark.problem.experiment import TunerEntry
+from bench.benchmark.runner.preloadable_packages import find_preloadable_packages, find_source_file
+from bench.benchmark.runner.retry_after_kill import retry_if_killed
 from bench.core.plugin_registries import Registry, tuners
 from sims.core.simulator import InputError
 
-Result = TypeVar("Result")
-
-_PRELOADABLE_PACKAGES = (
-    "bench", "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas",
-    "pysindy", "sbi", "scipy", "sims", "skopt", "sklearn", "statsmodels", "torch",
-)  # fmt: skip
-"""Packages that may be imported before a run: simgap's own and those that it requires.
-
-Other packages that a plugin imports are imported anew in each run, because they could store
-information from an earlier run.
-"""
 _MAX_WAITING_TUNERS = 8
 """Maximum number of idle tuners that wait for another run."""
 
-MAX_RETRIES = 3
-"""Maximum number of attempts at work whose processes are killed externally.
-
-An external kill gives no information about the work itself.
-"""
-
-NOT_REPRODUCIBLE_REASON = "it was killed, and the repeated training requested other simulations"
-"""Reason of a training or run that cannot be repeated."""
 
 _fork_servers: dict[int, ForkServerClient] = {}
 _idle_tuners: OrderedDict[Any, IsolatedTuner] = OrderedDict()
@@ -98,55 +74,6 @@ def close_isolated_processes() -> None:
         _fork_servers.popitem()[1].close()
 
 
-def retry_if_killed(work: Callable[[], Result]) -> Result:
-    """Call a function, again if one of its processes was killed externally.
-
-    Args:
-        work: function without arguments.
-
-    Returns:
-        The result of the function.
-
-    Raises:
-        RunEndedError: processes were killed in each of `MAX_RETRIES` attempts.
-    """
-    for _ in range(MAX_RETRIES):
-        try:
-            return work()
-        except KilledExternallyError as killed:
-            message = str(killed)
-    # After several kills the work itself is the more likely cause.
-    raise RunEndedError("crashed", f"{message}, {MAX_RETRIES} times")
-
-
-class RepeatedRequests:
-    """Requests of work that is repeated if its process is killed externally.
-
-    The repeated work must make the same requests. Otherwise a tuner that causes its own kill could
-    repeat its run until the result is good.
-    """
-
-    def __init__(self) -> None:
-        self._earlier: list[bytes] = []
-        self._place = 0
-
-    def restart(self) -> None:
-        """Begin the work, or begin it again."""
-        self._place = 0
-
-    def check(self, request: bytes) -> None:
-        """Store a new request, or compare it with the one before the kill.
-
-        Raises:
-            RunEndedError: it differs from the one before the kill.
-        """
-        if self._place == len(self._earlier):
-            self._earlier.append(request)
-        elif self._earlier[self._place] != request:
-            raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
-        self._place += 1
-
-
 def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
     """Return where the code of a tuner is, and what its isolated process preloads."""
     return make_part_spec(tuners, entry.tuner, entry.options)
@@ -168,7 +95,7 @@ def make_part_spec(
     kind, file = registry.get(name), registry.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     preloaded = (
-        find_preloadable_packages(str(file) if file else _find_source_file(module))
+        find_preloadable_packages(str(file) if file else find_source_file(module))
         if file or module
         else ()
     )
@@ -200,56 +127,6 @@ def start_part_process(
         hidden,
         [*modules, *part.modules, *own_module],
     )
-
-
-def _find_source_file(module: str) -> str:
-    """Return the source file of a module of a package that the fork server may import in advance.
-
-    Empty for modules of other packages, such as plugins: locating them could execute their code.
-    """
-    top = module.partition(".")[0]
-    if top not in _PRELOADABLE_PACKAGES:
-        return ""
-    spec = importlib.util.find_spec(module)
-    return (spec.origin or "") if spec else ""
-
-
-@cache
-def find_preloadable_packages(file: str) -> tuple[str, ...]:
-    """Return the known packages that a source file imports, directly or through simgap's tuners.
-
-    The fork server imports them once, so that not every run has to. The files are only parsed;
-    code of a plugin must not run here.
-    """
-    packages: dict[str, None] = {}
-    files = [file]
-    while files:
-        for name in _list_imported_modules(files.pop()):
-            if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in packages:
-                packages[name] = None
-                if name.startswith("methods."):
-                    files.append(_find_source_file(name))
-    return tuple(packages)
-
-
-def _list_imported_modules(file: str) -> list[str]:
-    """List the modules that a source file imports anywhere, without executing it.
-
-    Relative imports are left out. A file that cannot be read or parsed gives an empty list; its
-    error is reported when the tuner is built.
-    """
-    try:
-        tree = ast.parse(Path(file).read_bytes())
-    # A deeply nested file can exceed the limits of the parser.
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
-        return []
-    names: list[str] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names.append(node.module)
-    return names
 
 
 @contextmanager

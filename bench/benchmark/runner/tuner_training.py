@@ -9,9 +9,6 @@ hash, so that an exchanged file is detected. Nothing is ever unpickled.
 from __future__ import annotations
 
 import json
-import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     Message,
@@ -32,6 +28,7 @@ from bench.benchmark.isolation.message_channel import (
     to_printable,
     unpack_arrays,
 )
+from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess, TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.robot_experiment import get_simulator_class
@@ -47,15 +44,20 @@ from bench.benchmark.runner.code_digest import (
     hash_source_folders,
     select_relevant_keys,
 )
-from bench.benchmark.runner.tuner_process_reuse import (
-    RepeatedRequests,
-    retry_if_killed,
-    start_isolated_tuner,
+from bench.benchmark.runner.retry_after_kill import RepeatedRequests, retry_if_killed
+from bench.benchmark.runner.trained_weights import (
+    RETRAIN_ADVICE,
+    TrainingResult,
+    WeightsError,
+    get_weights_folder,
+    read_training_cost,
+    read_weights,
+    write_weights,
 )
+from bench.benchmark.runner.tuner_process_reuse import start_isolated_tuner
 from bench.core.plugin_registries import tuners
 from bench.core.random_streams import make_seed_words
 from methods.tuner import BudgetExceededError, TrainingCallback, TrainingSimulator, Tuner
-from sims.core.files import atomic_replacement
 from sims.core.simulator import Array, InputError
 
 _NO_DEADLINE = float("inf")
@@ -207,35 +209,6 @@ def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str
     return {"observations": observations, "rng": encode_rng_state(generator.bit_generator.state)}
 
 
-_COST_ARRAY = "__simulations_and_seconds__"
-"""Name of the array with the cost of the training: simulations and seconds."""
-_KEY_ARRAY = "__key__"
-"""Name of the array with the training key."""
-_RETRAIN_ADVICE = "delete it to train again"
-"""Advice for a file that cannot be used; it is never repaired silently."""
-
-
-class WeightsError(InputError):
-    """A file of trained weights cannot be used."""
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """Result of a training.
-
-    Attributes:
-        path: file of the weights.
-        simulations: number of simulations of the training.
-        seconds: duration of the training in seconds.
-        was_cached: True if the weights were in the cache.
-    """
-
-    path: Path
-    simulations: int
-    seconds: float
-    was_cached: bool = False
-
-
 def build_tuner(entry: TunerEntry) -> Tuner:
     """Build the tuner of an entry with its options.
 
@@ -248,13 +221,6 @@ def build_tuner(entry: TunerEntry) -> Tuner:
     # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
     except (TypeError, ValueError) as error:
         raise InputError(f"tuner {entry.label}: {error}") from None
-
-
-def get_weights_folder() -> Path:
-    """Return the folder of trained weights: $SIMGAP_CACHE, else simgap/ in the user's cache."""
-    if os.environ.get("SIMGAP_CACHE"):
-        return Path(os.environ["SIMGAP_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
 
 
 TRAINING_IRRELEVANT_KEYS = {
@@ -452,38 +418,7 @@ def _check_weights(request: TrainingRequest, path: Path) -> None:
 
 
 def _make_weights_error(path: Path, entry: TunerEntry, reason: object) -> WeightsError:
-    return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {_RETRAIN_ADVICE}")
-
-
-def write_weights(
-    path: Path, state: Mapping[str, Array], simulations: int, seconds: float
-) -> TrainingResult:
-    """Write a file atomically, because several processes may train the same tuner.
-
-    Args:
-        path: path of the NumPy archive, named by the training key.
-        state: weights by name.
-        simulations: number of simulations of the training.
-        seconds: duration of the training in seconds.
-
-    Raises:
-        RunEndedError: an array has a name that is reserved.
-    """
-    # These names are arguments of `np.savez` or reserved in the file.
-    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY_ARRAY} & set(state)
-    if reserved:
-        raise RunEndedError(
-            "crashed", f"the trained state has arrays with the reserved names {reserved}"
-        )
-    # The key is stored with the weights, so that an exchanged file is detected.
-    metadata = {
-        _COST_ARRAY: np.array([simulations, seconds]),
-        _KEY_ARRAY: np.frombuffer(path.stem.encode(), dtype=np.uint8),
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_replacement(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **state, **metadata)
-    return TrainingResult(path, simulations, seconds)
+    return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {RETRAIN_ADVICE}")
 
 
 def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
@@ -498,68 +433,3 @@ def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
     except ValueError as error:
         raise _make_weights_error(path, entry, error) from None
     return tuner
-
-
-def read_weights(path: Path) -> dict[str, Array]:
-    """Read the weights of a file.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another training.
-    """
-    state = _read_checked_arrays(path)
-    del state[_COST_ARRAY], state[_KEY_ARRAY]
-    return state
-
-
-def read_training_cost(path: Path) -> TrainingResult:
-    """Read the cost of the training whose weights a file has.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another training.
-    """
-    simulations, seconds = _read_checked_arrays(path)[_COST_ARRAY]
-    return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
-
-
-def _read_checked_arrays(path: Path) -> dict[str, Array]:
-    """Read and check the arrays of a weights file.
-
-    The file has the weights, the cost of the training (two numbers) and its key, which must be the
-    name of the file. Nothing is unpickled.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another training.
-    """
-    try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = {member: file[member] for member in file.files}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-        KeyError,
-        AttributeError,
-    ):
-        raise WeightsError(
-            f"{path}: expected trained weights, found none or a damaged file; {_RETRAIN_ADVICE}"
-        ) from None
-    counts, stored_key = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY_ARRAY, np.empty(0))
-    if (
-        counts.shape != (2,)
-        or counts.dtype != np.float64
-        or stored_key.dtype != np.uint8
-        or stored_key.ndim != 1
-    ):
-        raise WeightsError(
-            f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; "
-            f"{_RETRAIN_ADVICE}"
-        )
-    stored_name = stored_key.tobytes().decode("utf-8", "replace")
-    if stored_name != path.stem:
-        raise WeightsError(
-            f"{path}: expected the weights of {path.stem}, found those of {stored_name:.80}; "
-            f"{_RETRAIN_ADVICE}"
-        )
-    return arrays

@@ -29,8 +29,9 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
-from bench.benchmark.isolation.isolation_layers import describe_exit
 from bench.benchmark.isolation.linux_syscalls import set_not_dumpable
+from bench.benchmark.isolation.process_errors import describe_exit
+from bench.benchmark.isolation.resource_limits import THREAD_COUNT_VARIABLES, limit_to_one_thread
 from sims.core.simulator import InputError
 from sims.engines import describe_stepping
 
@@ -169,22 +170,6 @@ def _end_with_parent() -> None:
         connection.wait([parent.sentinel])
         # `sys.exit` would end this thread only.
         os._exit(1)
-
-
-THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables that set the number of threads of numerical libraries."""
-
-
-@contextmanager
-def limit_to_one_thread() -> Iterator[None]:
-    """Limit numerical libraries to one thread within the block, as in a worker."""
-    from threadpoolctl import threadpool_limits
-
-    # The variables are for libraries loaded within the block; threadpoolctl limits loaded ones.
-    for name in THREAD_COUNT_VARIABLES:
-        os.environ.setdefault(name, "1")
-    with threadpool_limits(limits=1):
-        yield
 
 
 HARD_LIMIT_GRACE_SECONDS = 30.0

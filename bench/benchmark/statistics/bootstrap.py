@@ -1,4 +1,6 @@
-"""Percentile-bootstrap intervals over targets (Efron & Tibshirani 1993, ch. 13).
+"""Resamples of targets, and percentile-bootstrap intervals over targets.
+
+Source: B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, ch. 13.
 
 A resample is represented by the number of times that it contains each target. A mean is then a
 weighted mean, and a median is found by counting along the sorted values, once for all resamples.
@@ -115,3 +117,31 @@ def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
         )
         medians[:] = 0.5 * (column[order[lower]] + column[order[upper]])
     return resampled_medians
+
+
+RESAMPLES = 1000
+"""Number of resamples of a 95 % interval."""
+
+
+def draw_target_resamples(targets: int, *names: str) -> NDArray[np.int64]:
+    """Draw target indices with replacement, from a random stream that depends on names only.
+
+    Tuners that share the targets get the same draws.
+
+    Args:
+        targets: number of targets.
+        names: names that determine the random stream.
+
+    Returns:
+        (RESAMPLES, targets) indices.
+    """
+    return make_rng("resample", *names).integers(targets, size=(RESAMPLES, targets))
+
+
+def compute_percentile_interval(values: Array) -> tuple[float, float]:
+    """Return the 95 % percentile interval of resampled values, which may be infinite."""
+    # Order statistics are used without interpolation, because values may be infinite.
+    ordered = np.sort(values)
+    n = len(ordered)
+    lower, upper = (share * (n - 1) for share in INTERVAL_QUANTILES)
+    return float(ordered[int(lower)]), float(ordered[int(np.ceil(upper))])

@@ -16,7 +16,6 @@ from bench.benchmark.statistics.error_curves import (
     build_error_table,
     compute_median_curves,
     compute_medians_by_distance,
-    find_coinciding_curves,
     select_primary_metric,
 )
 from bench.benchmark.statistics.expected_running_time import (
@@ -34,7 +33,6 @@ from bench.benchmark.statistics.training_amortisation import (
     find_cheapest_tuners,
 )
 from bench.benchmark.statistics.tuner_ranking import (
-    format_failure_notes,
     rank_after_budget,
     rank_tuners,
 )
@@ -138,28 +136,13 @@ class ComparisonStatistics:
     def notes(self) -> dict[str, str]:
         """Notes of legends and tables about tuners with failed runs, by tuner."""
         failed = pd.Series(self._all_runs.failed).groupby(self._all_runs.keys["tuner"], sort=False)
-        return format_failure_notes(
-            {str(t): (int(is_failed.sum()), len(is_failed)) for t, is_failed in failed}
-        )
-
-    def find_coinciding_curves(self, panels: Sequence[tuple[str, str]]) -> dict[str, str]:
-        """Find tuners whose curves are hidden below another curve.
-
-        Args:
-            panels: metric and range of each panel of curves.
-
-        Returns:
-            Note by tuner, such as ``same as hybrid up to 2``.
-        """
-        curves_by_tuner: dict[str, list[pd.Series[float]]] = {}
-        for metric, kind in panels:
-            for tuner, line in self.compute_median_curves(metric, kind).groupby(
-                "tuner", sort=False
-            ):
-                curves_by_tuner.setdefault(str(tuner), []).append(
-                    line.set_index("simulations")["median"]
-                )
-        return find_coinciding_curves(curves_by_tuner)
+        return {
+            str(tuner): "all runs failed"
+            if is_failed.all()
+            else f"{is_failed.sum()} of {len(is_failed)} runs failed"
+            for tuner, is_failed in failed
+            if is_failed.any()
+        }
 
     def get_error_floor(self, metric: str) -> float | None:
         """Return the error below which tuners count as equal, in the unit of a metric.

@@ -381,8 +381,6 @@ _BOOTSTRAP_RESAMPLES = 500
 """Number of bootstrap resamples; enough for an interval band a few pixels wide."""
 _CURVE_POINT_COUNT = 40
 """Number of points of a curve, on a logarithmic scale of simulations."""
-_MAX_INVISIBLE_DIFFERENCE = 0.02
-"""Relative difference of errors that is not visible on a logarithmic axis."""
 _DISTANCE_CHECKPOINTS = (3, 10)
 """Numbers of simulations for plots of error against distance, in addition to the whole budget."""
 
@@ -432,62 +430,6 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
         columns = (tuner, points, np.median(lines, axis=0), low, high, len(lines))
         tables.append(pd.DataFrame(dict(zip(MEDIAN_COLUMNS, columns, strict=True))))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=MEDIAN_COLUMNS)
-
-
-def find_coinciding_curves(
-    curves_by_tuner: Mapping[str, Sequence[pd.Series[float]]],
-) -> dict[str, str]:
-    """Find curves that cannot be seen because another one is drawn above them.
-
-    A reader would miss a tuner in the figure, so a note names the tuner that covers it. A curve
-    coincides with a later one up to k simulations if the two differ by less than
-    `_MAX_INVISIBLE_DIFFERENCE` in every panel up to k, and if the error has halved by then. Before
-    that most tuners are equal.
-
-    Args:
-        curves_by_tuner: curves of each tuner in drawing order, one per panel: medians by number of
-            simulations.
-
-    Returns:
-        Note by tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
-    """
-    notes = {}
-    names = list(curves_by_tuner)
-    for place, name in enumerate(names):
-        longest = 0
-        for upper_name in names[place + 1 :]:
-            if len(curves_by_tuner[upper_name]) != len(curves_by_tuner[name]):
-                continue
-            pairs = list(zip(curves_by_tuner[name], curves_by_tuner[upper_name], strict=True))
-            upto = min(
-                _count_equal_simulations(hidden_curve, upper_curve)
-                for hidden_curve, upper_curve in pairs
-            )
-            has_progress = any(
-                (hidden_curve.loc[:upto] < 0.5 * hidden_curve.iloc[0]).any()
-                for hidden_curve, _ in pairs
-            )
-            if upto > longest and has_progress:
-                longest = upto
-                is_complete = all(upto == hidden_curve.index[-1] for hidden_curve, _ in pairs)
-                notes[name] = f"same as {upper_name}" + ("" if is_complete else f" up to {upto}")
-    return notes
-
-
-def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) -> int:
-    """Return the largest number of simulations up to which two curves look the same; 0 for none.
-
-    Args:
-        first: errors, by number of simulations.
-        second: errors of another tuner, by number of simulations.
-    """
-    points = first.index.intersection(second.index)
-    first_errors, second_errors = first[points].to_numpy(), second[points].to_numpy()
-    is_equal = np.logical_and.accumulate(
-        np.abs(first_errors - second_errors)
-        <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(first_errors, second_errors)
-    )
-    return int(points[is_equal][-1]) if is_equal.any() else 0
 
 
 def compute_medians_by_distance(
@@ -567,22 +509,3 @@ def _compute_median_with_interval(
         values[:, None], compute_resampled_medians, *names, resamples=_BOOTSTRAP_RESAMPLES
     )
     return float(np.median(values)), float(low[0]), float(high[0])
-
-
-def format_bin_labels(table: pd.DataFrame) -> list[str]:
-    """Return labels of the groups of `compute_medians_by_distance`, with numbers of targets.
-
-    Args:
-        table: Result of `compute_medians_by_distance`, with the limits of each bin.
-    """
-    first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
-    names = []
-    for bin_index in range(max(first, default=0) + 1):
-        row = first.get(bin_index)
-        if row is None:
-            names.append("inside\nn=0")
-            continue
-        limits = [f"{row[end]:.2f}" for end in ("beyond", "to")]
-        name = "–".join(dict.fromkeys(limits)) if bin_index else "inside"
-        names.append(f"{name}\nn={row['targets']}")
-    return names

@@ -18,15 +18,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
+from bench.benchmark.statistics.bootstrap import (
+    compute_percentile_interval,
+    draw_target_resamples,
+)
 from bench.benchmark.statistics.error_curves import RunCurves, select_checkpoints
-from bench.core.random_streams import make_rng
 from sims.core.simulator import Array
 
 RUNTIME_THRESHOLDS: Array = np.logspace(0, -8, 51)
 """Thresholds of the runtime distribution in widths of the training range; 51 as in COCO."""
-RESAMPLES = 1000
-"""Number of resamples of a 95 % interval."""
 ERT_TARGET_LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 """Thresholds of the ERT table in widths of the training range."""
 
@@ -160,30 +160,6 @@ def compute_effort(
         np.array([success[rows].sum() for rows in groups]),
         len(simulations),
     )
-
-
-def draw_target_resamples(targets: int, *names: str) -> NDArray[np.int64]:
-    """Draw target indices with replacement, from a random stream that depends on names only.
-
-    Tuners that share the targets get the same draws.
-
-    Args:
-        targets: number of targets.
-        names: names that determine the random stream.
-
-    Returns:
-        (RESAMPLES, targets) indices.
-    """
-    return make_rng("resample", *names).integers(targets, size=(RESAMPLES, targets))
-
-
-def compute_percentile_interval(values: Array) -> tuple[float, float]:
-    """Return the 95 % percentile interval of resampled values, which may be infinite."""
-    # Order statistics are used without interpolation, because values may be infinite.
-    ordered = np.sort(values)
-    n = len(ordered)
-    lower, upper = (share * (n - 1) for share in INTERVAL_QUANTILES)
-    return float(ordered[int(lower)]), float(ordered[int(np.ceil(upper))])
 
 
 ERT_COLUMNS = [

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -84,28 +84,6 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
             part["p_holm"] = correct_holm(part["p_value"].to_numpy())
             tables.append(part)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=PAIR_COLUMNS)
-
-
-def compute_proportion_interval(
-    hits: int, trials: int, method: Literal["wilson", "exact"] = "wilson"
-) -> tuple[float, float]:
-    """Compute the 95 % interval of a proportion.
-
-    Args:
-        hits: number of successes.
-        trials: number of trials.
-        method: ``wilson`` for the score interval (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
-            doi:10.2307/2276774), ``exact`` for that of Clopper and Pearson.
-
-    Returns:
-        Lower and upper bound; NaN without trials.
-    """
-    from scipy.stats import binomtest
-
-    if trials < 1:
-        return float("nan"), float("nan")
-    interval = binomtest(hits, trials).proportion_ci(0.95, method=method)
-    return float(interval.low), float(interval.high)
 
 
 def correct_holm(p: Array) -> Array:

@@ -17,13 +17,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bench.benchmark.statistics.bootstrap import compute_percentile_interval, draw_target_resamples
 from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.expected_running_time import (
-    ThresholdEffort,
-    compute_effort,
-    compute_percentile_interval,
-    draw_target_resamples,
-)
+from bench.benchmark.statistics.expected_running_time import ThresholdEffort, compute_effort
 from sims.core.simulator import Array
 
 BREAK_EVEN_COLUMNS = [

@@ -31,7 +31,7 @@ Bootstrap Tests of Hypotheses, 2005, ch. 3.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -224,24 +224,6 @@ def _compute_median_error(logs: pd.Series[float]) -> float:
     """Return the median error; infinite if half of the targets failed."""
     middle = float(logs.median())
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
-
-
-def format_failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
-    """Build the notes that follow the names of tuners with failed runs.
-
-    Args:
-        failed: (failed runs, runs) by tuner.
-
-    Returns:
-        Note by tuner with failed runs.
-    """
-    return {
-        tuner: "all runs failed"
-        if failure_count == runs
-        else f"{failure_count} of {runs} runs failed"
-        for tuner, (failure_count, runs) in failed.items()
-        if failure_count
-    }
 
 
 MIN_PROBLEMS_FOR_RANKS = 5

@@ -1,4 +1,4 @@
-"""Folder of a comparison: configuration, versions, machine, statuses of runs, and secret salt.
+"""Folder of a comparison: configuration, versions, machine, and statuses of runs.
 
 While runs are missing, the salt is in a separate file that only its owner can read; when the study
 is complete, it is in experiment.toml.
@@ -26,12 +26,6 @@ from bench.benchmark.storage.table_schemas import (
     RUN_COLUMNS,
     STATUS_COLUMNS,
     Columns,
-)
-from bench.core.random_streams import (
-    PUBLIC_SALT,
-    check_commitment,
-    compute_commitment,
-    generate_salt,
 )
 from sims.core.files import (
     atomic_new_folder,
@@ -106,7 +100,7 @@ def create_folder(
         folder: Path of a new or empty folder.
         configuration: Its configuration.
         jobs: Planned number of worker processes.
-        secret: Salt from which its targets are drawn; see `bench.benchmark.storage.result_folder`.
+        secret: Salt from which its targets are drawn; see `bench.benchmark.storage.secret_salt`.
         seals: Isolation layers that are available for its tuners on this machine.
         redraws: Number of targets that were drawn again; None for studies without such targets.
 
@@ -344,66 +338,3 @@ def _compute_training_costs(training: pd.DataFrame) -> dict[str, tuple[float, fl
         str(name): (float(row[0]), float(row[1]))
         for name, row in zip(mean_costs.index, values, strict=True)
     }
-
-
-def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Experiment, str | None]:
-    """Draw or take the secret salt of a new study, and commit to it by its hash.
-
-    The salt determines the random targets. As long as it is secret, no tuner can be made for these
-    targets; its hash proves afterwards that it was not chosen after the results.
-
-    Args:
-        experiment: The experiment; a salt in it is public.
-        salt: Salt given by the user; None for a fresh one.
-
-    Returns:
-        The experiment with the secret's hash, and the secret; None if the salt is public.
-
-    Raises:
-        InputError: Two salts were given, or an invalid one.
-    """
-    if experiment.salt and salt not in (None, experiment.salt):
-        raise InputError(
-            f"experiment {experiment.name}: states a public salt; leave out the salt, or "
-            "remove it from the experiment"
-        )
-    if experiment.salt or salt == PUBLIC_SALT:
-        return experiment.chosen(salt=experiment.salt or PUBLIC_SALT, salt_sha256=""), None
-    secret = generate_salt() if salt is None else salt
-    if not secret:
-        raise InputError("salt: expected a text, found none; leave it out for a fresh one")
-    check_commitment("salt", secret, "")
-    return experiment.chosen(salt_sha256=compute_commitment(secret)), secret
-
-
-def read_salt(folder: Path, experiment: Experiment) -> str | None:
-    """Read the secret salt of a study to be resumed; None if it is public or revealed.
-
-    Raises:
-        InputError: It is missing, or differs from the committed one.
-    """
-    if experiment.salt or not experiment.salt_sha256:
-        return None
-    path = folder / SEGMENTS_FOLDER / SALT_FILE
-    try:
-        secret = path.read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        raise InputError(
-            f"{path}: expected the salt that the targets are drawn from, found none; restore it, "
-            "or start a new comparison"
-        ) from None
-    check_commitment(str(path), secret, experiment.salt_sha256)
-    return secret
-
-
-def reveal_salt(folder: Path, secret: str | None) -> None:
-    """Write the salt to experiment.toml, since the study is complete.
-
-    Args:
-        folder: Folder of the study.
-        secret: The salt; None if it is public, then nothing is done.
-    """
-    if secret is None:
-        return
-    write_configuration(folder, read_configuration(folder).experiment.chosen(salt=secret))
-    (folder / SEGMENTS_FOLDER / SALT_FILE).unlink(missing_ok=True)

@@ -23,7 +23,7 @@ from bench.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from bench.benchmark.runner.stored_study import Study
+    from bench.benchmark.runner.study_base import Study
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.run_status import StudyOutcome
 

@@ -38,7 +38,7 @@ def collect_info() -> JsonDocument:
     import platform
 
     from bench import __version__
-    from bench.benchmark.runner.tuner_training import get_weights_folder
+    from bench.benchmark.runner.trained_weights import get_weights_folder
     from bench.core.resource_estimates import count_available_cores
     from bench.datasets.dataset_catalogue import get_user_folder
 

@@ -10,7 +10,7 @@ from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDo
 from bench.cli.shared_options import parse_path
 
 if TYPE_CHECKING:
-    from bench.benchmark.runner.stored_study import Study
+    from bench.benchmark.runner.study_base import Study
     from bench.benchmark.storage.run_status import RunEnd, StudyProgress
 
 _MAX_LISTED_RUNS = 20

@@ -21,7 +21,7 @@ from bench.diagnosis.validation.run_consistency import (
     CovariateKind,
     ParameterConsistency,
 )
-from bench.pages.page_table import IntervalDrawing, draw_intervals
+from bench.pages.interval_drawing import IntervalDrawing, draw_intervals
 from bench.pages.template import render_text
 
 _TEMPLATE = Path(__file__).with_name("consistency.txt")

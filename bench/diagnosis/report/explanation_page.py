@@ -57,7 +57,8 @@ from bench.figures.figure_output import FigureFiles
 from bench.figures.style import shorten_name
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
-from bench.pages.page_table import Table, draw_intervals
+from bench.pages.interval_drawing import draw_intervals
+from bench.pages.page_table import Table
 from sims import effects
 from sims.core.simulator import Array, InputError
 

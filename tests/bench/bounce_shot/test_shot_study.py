@@ -12,10 +12,10 @@ from scipy.stats import binomtest
 
 from bench.api.compare import ComparisonResult
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
-from bench.benchmark.statistics.paired_tests import compute_proportion_interval
+from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.bounce_shot import shot_study, tuned_shots
 from bench.bounce_shot.drop_recording import record_drop
 from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table

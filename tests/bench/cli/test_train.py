@@ -10,10 +10,10 @@ import tomli_w
 
 from bench.api.train import DEFAULT_EXPERIMENTS, LossRecorder, default_experiment, select_training
 from bench.benchmark.problem.experiment import TunerEntry, list_experiment_names, load_experiment
+from bench.benchmark.runner.trained_weights import WeightsError
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
-    WeightsError,
     compute_training_key,
     load_trained_tuner,
     train_or_load,

@@ -12,13 +12,14 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.isolation.isolation_layers import KilledExternallyError
-from bench.benchmark.isolation.tuner_processes import create_locked_folder, remove_stale_folders
+from bench.benchmark.isolation.process_errors import KilledExternallyError
+from bench.benchmark.isolation.temporary_folders import create_locked_folder, remove_stale_folders
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import tuner_process_reuse
+from bench.benchmark.runner import retry_after_kill, tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
-from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
+from bench.benchmark.runner.trained_weights import read_weights
+from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from sims.core.simulator import InputError
 from tests.kill_and_resume import ISOLATION_PROCESSES, below
 from tests.sample_experiments import spring_experiment
@@ -132,7 +133,7 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
     monkeypatch.setattr(tuner_process_reuse, "_find_active_layers", looked)
     # Call the undecorated function, because another test may have cached its result.
     look = tuner_process_reuse.list_active_isolation_layers.__wrapped__
-    if kills < tuner_process_reuse.MAX_RETRIES:
+    if kills < retry_after_kill.MAX_RETRIES:
         assert look() == ("process",)
     else:
         with pytest.raises(
@@ -143,7 +144,7 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
 
 ALONE = """
 import sys, time
-from bench.benchmark.runner import tuner_process_reuse
+from bench.benchmark.runner import retry_after_kill, tuner_process_reuse
 tuner_process_reuse.get_fork_server()
 print("there", flush=True)
 time.sleep(60)

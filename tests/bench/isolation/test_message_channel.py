@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.benchmark.isolation.fork_server import EXIT_CODE
-from bench.benchmark.isolation.isolation_layers import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     Message,
     MessageChannel,
@@ -23,6 +22,7 @@ from bench.benchmark.isolation.message_channel import (
     to_printable,
     unpack_arrays,
 )
+from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess
 
 HEAD = struct.Struct("<cBxxIQ")

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.isolation.isolation_layers import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.process_errors import KilledExternallyError, RunEndedError
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
+from bench.benchmark.runner.trained_weights import read_weights
+from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.core.plugin_registries import tuners
 from methods.tuner import Tuner
 from tests.bench.isolation.isolated_process import make_training_request

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
-from bench.benchmark.runner.tuner_training import WeightsError
+from bench.benchmark.runner.trained_weights import WeightsError
 from bench.core.plugin_registries import tuners
 from methods.tuner import Tuner
 from tests.sample_experiments import spring_experiment

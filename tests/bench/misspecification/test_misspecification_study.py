@@ -21,16 +21,15 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.problem.recording_observations import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores
-from bench.misspecification.calibration import (
-    MODEL_LABELS,
+from bench.misspecification.calibration import MODEL_LABELS, write_calibration_recording
+from bench.misspecification.misspecification_study import (
+    MisspecificationStudy,
     make_base_experiment,
     make_extended_experiment,
-    write_calibration_recording,
 )
-from bench.misspecification.misspecification_study import MisspecificationStudy
 from bench.studies.study import begin_studies, get_study_class
 from sims import extended_simulator as extending
 from sims.core.simulator import InputError

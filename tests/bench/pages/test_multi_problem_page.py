@@ -6,7 +6,7 @@ import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.paired_tests import compute_proportion_interval
+from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.statistics.tuner_ranking import MIN_PROBLEMS_FOR_RANKS
 from bench.bounce_shot.hit_rate_table import build_result_table
 from bench.bounce_shot.shot_report import render_page

@@ -15,7 +15,7 @@ from bench.benchmark.problem.fisher_information import (
     compute_spectrum_from_jacobian,
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.statistics.error_curves import select_primary_metric
 from bench.benchmark.storage.result_folder import read_comparison
 from sims.core.simulator import InputError, Parameter

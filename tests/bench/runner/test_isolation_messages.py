@@ -5,9 +5,9 @@ import csv
 import pytest
 import tomli_w
 
-from bench.benchmark.isolation.isolation_layers import ISOLATION_NOTE
+from bench.benchmark.isolation.process_errors import ISOLATION_NOTE
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner.run_scoring import Notes
+from bench.benchmark.runner.tuner_author_notes import Notes
 from bench.cli.main import main
 from tests.bench.isolation.isolated_process import experiment, need, outcome
 from tests.command_output import run_command
@@ -64,7 +64,7 @@ def test_a_trusted_tuner_gets_no_message_about_isolation(tmp_path, capsys, monke
 def test_slow_imports_are_measured_and_a_shared_process_suggested(
     isolation, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("bench.benchmark.runner.run_scoring.SLOW_IMPORTS", 0.25)
+    monkeypatch.setattr("bench.benchmark.runner.tuner_author_notes.SLOW_IMPORTS", 0.25)
     slow = tmp_path / "slow.py"
     text = (PLUGINS / "isolated.py").read_text()
     slow.write_text(f"import time\n\ntime.sleep(0.3)\n{text[text.index('import') :]}")

@@ -12,7 +12,7 @@ from bench.benchmark.problem.experiment import parse_experiment
 from bench.benchmark.problem.recording_observations import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.benchmark.storage.run_journal import (
     RunJournal,

@@ -9,7 +9,7 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.isolation.isolation_layers import limited_memory
+from bench.benchmark.isolation.resource_limits import limited_memory
 from bench.benchmark.runner.plugin_discovery import Plugin
 from bench.benchmark.runner.worker_pools import (
     MAX_RETRIES,

@@ -6,14 +6,12 @@ from scipy.stats import bootstrap
 
 from bench.benchmark.statistics.bootstrap import (
     compute_bootstrap_interval,
+    compute_percentile_interval,
     compute_resampled_means,
     compute_resampled_medians,
 )
 from bench.benchmark.statistics.error_curves import build_error_table
-from bench.benchmark.statistics.expected_running_time import (
-    build_ert_table,
-    compute_percentile_interval,
-)
+from bench.benchmark.statistics.expected_running_time import build_ert_table
 from bench.core.random_streams import make_rng
 from tests.bench.statistics.test_error_table import at, runs_of, statuses_of
 from tests.bench.statistics.test_statistics import curves_of

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.statistics.error_curves import RunRowTable
 from bench.benchmark.statistics.expected_running_time import (
     ThresholdEffort,

@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.statistics.error_curves import RunCurves, find_coinciding_curves
+from bench.benchmark.comparison_charts import find_coinciding_curves
+from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.tuner_ranking import (
     compute_min_targets,
     list_ranking_points,

@@ -10,7 +10,7 @@ from pyarrow import parquet
 from bench.api.compare import ComparisonResult
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import run_experiment
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.statistics.error_curves import ERROR_TABLE_COLUMNS
 from bench.benchmark.storage.result_folder import read_checked_comparison, read_comparison
 from bench.benchmark.storage.run_journal import RunJournal, read_plan

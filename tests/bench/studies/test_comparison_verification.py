@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.runner.stored_study import prepare_study
+from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.figures.style import TRUSTED_TUNERS_NOTE
 from tests.command_output import run_command

@@ -8,14 +8,9 @@ import pandas as pd
 import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
-from bench.suite.suite_page import (
-    LOSS_FACTOR,
-    build_guide,
-    build_headline,
-    describe_losses,
-)
+from bench.suite.suite_page import LOSS_FACTOR, build_headline, describe_losses
 from bench.suite.suite_runs import RUN_KEYS, read_suite_runs
-from bench.suite.suite_statistics import FREE, SuiteTables
+from bench.suite.suite_statistics import FREE, SuiteTables, build_guide
 
 FOLDER = Path(__file__).parents[3] / "results" / "reference" / "suite"
 

@@ -7,15 +7,13 @@ import pandas as pd
 import pytest
 
 from bench.suite.suite_page import (
-    build_guide,
     build_headline,
-    choose_segments,
     describe_losses,
     describe_tests,
     join_segments,
     render_suite_page,
 )
-from bench.suite.suite_statistics import COUNTED, FREE, SuiteTables
+from bench.suite.suite_statistics import COUNTED, FREE, SuiteTables, build_guide, choose_segments
 from tests.bench.suite.synthetic_suite import BUDGET, make_suite, power_law
 
 CELLS = [f"problem-{number}" for number in range(8)]

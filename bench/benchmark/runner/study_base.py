@@ -14,10 +14,7 @@ from bench.benchmark.storage.result_folder import (
     FolderConfiguration,
     choose_free_folder,
     create_folder,
-    draw_salt_if_needed,
     read_configuration,
-    read_salt,
-    reveal_salt,
 )
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
@@ -25,6 +22,7 @@ from bench.benchmark.storage.run_status import (
     StudyOutcome,
     StudyProgress,
 )
+from bench.benchmark.storage.secret_salt import draw_salt_if_needed, read_salt, reveal_salt
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -191,7 +189,7 @@ class PreparedStudy(NamedTuple):
         Raises:
             InputError: workers could not load a class that the study needs.
         """
-        from bench.benchmark.runner.experiment_runner import check_classes_importable
+        from bench.benchmark.runner.plugin_discovery import check_classes_importable
         from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 
         # This comes before the folder is created, so that a user error leaves no files behind.

@@ -1,0 +1,79 @@
+"""Secret salt of a study: draw it, commit to it by its hash, and reveal it when all is complete."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.storage.result_folder import SALT_FILE, read_configuration, write_configuration
+from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
+from bench.core.random_streams import (
+    PUBLIC_SALT,
+    check_commitment,
+    compute_commitment,
+    generate_salt,
+)
+from sims.core.simulator import InputError
+
+
+def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Experiment, str | None]:
+    """Draw or take the secret salt of a new study, and commit to it by its hash.
+
+    The salt determines the random targets. As long as it is secret, no tuner can be made for these
+    targets; its hash proves afterwards that it was not chosen after the results.
+
+    Args:
+        experiment: The experiment; a salt in it is public.
+        salt: Salt given by the user; None for a fresh one.
+
+    Returns:
+        The experiment with the secret's hash, and the secret; None if the salt is public.
+
+    Raises:
+        InputError: Two salts were given, or an invalid one.
+    """
+    if experiment.salt and salt not in (None, experiment.salt):
+        raise InputError(
+            f"experiment {experiment.name}: states a public salt; leave out the salt, or "
+            "remove it from the experiment"
+        )
+    if experiment.salt or salt == PUBLIC_SALT:
+        return experiment.chosen(salt=experiment.salt or PUBLIC_SALT, salt_sha256=""), None
+    secret = generate_salt() if salt is None else salt
+    if not secret:
+        raise InputError("salt: expected a text, found none; leave it out for a fresh one")
+    check_commitment("salt", secret, "")
+    return experiment.chosen(salt_sha256=compute_commitment(secret)), secret
+
+
+def read_salt(folder: Path, experiment: Experiment) -> str | None:
+    """Read the secret salt of a study to be resumed; None if it is public or revealed.
+
+    Raises:
+        InputError: It is missing, or differs from the committed one.
+    """
+    if experiment.salt or not experiment.salt_sha256:
+        return None
+    path = folder / SEGMENTS_FOLDER / SALT_FILE
+    try:
+        secret = path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        raise InputError(
+            f"{path}: expected the salt that the targets are drawn from, found none; restore it, "
+            "or start a new comparison"
+        ) from None
+    check_commitment(str(path), secret, experiment.salt_sha256)
+    return secret
+
+
+def reveal_salt(folder: Path, secret: str | None) -> None:
+    """Write the salt to experiment.toml, since the study is complete.
+
+    Args:
+        folder: Folder of the study.
+        secret: The salt; None if it is public, then nothing is done.
+    """
+    if secret is None:
+        return
+    write_configuration(folder, read_configuration(folder).experiment.chosen(salt=secret))
+    (folder / SEGMENTS_FOLDER / SALT_FILE).unlink(missing_ok=True)
