@@ -15,7 +15,7 @@ from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_results, write_bundle
 from bench.studies.study import begin_studies, report_jointly
-from bench.suite import suite_page
+from bench.suite import suite_runs
 from bench.suite.suite_runs import read_suite_runs, write_suite_runs
 from sims.core.simulator import InputError
 
@@ -173,7 +173,7 @@ def small_suite(tmp_path):
 @pytest.mark.usefixtures("undrawn")
 def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_suite, monkeypatch):
     reference = tmp_path / "reference"
-    monkeypatch.setattr(suite_page, "REFERENCE_FOLDERS", (reference,))
+    monkeypatch.setattr(suite_runs, "REFERENCE_FOLDERS", (reference,))
     stored = small_suite.with_tuners(["random", "least_squares"]).chosen(trusted=True)
     printed = run_suite(stored, tmp_path / "stored")
     assert "Use " in printed
@@ -206,7 +206,7 @@ def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_su
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_cell_comes_out_again_with_its_salt(tmp_path, small_suite, monkeypatch):
-    monkeypatch.setattr(suite_page, "REFERENCE_FOLDERS", ())
+    monkeypatch.setattr(suite_runs, "REFERENCE_FOLDERS", ())
     for number in range(2):
         chosen = small_suite.with_tuners(["random", "cma_es"]).chosen(trusted=True, salt="again")
         run_suite(chosen, tmp_path / str(number))
