@@ -146,7 +146,7 @@ class ForkServerClient:
             child_control.close()
             os.close(child_reading)
             os.close(child_writing)
-        return IsolatedProcess(self, control, MessageChannel(reading, writing))
+        return IsolatedProcess(MessageChannel(reading, writing), control, self.empty_shared_folder)
 
     def empty_shared_folder(self) -> None:
         """Delete the content of the folder that processes without their own folder share."""

@@ -6,11 +6,11 @@ import contextlib
 import json
 import signal
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,6 @@ from bench.benchmark.isolation.process_errors import (
     with_isolation,
 )
 from methods.tuner import Array, Proposal, Task, TunerGenerator
-
-if TYPE_CHECKING:
-    from bench.benchmark.isolation.fork_server_client import ForkServerClient
 
 START_TIMEOUT_SECONDS = 60.0
 """Timeout in seconds for the start of a process and for building a tuner."""
@@ -84,14 +81,22 @@ class IsolatedProcess:
     """
 
     def __init__(
-        self, server: ForkServerClient, control: socket.socket, channel: MessageChannel
+        self,
+        channel: MessageChannel,
+        control: socket.socket,
+        empty_shared_folder: Callable[[], None],
     ) -> None:
         """Store the connections to a process.
 
-        `channel` carries the messages of the tuner. `control` is the socket to its supervisor, the
-        parent process that reports its exit code, and kills it when the socket is closed.
+        Args:
+            channel: channel for the messages of the tuner.
+            control: socket to the supervisor, the parent of the process: it reports the exit code
+                of the process, and kills it when this socket is closed.
+            empty_shared_folder: deletes the content of the folder that processes share if the
+                kernel does not permit a folder of their own.
         """
-        self._server, self._control, self.channel = server, control, channel
+        self.channel, self._control = channel, control
+        self._empty_shared_folder = empty_shared_folder
         self._open = True
         self.seals: list[str] = []
 
@@ -137,7 +142,7 @@ class IsolatedProcess:
             self._wait_for_exit_code(START_TIMEOUT_SECONDS)
         self._control.close()
         if "disk" not in self.seals:
-            self._server.empty_shared_folder()
+            self._empty_shared_folder()
         return code
 
     def _wait_for_exit_code(self, seconds: float) -> int | None:

@@ -124,17 +124,10 @@ def test_two_messages_at_once_are_foul(ends):
         ends.channel.receive()
 
 
-class Server:
-    """Stand-in for a fork server."""
-
-    def empty_shared_folder(self):
-        pass
-
-
 def test_an_answer_before_the_question_ends_the_run(ends):
     copies = (os.dup(one) for one in (ends.channel._reading, ends.channel._writing))
     control, supervisor = socket.socketpair()
-    child = IsolatedProcess(Server(), control, MessageChannel(*copies))
+    child = IsolatedProcess(MessageChannel(*copies), control, lambda: None)
     child.send(b"E", deadline=soon())
     ends.write_bytes(HEAD.pack(b"A", 0, 1, 8) + bytes(8))
     supervisor.send(EXIT_CODE.pack(-9))
