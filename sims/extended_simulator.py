@@ -18,6 +18,7 @@ from typing import Any, Literal
 from sims import effects as library
 from sims.core import files
 from sims.core.document_fields import OPTIONAL
+from sims.core.effect import make_effect_parameters
 from sims.core.simulator import InputError, Parameter, Simulator
 from sims.core.toml_validation import (
     check_finite,
@@ -30,7 +31,7 @@ from sims.core.toml_validation import (
 )
 from sims.robot import robot_reference
 from sims.robot.robot_reference import RobotReference
-from sims.system_simulator import SystemSimulator, make_effect_parameters
+from sims.system_simulator import SystemSimulator
 
 FORMAT_VERSION = 1
 """Version of the file format; files with another version are refused."""

@@ -15,12 +15,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sims.core.argument_checks import check_positive
 from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect, Level
-from sims.core.engine import Engine, check_positive
+from sims.core.engine import Engine
 from sims.core.simulator import Array, InputError
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
+from sims.effects.state_limits import find_level_effect, make_level_effects
 from sims.engines.external.bullet_world import import_pybullet
-from sims.own_simulator_engine import OwnSimulatorEngine, find_level_effect, make_level_effects
+from sims.own_simulator_engine import OwnSimulatorEngine
 from sims.system_simulator import SystemSimulator
 
 

@@ -19,29 +19,24 @@ from sims.core.effect import (
     Input,
     Level,
     Sensor,
-    Signal,
+    make_effect_parameters,
 )
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
-from sims.core.plain_values import is_plausible_number
 from sims.core.simulation_counter import SIMULATION_COUNTER
 from sims.core.simulator import Array, Indices, InputError, Parameter, Scenario, Simulator
 from sims.core.system import System
 from sims.core.toml_validation import format_value
-from sims.engines import HIDDEN_STATE_ENGINES, make_engine
-from sims.engines.step_inputs import compute_applied_inputs
-from sims.engines.time_grid import (
-    Commands,
-    ScenarioGroups,
-    TimeGrid,
-    build_time_grid,
-    group_by_identity,
-    group_scenarios,
-    is_active,
-    shifts_time,
+from sims.effects.coefficient_validation import (
+    check_coefficient_sizes,
+    check_effect_types,
+    read_coefficients,
 )
+from sims.effects.sensor_effects import apply_sensor_effects, needs_every_step
+from sims.engines.engine_lookup import HIDDEN_STATE_ENGINES, make_engine
+from sims.engines.scenario_groups import ScenarioGroups, group_by_identity, group_scenarios
+from sims.engines.step_inputs import compute_applied_inputs
+from sims.engines.time_grid import Commands, TimeGrid, build_time_grid, shifts_time
 
-MAX_COEFFICIENT_FACTOR = 1e6
-"""Factor of its largest plausible value above which a coefficient is refused as a mistake."""
 MAX_STORED_TIME_GRIDS = 8
 """Maximum number of sets of scenarios whose steps and inputs are stored."""
 MAX_STORED_NUMBERS = 2_000_000
@@ -90,10 +85,10 @@ class SystemSimulator(Simulator):
         self._declared = self.system()
         self._stored_steps: dict[tuple[object, ...], tuple[TimeGrid, dict[str, Array]]] = {}
         self.engine = self._make_engine(engine, settings)
-        _check_effect_types(effects, fixed)
+        check_effect_types(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
         self.fixed = [
-            (self._effect(name), _read_coefficients(name, value))
+            (self._effect(name), read_coefficients(name, value))
             for name, value in (fixed or {}).items()
         ]
         effect_names = [effect.name for effect in self.effects]
@@ -109,7 +104,7 @@ class SystemSimulator(Simulator):
                     f"effect {effect.name}: expected up to {len(names)} values"
                     f" ({', '.join(names)}), found {format_value(values)}"
                 )
-            _check_sizes(effect, self.system, values)
+            check_coefficient_sizes(effect, self.system, values)
         observed = [c.name for c in self.channels]
         extra: list[Parameter] = []
         for effect in self.effects:
@@ -230,7 +225,7 @@ class SystemSimulator(Simulator):
                 (effect, c) for effect, c in _select_effects(active_effects, Sensor) if c.any()
             )
             # A sensor filter needs every step; other sensor effects need the samples only.
-            filtered = any(_filters(effect) for effect, _ in sensors)
+            filtered = any(needs_every_step(effect) for effect, _ in sensors)
             steps_per_state = 1 if filtered else plan.steps_per_sample
             base_theta = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._collect_known_values(scenarios, initial)
@@ -370,7 +365,7 @@ class SystemSimulator(Simulator):
         channels = self._declared.observe(motion.x, motion.v, motion.a, batch.constants)
         names = [c.name for c in self.channels]
         valued = self.system.reading(names)
-        times = _compute_state_times(plan, batch.steps_per_sample)
+        times = plan.compute_state_times(batch.steps_per_sample)
         steps = np.diff(times, axis=1, prepend=0.0)
         # Convert the rows: with a sensor filter, more states than the samples are stored.
         sample_steps = plan.rows * (plan.steps_per_sample // batch.steps_per_sample)
@@ -378,67 +373,12 @@ class SystemSimulator(Simulator):
         for place, name in enumerate(names):
             values = channels[name]
             # A gain or bias affects one channel only.
-            reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
+            reading = tuple((e, c) for e, c in sensors if needs_every_step(e) or name == valued)
             if reading:
                 values = apply_sensor_effects(reading, values, steps, times, clock)
             observations[:, :, place] = _select_rows(values, sample_steps)
         observations += 0.0  # turn negative zeros into positive ones
         return observations
-
-
-def _filters(effect: Effect) -> bool:
-    """Return whether an effect is a sensor effect that needs every step."""
-    return isinstance(effect, Sensor) and effect.filters
-
-
-def apply_sensor_effects(
-    sensors: ActiveEffects, values: Array, steps: Array, times: Array, clock: Array | float = 0.0
-) -> Array:
-    """Apply sensor effects one after another to a channel.
-
-    Each effect gets the output of the previous one, also for the value at the start.
-
-    Shapes: L batch elements.
-
-    Args:
-        sensors: Sensor effects with their coefficients.
-        values: (L, R) values of the channel.
-        steps: (L, R) lengths of the steps before the values, s.
-        times: (L, R) times of the values since the start, s.
-        clock: (L, 1) first time stamp of each run, s.
-
-    Returns:
-        Readings (L, R).
-    """
-    values = values.copy()
-    start = values[:, :1].copy()
-    clock = np.broadcast_to(clock, start.shape)
-    for effect, c in sensors:
-        assert isinstance(effect, Sensor)
-        # An effect may be active in few of the batch elements; evaluate only these.
-        elements = np.flatnonzero(is_active(c))
-        coefficients, start_values = c[:, elements], start[elements]
-        zeros = np.zeros_like(start_values)
-        first = clock[elements]
-        signal = Signal(values[elements], steps[elements], start_values, times[elements], first)
-        values[elements] = effect.read(coefficients, signal)
-        start[elements] = effect.read(
-            coefficients, Signal(start_values, zeros, start_values, zeros, first)
-        )
-    return values
-
-
-def _compute_state_times(plan: TimeGrid, steps_per_state: int) -> Array:
-    """Return the times (L, R) since the start of the states that the engine stores, s.
-
-    Shapes: L batch elements.
-
-    Args:
-        plan: time grid of the batch.
-        steps_per_state: number of steps between two stored states.
-    """
-    start = np.zeros((len(plan.ends), 1))
-    return np.concatenate([start, plan.ends[:, steps_per_state - 1 :: steps_per_state]], axis=1)
 
 
 def _select_rows(values: Array, rows: Indices) -> Array:
@@ -448,27 +388,6 @@ def _select_rows(values: Array, rows: Indices) -> Array:
         return values[:, : rows.shape[1]]
     selected: Array = np.take_along_axis(values, rows, axis=1)
     return selected
-
-
-def make_effect_parameters(
-    effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
-) -> tuple[Parameter, ...]:
-    """Return the coefficients of an effect as parameters with their plausible ranges as bounds.
-
-    Args:
-        effect: Effect.
-        system: System on which it acts.
-        observed: Names of the observed channels, which may determine units; all if empty.
-    """
-    parameters = []
-    coefficients = effect.on(system)
-    for coefficient in coefficients:
-        name = effect.name if len(coefficients) == 1 else f"{effect.name}.{coefficient.name}"
-        low, high = coefficient.range(system.kind)
-        unit = coefficient.unit_on(system, observed) or ""
-        nominal = min(max(0.0, low), high)  # zero, or the nearest value of the range
-        parameters.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
-    return tuple(parameters)
 
 
 def _expand_rows(rows: Sequence[Mapping[str, float]], index: Indices) -> dict[str, Array]:
@@ -483,63 +402,6 @@ def _stack_states(states: Mapping[str, Array], names: Sequence[str], count: int)
     columns = [np.broadcast_to(states[name], (count,)) for name in names]
     result: Array = np.stack(columns, axis=1)
     return result
-
-
-def _check_effect_types(effects: object, fixed: object) -> None:
-    """Check the types of effects and fixed coefficients, which may come from an experiment's file.
-
-    Raises:
-        InputError: A type is wrong.
-    """
-    if not isinstance(effects, list | tuple) or not all(map(_is_effect_reference, effects)):
-        raise InputError(f"effects: expected a list of names, found {format_value(effects)}")
-    if fixed is not None and not isinstance(fixed, Mapping):
-        expected = "a table of coefficients by effect"
-        raise InputError(f"fixed: expected {expected}, found {format_value(fixed)}")
-
-
-def _is_effect_reference(value: object) -> bool:
-    return isinstance(value, str) or (isinstance(value, type) and issubclass(value, Effect))
-
-
-def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
-    """Return the coefficients of a fixed effect as a tuple of numbers.
-
-    Args:
-        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        value: a number, or a list of numbers.
-
-    Raises:
-        InputError: a coefficient is not a finite number.
-    """
-    is_sequence = isinstance(value, list | tuple)
-    values = tuple(value) if is_sequence else (value,)
-    if not all(map(is_plausible_number, values)):
-        raise InputError(
-            f"effect {name}: expected finite coefficients, found {format_value(value)}"
-        )
-    return tuple(float(v) for v in values)
-
-
-def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
-    """Check that coefficients have plausible sizes.
-
-    Args:
-        effect: effect of the library: a force, friction, input, sensor or contact law.
-        system: the system on which it acts.
-        values: its coefficients in order.
-
-    Raises:
-        InputError: A coefficient is too large.
-    """
-    for coefficient, value in zip(effect.on(system), values, strict=False):
-        largest = max(map(abs, coefficient.range(system.kind)))
-        if abs(value) > MAX_COEFFICIENT_FACTOR * largest:
-            unit = coefficient.unit_on(system) or ""
-            expected = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {unit}".rstrip()
-            raise InputError(
-                f"effect {effect.name}: expected {coefficient.name} {expected}, found {value:g}"
-            )
 
 
 def _expand_coefficients(effect: Effect, rows: Array) -> Array:

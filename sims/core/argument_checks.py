@@ -19,7 +19,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_orig
 
 import numpy as np
 
-from sims.core.plain_values import truncate_text
+from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
 
 P = ParamSpec("P")
@@ -425,3 +425,19 @@ def _format_value(value: object) -> str:
     if inspect.isclass(value):
         return f"the class {value.__name__}"
     return f"a {type(value).__name__}"
+
+
+def check_positive(name: str, value: Any, expected: str = "a positive number of seconds") -> float:
+    """Return a setting of an engine as a float.
+
+    Args:
+        name: Name of the setting, for messages.
+        value: Its value.
+        expected: Words for the expected value.
+
+    Raises:
+        InputError: The value is not a positive number.
+    """
+    if not (is_plausible_number(value) and value > 0):
+        raise InputError(f"{name} must be {expected}, found {truncate_text(str(value))}")
+    return float(value)

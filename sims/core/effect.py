@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Parameter
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 
 PlaceKind = Literal["joint", "actuator", "body", "channel", "contact", "geom", "world", "level"]
@@ -525,3 +525,24 @@ class Sensor(Effect):
 
 ActiveEffects = tuple[tuple[Effect, Array], ...]
 """Effects with their coefficients (K, L, 1)."""
+
+
+def make_effect_parameters(
+    effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
+) -> tuple[Parameter, ...]:
+    """Return the coefficients of an effect as parameters with their plausible ranges as bounds.
+
+    Args:
+        effect: Effect.
+        system: System on which it acts.
+        observed: Names of the observed channels, which may determine units; all if empty.
+    """
+    parameters = []
+    coefficients = effect.on(system)
+    for coefficient in coefficients:
+        name = effect.name if len(coefficients) == 1 else f"{effect.name}.{coefficient.name}"
+        low, high = coefficient.range(system.kind)
+        unit = coefficient.unit_on(system, observed) or ""
+        nominal = min(max(0.0, low), high)  # zero, or the nearest value of the range
+        parameters.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
+    return tuple(parameters)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from sims.core.effect import ActiveEffects
-from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import Array, Indices, InputError
 from sims.core.system import System
 
@@ -77,22 +76,6 @@ class Trajectories:
     x: Array
     v: Array
     a: Array
-
-
-def check_positive(name: str, value: Any, expected: str = "a positive number of seconds") -> float:
-    """Return a setting of an engine as a float.
-
-    Args:
-        name: Name of the setting, for messages.
-        value: Its value.
-        expected: Words for the expected value.
-
-    Raises:
-        InputError: The value is not a positive number.
-    """
-    if not (is_plausible_number(value) and value > 0):
-        raise InputError(f"{name} must be {expected}, found {truncate_text(str(value))}")
-    return float(value)
 
 
 def make_unsupported_error(engine: str, system: type[System], reason: str) -> InputError:

@@ -8,6 +8,7 @@ import sys
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
 def set_glfw_library() -> None:
@@ -26,6 +27,18 @@ def set_glfw_library() -> None:
     library = Path(package.origin).parent / variant / "libglfw.so"
     if library.is_file():
         os.environ["PYGLFW_LIBRARY"] = str(library)
+
+
+@cache
+def import_mujoco() -> Any:
+    """Import the module ``mujoco`` on first use.
+
+    The import is slow, and most commands never simulate.
+    """
+    import mujoco
+
+    disable_step_profiler()
+    return mujoco
 
 
 @cache

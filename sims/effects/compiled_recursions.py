@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.compiled.array_functions import ArrayFunctions
+from sims.engines.compiled.compiled_functions import CompiledFunctions
 from sims.engines.compiled.interpreter import nan_maximum, nan_minimum
 
 LINEAR, CLAMP, RATE_LIMIT, ACCELERATION_LIMIT = range(4)
@@ -104,7 +104,7 @@ def move_with_limited_acceleration(commands: Any, steps: Any, start: Any, means:
         position, speed = position + travel, next_speed
 
 
-COMPILED = ArrayFunctions(
+COMPILED = CompiledFunctions(
     __name__,
     "the effects with memory",
     {step_elements: ("#", "ls", "ls", "l2", "ls")},

@@ -23,10 +23,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.core.effect import Coefficient, Sensor, Signal
+from sims.core.effect import ActiveEffects, Coefficient, Effect, Sensor, Signal
 from sims.core.simulator import Array
 from sims.effects.compiled_recursions import LINEAR, run_recursion
 from sims.effects.input_effects import compute_lag_response, shift_by_one_step
+from sims.engines.time_grid import is_active
 
 _SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
@@ -267,3 +268,45 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     # (4) of sims.effects.input_effects without its first term, which is the recursion
     increments = signal.values - decay * old - mean * (signal.values - old)
     return run_recursion(LINEAR, decay, increments, signal.start)
+
+
+def apply_sensor_effects(
+    sensors: ActiveEffects, values: Array, steps: Array, times: Array, clock: Array | float = 0.0
+) -> Array:
+    """Apply sensor effects one after another to a channel.
+
+    Each effect gets the output of the previous one, also for the value at the start.
+
+    Shapes: L batch elements.
+
+    Args:
+        sensors: Sensor effects with their coefficients.
+        values: (L, R) values of the channel.
+        steps: (L, R) lengths of the steps before the values, s.
+        times: (L, R) times of the values since the start, s.
+        clock: (L, 1) first time stamp of each run, s.
+
+    Returns:
+        Readings (L, R).
+    """
+    values = values.copy()
+    start = values[:, :1].copy()
+    clock = np.broadcast_to(clock, start.shape)
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        # An effect may be active in few of the batch elements; evaluate only these.
+        elements = np.flatnonzero(is_active(c))
+        coefficients, start_values = c[:, elements], start[elements]
+        zeros = np.zeros_like(start_values)
+        first = clock[elements]
+        signal = Signal(values[elements], steps[elements], start_values, times[elements], first)
+        values[elements] = effect.read(coefficients, signal)
+        start[elements] = effect.read(
+            coefficients, Signal(start_values, zeros, start_values, zeros, first)
+        )
+    return values
+
+
+def needs_every_step(effect: Effect) -> bool:
+    """Return whether an effect is a sensor effect that needs every step."""
+    return isinstance(effect, Sensor) and effect.filters

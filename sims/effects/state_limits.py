@@ -8,8 +8,10 @@ and a the loss of a stop:
   the sign of k and d = max(s (x - p), 0) the penetration; k > 0 limits upward motion, k < 0
   downward motion; k is the stiffness at the depth D, 1 cm or 0.01 rad
 
-A rim of zero is no rim. (2) is the law of Hunt and Crossley with Hertz's contact; the rebound speed
-after contact at a small speed w is (1 - 2 a w / 3) w for any stiffness.
+A rim of zero is no rim. If a user-defined simulator has several levels, an effect on levels has one
+class for each, named ``effect@level``, with the unit and the typical size of the level. (2) is the
+law of Hunt and Crossley with Hertz's contact; the rebound speed after contact at a small speed w is
+(1 - 2 a w / 3) w for any stiffness.
 
 With e0 the simulator's restitution, vn the normal speed before the impact and c the coefficient:
 
@@ -27,11 +29,17 @@ With the parameters of a contact of two geoms in a robot's model file:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
 import numpy as np
 
-from sims.core.effect import Coefficient, Contact, Force, Level, ModelValueEffect
-from sims.core.simulator import Array
-from sims.core.system import StateSnapshot
+from sims.core.effect import Coefficient, Contact, Effect, Force, Level, ModelValueEffect
+from sims.core.registry import PartUnavailableError
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.system import StateSnapshot, System
+from sims.effects import registry
 
 _LEVEL_UNITS = ("m", "m", "m")
 """Units of a level; a level may have another unit."""
@@ -181,3 +189,80 @@ class ContactDamping(ContactSoftness):
 
     name = "contact.damping"
     noun = "a wrong damping"
+
+
+@lru_cache(maxsize=64)
+def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[Effect], ...]:
+    """Return the effect at each level of a system; empty if it has no levels.
+
+    A level is a state that a user's simulator integrates itself, such as the filling of a tank.
+    With several levels, the effect has one class for each, named after it.
+
+    Args:
+        effect: Registered effect.
+        system: System of a user-defined simulator.
+    """
+    levels = [channel for channel in system.channels if channel.name in system.levels]
+    has_several_levels = len(levels) > 1
+    effects = []
+    for channel in levels:
+        body = {
+            "name": f"{effect.name}@{channel.name}" if has_several_levels else effect.name,
+            "of": effect.name,
+            "place": channel.name if has_several_levels else "",
+            "coefficients": [
+                _convert_to_level_size(c, channel.unit, channel.scale) for c in effect.coefficients
+            ],
+            "__module__": __name__,
+            "__doc__": effect.__doc__,
+        }
+        effects.append(type(f"{effect.__name__}At", (effect,), body))
+    return tuple(effects)
+
+
+def _convert_to_level_size(c: Coefficient, unit: str, scale: float) -> Coefficient:
+    """Convert a coefficient to the unit and size of a level.
+
+    Args:
+        c: coefficient of the effect: name, units and plausible ranges.
+        unit: unit of the level.
+        scale: typical size of the level, in this unit.
+    """
+    low, high = c.plausible[0]
+    return replace(c, units=(unit,) * 3, plausible=((low * scale, high * scale),) * 3)
+
+
+def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
+    """Return the effect with a name such as ``state.overflow@upper``; None if it is not on levels.
+
+    Args:
+        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        system: System of a user-defined simulator.
+
+    Raises:
+        InputError: The effect is not possible on this system or at this place; the message states
+            the reason or the possible places.
+    """
+    effect_name, separator, place = name.partition("@")
+    try:
+        effect = registry.get(effect_name)
+    except PartUnavailableError:
+        return None
+    if not issubclass(effect, Level) or not system.levels:
+        return None
+    if reason := effect.misses(system):
+        raise InputError(f"system {system.name} cannot have effect {name}: {reason}")
+    effects_by_name = {
+        effect_class.name: effect_class for effect_class in make_level_effects(effect, system)
+    }
+    if name in effects_by_name:
+        return effects_by_name[name]
+    places: Sequence[str] = [effect_class.place for effect_class in effects_by_name.values()]
+    if not separator:
+        alternatives = ", ".join(f"{effect_name}@{place_name}" for place_name in places)
+        raise InputError(
+            f"effect {effect_name} of simulator {system.name} needs a place: {alternatives}"
+        )
+    raise make_unknown_name_error(
+        f"place of effect {effect_name} in simulator {system.name}", place, list(system.levels)
+    )

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, Input, Signal
 from sims.core.simulator import Array, Indices, Scenario
+from sims.engines.scenario_groups import ScenarioGroups
 from sims.engines.time_grid import (
     Commands,
-    ScenarioGroups,
     TimeGrid,
     divide_intervals,
     get_command_times,

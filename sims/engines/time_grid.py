@@ -15,21 +15,24 @@ changes slowly.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, Input, Sensor
 from sims.core.simulator import Array, Indices, Scenario
+from sims.engines.scenario_groups import ScenarioGroups
 
 _ROUNDING_SHARE = 1e-6
 """Fraction of a step by which an interval may exceed an integer number of steps."""
+TIME_TOLERANCE = 1e-6
+"""Largest deviation of sample times from the engine's steps, as a fraction of an interval.
 
-
-Number = TypeVar("Number", np.float64, np.intp)
+Recordings round their time stamps.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,81 +55,16 @@ class TimeGrid:
     rows: Indices
     has_uniform_steps: bool = False
 
+    def compute_state_times(self, steps_per_state: int) -> Array:
+        """Return the times (L, R) since the start of the run at which the engine stores states, s.
 
-@dataclass(frozen=True)
-class ScenarioGroups:
-    """Scenarios of batch elements, grouped if they are equal.
+        The first of them is zero, the time of the initial state.
 
-    Attributes:
-        unique_scenarios: Scenarios that differ in their times or inputs.
-        scenario_index: (L,) number of the distinct scenario of each batch element.
-        contents: Hashable content of each distinct scenario; empty if unknown.
-    """
-
-    unique_scenarios: tuple[Scenario, ...]
-    scenario_index: Indices
-    contents: tuple[object, ...] = ()
-
-    @property
-    def one_each(self) -> ScenarioGroups:
-        """Groups of the distinct scenarios with one batch element each."""
-        count = len(self.unique_scenarios)
-        return ScenarioGroups(self.unique_scenarios, np.arange(count), self.contents)
-
-    def expand_rows(self, rows: NDArray[Number]) -> NDArray[Number]:
-        """Expand rows (N, ...) of the distinct scenarios to rows (L, ...) of the batch elements.
-
-        Equal rows that share memory are broadcast.
+        Args:
+            steps_per_state: Number of steps from one stored state to the next.
         """
-        if len(rows) == 1 or rows.strides[0] == 0:
-            rows = rows[:1]
-            return np.broadcast_to(rows, (self.scenario_index.size, *rows.shape[1:]))
-        return rows[self.scenario_index]
-
-
-def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> ScenarioGroups:
-    """Group scenarios with the same times and inputs.
-
-    Inputs and time steps are computed once for each group, not for each batch element.
-
-    Args:
-        scenarios: Scenario of each batch element.
-        by_initial: Whether grouped scenarios must also state the same initial states.
-    """
-    # Compare objects first, because comparing the contents of each scenario is slow.
-    objects, object_index = group_by_identity(scenarios)
-    group_by_content: dict[object, int] = {}
-    distinct: list[Scenario] = []
-    group_by_object = []
-    for scenario in objects:
-        signals = sorted(scenario.inputs.items())
-        input_histories = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
-        interpretation = tuple(sorted(scenario.linear)), scenario.offset, input_histories
-        initial_states = tuple(sorted(scenario.initial.items())) if by_initial else ()
-        signals_content = ((name, u.tobytes()) for name, u in signals)
-        off_masks = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
-        content = (
-            scenario.times.tobytes(),
-            interpretation,
-            initial_states,
-            off_masks,
-            *signals_content,
-        )
-        group = group_by_content.setdefault(content, len(distinct))
-        if group == len(distinct):
-            distinct.append(scenario)
-        group_by_object.append(group)
-    index = np.array(group_by_object, dtype=np.intp)[object_index]
-    return ScenarioGroups(tuple(distinct), index, tuple(group_by_content))
-
-
-def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
-    """Return the distinct objects among scenarios, and the number of each element's object (L,)."""
-    # One dictionary lookup per batch element, of which there may be thousands.
-    objects = {id(scenario): scenario for scenario in scenarios}
-    index = {key: i for i, key in enumerate(objects)}
-    object_index = np.array([index[id(scenario)] for scenario in scenarios], dtype=np.intp)
-    return list(objects.values()), object_index
+        start = np.zeros((len(self.ends), 1))
+        return np.concatenate([start, self.ends[:, steps_per_state - 1 :: steps_per_state]], axis=1)
 
 
 Commands = Sequence[Mapping[str, Array]]
@@ -311,3 +249,28 @@ def is_active(c: Array) -> NDArray[np.bool_]:
     """Return the mask (L, 1) of batch elements in which coefficients (K, L, 1) are not all zero."""
     result: NDArray[np.bool_] = (c != 0).any(axis=0)
     return result
+
+
+def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
+    """Return equal steps if the given ones differ only by rounding.
+
+    A change of the step size costs an engine more than a step.
+
+    Shapes: S steps.
+
+    Args:
+        steps: (S,) step sizes in seconds, > 0.
+        steps_per_sample: number of steps from one sample to the next.
+
+    Returns:
+        The steps (S,), equal or unchanged.
+    """
+    if not steps.size:
+        return steps
+    # The error of the sample times is compared, not that of each step, because errors of rounded
+    # time stamps do not add up.
+    mean_step = math.fsum(steps) / steps.size
+    equal_times = mean_step * np.arange(1, steps.size + 1)
+    largest_deviation = np.abs(np.cumsum(steps) - equal_times).max()
+    are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * steps_per_sample
+    return np.full(steps.size, mean_step) if are_equal else steps

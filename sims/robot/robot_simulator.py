@@ -21,7 +21,7 @@ from sims.core.effect import ActiveEffects, Effect, Sensor
 from sims.core.engine import Engine
 from sims.core.simulator import Array, InputError, Scenario, make_unknown_name_error
 from sims.core.toml_validation import format_value
-from sims.engines.time_grid import ScenarioGroups, group_scenarios
+from sims.engines.scenario_groups import ScenarioGroups, group_scenarios
 from sims.robot.dynamics.activation_filters import (
     ActivationFilter,
     activation_filters,

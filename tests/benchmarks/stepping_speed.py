@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from sims.core.simulator import Scenario
-from sims.engines.compiled import array_programs, force_program
+from sims.engines.compiled import force_program, register_programs
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -75,7 +75,7 @@ class Noted:
 def evaluate_with_numpy():
     """Have NumPy evaluate all forces in a `with` block."""
     with (
-        mock.patch.object(array_programs.TracedPrograms, "find", return_value=None),
+        mock.patch.object(register_programs.TracedPrograms, "find", return_value=None),
         mock.patch.dict(force_program._traced_forces, clear=True),
     ):
         yield

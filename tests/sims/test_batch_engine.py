@@ -10,8 +10,8 @@ from sims.core.engine import IntegrationBatch
 from sims.core.simulator import InputError, Parameter, Scenario
 from sims.core.system import System
 from sims.effects.friction import CoulombFriction
-from sims.engines.batch import make_engine
-from sims.engines.compiled import array_programs, force_program
+from sims.engines.batch_engine import make_engine
+from sims.engines.compiled import force_program, register_programs
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -32,7 +32,7 @@ T = np.arange(201) / 100
 def force_evaluation(request, monkeypatch):
     """Run each test with traced forces, and with forces that NumPy evaluates."""
     if request.param == "evaluated":
-        monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+        monkeypatch.setattr(register_programs.TracedPrograms, "find", lambda *_: None)
         monkeypatch.setattr(force_program, "_traced_forces", {})
 
 

@@ -14,9 +14,10 @@ import pytest
 
 from sims import effects
 from sims.core.effect import Coefficient, Force, Friction
+from sims.core.mujoco_import import import_mujoco
 from sims.core.simulator import InputError, Scenario
-from sims.engines.external import bullet_world, mujoco_bodies
-from sims.engines.external.external_engine import equalise_steps
+from sims.engines.external import bullet_world
+from sims.engines.time_grid import equalise_steps
 from tests.sims.engine_agreement import (
     COEFFICIENTS,
     OTHERS,
@@ -331,7 +332,7 @@ def test_a_copy_has_a_world_of_its_own(system, engine, settings, copied):
     np.testing.assert_array_equal(twin.simulate(theta, run), first)
 
 
-IMPORTS = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
+IMPORTS = {"pybullet": bullet_world.import_pybullet, "mujoco": import_mujoco}
 STEPPERS = {"pybullet": "stepSimulation", "mujoco": "mj_step"}
 """Function of each engine's library that makes a step."""
 

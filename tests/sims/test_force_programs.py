@@ -9,9 +9,8 @@ import pytest
 from sims import effects as library
 from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
-from sims.engines import make_engine
-from sims.engines.batch import BatchEngine
-from sims.engines.compiled import array_programs, force_program
+from sims.engines.batch_engine import BatchEngine
+from sims.engines.compiled import force_program, register_programs
 from sims.engines.compiled.kernel import make_instruction_runner
 from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
@@ -20,6 +19,7 @@ from sims.engines.compiled.traced_array import (
     NotTraceableError,
     TracedArray,
 )
+from sims.engines.engine_lookup import make_engine
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
@@ -144,7 +144,7 @@ def test_an_exception_in_an_evaluated_effect_reaches_the_caller(error):
 def test_an_effect_with_many_array_operations_is_traced(monkeypatch, capsys):
     traced = simulate_slider(ManyOperations)
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+    monkeypatch.setattr(register_programs.TracedPrograms, "find", lambda *_: None)
     monkeypatch.setattr(force_program, "_traced_forces", {})
     np.testing.assert_allclose(traced, simulate_slider(ManyOperations), rtol=1e-12)
 
@@ -218,7 +218,7 @@ def test_damaged_batches_end_in_the_same_state_with_evaluated_forces(system, mon
     with np.errstate(all="ignore"):
         batches = list(damaged_batches(batch, np.random.default_rng(11)))
         traced = [engine.integrate(batch) for batch in batches]
-        monkeypatch.setattr(array_programs.TracedPrograms, "find", lambda *_: None)
+        monkeypatch.setattr(register_programs.TracedPrograms, "find", lambda *_: None)
         monkeypatch.setattr(force_program, "_traced_forces", {})
         evaluated = [engine.integrate(batch) for batch in batches]
     for found, expected in zip(evaluated, traced, strict=True):

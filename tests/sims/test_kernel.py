@@ -12,12 +12,12 @@ import pytest
 from bench.diagnosis.kalman import compiled_recursions
 from sims.core.simulator import InputError
 from sims.engines.compiled import (
-    array_functions,
     data_layout,
     interpreter,
     kernel,
     kernel_build,
     machine_code,
+    machine_code_cache,
     mujoco_callback,
     traced_array,
 )
@@ -38,7 +38,7 @@ def fail_if_called():
     ],
 )
 def test_the_cache_name_depends_on_every_compiled_source_file(module, entry):
-    sources = {str(path) for path in array_functions.list_source_files(module.__name__)}
+    sources = {str(path) for path in machine_code_cache.list_source_files(module.__name__)}
     assert module.__file__ in sources
     assert all(Path(path).is_file() for path in sources)
     called = kernel_build.list_called_functions(entry)
@@ -57,13 +57,13 @@ def test_the_cache_name_depends_on_every_compiled_source_file(module, entry):
 
 def test_a_damaged_cache_file_is_made_again(tmp_path):
     path = tmp_path / "deep" / "code.bin"
-    assert machine_code.read_cached(path) is None
-    assert machine_code.make_cached(path, lambda: b"code", fail_if_called) == b"code"
-    assert machine_code.make_cached(path, fail_if_called, fail_if_called) == b"code"
+    assert machine_code_cache.read_cached(path) is None
+    assert machine_code_cache.make_cached(path, lambda: b"code", fail_if_called) == b"code"
+    assert machine_code_cache.make_cached(path, fail_if_called, fail_if_called) == b"code"
     data = path.read_bytes()
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    assert machine_code.read_cached(path) is None
-    assert machine_code.make_cached(path, lambda: b"anew", fail_if_called) == b"anew"
+    assert machine_code_cache.read_cached(path) is None
+    assert machine_code_cache.make_cached(path, lambda: b"anew", fail_if_called) == b"anew"
 
 
 def test_an_interrupted_compilation_leaves_no_file(tmp_path):
@@ -72,20 +72,20 @@ def test_an_interrupted_compilation_leaves_no_file(tmp_path):
 
     path = tmp_path / "code.bin"
     with pytest.raises(KeyboardInterrupt):
-        machine_code.make_cached(path, interrupted, fail_if_called)
+        machine_code_cache.make_cached(path, interrupted, fail_if_called)
     assert [p.name for p in tmp_path.iterdir()] == ["code.lock"]
 
 
 def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp_path):
     code = (
         "import os, sys, time; from pathlib import Path; "
-        "from sims.engines.compiled import machine_code\n"
+        "from sims.engines.compiled import machine_code_cache\n"
         "path = Path(sys.argv[1])\n"
         "def make():\n"
         "    path.with_name('at-it').touch()\n"
         "    time.sleep(float(sys.argv[2]))\n"
         "    return str(os.getpid()).encode()\n"
-        "print(machine_code.make_cached(path, make, lambda: print('waits')).decode())\n"
+        "print(machine_code_cache.make_cached(path, make, lambda: print('waits')).decode())\n"
     )
 
     def start_process(seconds):
@@ -107,7 +107,12 @@ def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp
 
 
 def load_kernel():
-    return array_functions.load_stored(kernel.__name__, "COMPILED", "the batch engine", 1, {})
+    return machine_code_cache.load_stored(kernel.__name__, "COMPILED", "the batch engine", 1, {})
+
+
+def get_kernel_path():
+    name = machine_code_cache.make_cache_name(kernel.__name__, {})
+    return machine_code_cache.get_cache_folder() / name
 
 
 def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, capsys):
@@ -119,8 +124,10 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
-    path = machine_code.get_cache_folder() / array_functions.make_cache_name(kernel.__name__, {})
-    code = machine_code.read_cached(path)
+    path = machine_code_cache.get_cache_folder() / machine_code_cache.make_cache_name(
+        kernel.__name__, {}
+    )
+    code = machine_code_cache.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
     monkeypatch.setattr(kernel_build, "build_module", lambda *_: code)
@@ -129,8 +136,10 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
-    path = machine_code.get_cache_folder() / array_functions.make_cache_name(kernel.__name__, {})
-    code = machine_code.MachineCode.unpack(machine_code.read_cached(path))
+    path = machine_code_cache.get_cache_folder() / machine_code_cache.make_cache_name(
+        kernel.__name__, {}
+    )
+    code = machine_code.MachineCode.unpack(machine_code_cache.read_cached(path))
     assert machine_code.MachineCode.unpack(code.pack()) == code
     with pytest.raises(machine_code.CodeNotLoadableError, match="frobnicate"):
         machine_code.load_machine_code(code._replace(needs=(*code.needs, "frobnicate")))

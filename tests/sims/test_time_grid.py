@@ -11,8 +11,9 @@ from sims.effects import get_effect
 from sims.effects.input_effects import InputBacklash, InputDelay
 from sims.effects.sensor_effects import ClockSkew
 from sims.effects.sensor_effects import SensorDelay as Late
+from sims.engines.scenario_groups import group_scenarios
 from sims.engines.step_inputs import compute_applied_inputs
-from sims.engines.time_grid import TimeGrid, build_time_grid, group_scenarios
+from sims.engines.time_grid import TimeGrid, build_time_grid
 from sims.recording.recording import Run
 from sims.systems.slider import Slider
 

@@ -24,7 +24,7 @@ from bench.benchmark.isolation.temporary_folders import (
     remove_stale_folders,
 )
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess
-from sims.engines.compiled import machine_code as compiled
+from sims.engines.compiled.machine_code_cache import get_cache_folder
 
 _EXIT_WAIT_SECONDS = 5.0
 """Time in seconds that the fork server has to end after its link is closed."""
@@ -201,7 +201,7 @@ def _make_environment(folder: str) -> dict[str, str]:
         if name.startswith(_NUMERICAL_VARIABLE_PREFIXES)
     }
     # Compiled steps are loaded from the cache folder before the process is isolated.
-    variables["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
+    variables["SIMGAP_COMPILED"] = str(get_cache_folder())
     single_thread = dict.fromkeys(THREAD_COUNT_VARIABLES, "1")
     return {
         **single_thread,

@@ -12,7 +12,7 @@ from bench.core.plugin_registries import PartUnavailableError, simulators, tuner
 from bench.datasets import dataset_catalogue as datasets
 from bench.datasets.dataset_catalogue import DataSet
 from sims.core.simulator import InputError
-from sims.engines import ENGINE_MODULES, missing_packages
+from sims.engines.engine_lookup import ENGINE_MODULES, missing_packages
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from bench.benchmark.isolation.linux_syscalls import set_not_dumpable
 from bench.benchmark.isolation.process_errors import describe_exit
 from bench.benchmark.isolation.resource_limits import THREAD_COUNT_VARIABLES, limit_to_one_thread
 from sims.core.simulator import InputError
-from sims.engines import describe_stepping
+from sims.engines.engine_lookup import describe_stepping
 
 if TYPE_CHECKING:
     from bench.benchmark.runner.plugin_discovery import Plugin

@@ -38,7 +38,7 @@ from sims.core.files import (
 from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, format_value, read_toml
-from sims.engines import describe_stepping
+from sims.engines.engine_lookup import describe_stepping
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -102,9 +102,10 @@ def _read_memory_size() -> int | None:
 def _describe_engines() -> Iterator[JsonDocument]:
     """List every engine; each package is imported, since an installed one may not work."""
     from bench import __version__
-    from sims.engines.external import bullet_world, mujoco_bodies
+    from sims.core.mujoco_import import import_mujoco
+    from sims.engines.external.bullet_world import import_pybullet
 
-    loads = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
+    loads = {"pybullet": import_pybullet, "mujoco": import_mujoco}
     yield {"name": "batch", "version": __version__, "missing": None}
     for name, load in loads.items():
         yield {

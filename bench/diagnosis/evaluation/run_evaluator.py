@@ -20,7 +20,7 @@ from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
-from sims.engines import HIDDEN_STATE_ENGINES
+from sims.engines.engine_lookup import HIDDEN_STATE_ENGINES
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 

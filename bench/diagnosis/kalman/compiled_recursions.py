@@ -1,8 +1,8 @@
 """Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `filter_and_smoother`.
 
 Matrices of a few joints are too small for one library call each: a step in Python takes fifty
-microseconds whatever their size. The functions are compiled once (`array_functions`) and allocate
-no memory.
+microseconds whatever their size. The functions are compiled once (`compiled_functions`) and
+allocate no memory.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.compiled.array_functions import ArrayFunctions
+from sims.engines.compiled.compiled_functions import CompiledFunctions
 
 
 def multiply_sparse(a: Array, b: Array, out: Array) -> None:
@@ -338,7 +338,7 @@ def run_smoother(
                 expected[e] += known
 
 
-COMPILED = ArrayFunctions(
+COMPILED = CompiledFunctions(
     __name__,
     "the Kalman filter",
     {

@@ -22,11 +22,12 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
+from sims.core.effect import make_effect_parameters
 from sims.core.simulation_counter import SimulationBudgetExceededError
 from sims.core.simulator import Array, InputError
 from sims.effects import list_effects_for as library_of
 from sims.recording.recording import Recording
-from sims.system_simulator import SystemSimulator, make_effect_parameters
+from sims.system_simulator import SystemSimulator
 
 GRID_POINT_COUNT = 64
 """Number of grid points over a run."""

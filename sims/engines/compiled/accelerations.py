@@ -41,21 +41,7 @@ from sims.engines.compiled.data_layout import (
     X,
 )
 from sims.engines.compiled.events import compute_norm
-from sims.engines.compiled.interpreter import nan_maximum, run_instructions
-
-
-def run_part(block: Block, part: int) -> None:
-    """Run one part of the force program on all slots in use, which hold one element each.
-
-    Entries `part` and `part + 1` of `block.ends` are the bounds of its instructions.
-
-    Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
-        part: `CONSTANTS`, `FORCES` or `IMPACTS`.
-    """
-    run_instructions(block.code, block.ends[part], block.ends[part + 1], block.r, block.w)
+from sims.engines.compiled.interpreter import nan_maximum, run_part
 
 
 def evaluate_forces(block: Block) -> None:

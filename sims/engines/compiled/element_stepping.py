@@ -26,12 +26,7 @@ other.
 
 from __future__ import annotations
 
-from sims.engines.compiled.accelerations import (
-    begin_step,
-    compute_acceleration,
-    evaluate_forces,
-    run_part,
-)
+from sims.engines.compiled.accelerations import begin_step, compute_acceleration, evaluate_forces
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     CONSTANTS,
@@ -67,15 +62,18 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
-from sims.engines.compiled.element_clock import load_element, next_step, record_and_check_remaining
-from sims.engines.compiled.events import (
-    detect_and_schedule_event,
-    handle_event,
-    handle_impact,
+from sims.engines.compiled.element_loading_and_recording import (
+    load_element,
+    next_step,
+    record_and_check_remaining,
+)
+from sims.engines.compiled.events import detect_and_schedule_event, handle_event, handle_impact
+from sims.engines.compiled.interpreter import nan_maximum, run_part
+from sims.engines.compiled.step_size import (
+    choose_step_divisions,
+    divide_steps,
     shorten_if_nonlinear,
 )
-from sims.engines.compiled.interpreter import nan_maximum
-from sims.engines.compiled.step_size import choose_step_divisions, divide_steps
 
 
 def step_elements(block: Block) -> None:

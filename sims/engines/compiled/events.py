@@ -37,14 +37,9 @@ from sims.engines.compiled.data_layout import (
     EVENT_DELAY,
     EXCESS_AFTER,
     EXCESS_BEFORE,
-    F1,
-    F2,
-    F3,
-    F4,
     FLOOR,
     FRICTION_COORDINATE_COUNT,
     GROUND_FRICTION,
-    HAS_FORCES,
     HAS_FRICTION,
     IMPACT,
     IMPACTS,
@@ -54,12 +49,7 @@ from sims.engines.compiled.data_layout import (
     IS_RESTING,
     IS_STICKING,
     K1,
-    K2,
-    K3,
     K4,
-    MASS,
-    MAX_ACCELERATION,
-    MAX_FRICTION,
     MAX_STEP,
     MIN_REMAINING_SHARE,
     NEXT_V,
@@ -72,7 +62,6 @@ from sims.engines.compiled.data_layout import (
     RESTITUTION,
     SHORT_FLIGHT_COUNT,
     STANDSTILL,
-    STEP_LIMIT,
     Block,
     FloatArray,
     H,
@@ -85,26 +74,6 @@ from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, S
 
 MAX_EVENTS_PER_STEP = 256
 """Maximum number of events in one step of one element; further events are ignored."""
-FRICTION_NONLINEARITY_TOLERANCE = 6.0 * 0.05
-"""Tolerance of six times the nonlinearity (7) of dry friction.
-
-It is a fraction of the largest friction so far: the tail of a Stribeck peak, almost zero at speed,
-is strongly nonlinear in relation to itself.
-"""
-FORCE_NONLINEARITY_TOLERANCE = (6.0 * 0.005) ** 2
-"""Tolerance of the square of six times the nonlinearity (7) of the acceleration.
-
-It is a fraction of the square of the largest acceleration so far.
-"""
-NEGLIGIBLE_ACCELERATION_SHARE = 1e-5
-"""Fraction of the largest acceleration so far below which friction is negligible.
-
-Nonlinearity of negligible friction does not shorten a step.
-"""
-STEP_REDUCTION_FACTOR = 0.25
-"""Reduction factor of the length of a step in which forces are too nonlinear."""
-MIN_STEP_SHARE = 1.0 / 256.0
-"""Fraction of a full step below which steps are not shortened."""
 BREAK_AWAY_TIME_TOLERANCE = 1e-4
 """Time tolerance of break-away, as a fraction of a step."""
 REST_SPEED_SHARE = 1e-9
@@ -160,56 +129,6 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
     seconds = 2.0 * value / (root - rate) if rate < 0.0 else (root + rate) / (2.0 * curvature)
     # Without a root, which only rounding can cause, the event is at the end of the step.
     return float(seconds if abs(seconds) < np.inf else h)
-
-
-def shorten_if_nonlinear(block: Block, i: int) -> bool:
-    """Shorten the step just tried if its forces are too nonlinear; return whether it is rejected.
-
-    The measure is |k1 - k2 - k3 + k4| of the four Runge-Kutta accelerations, relative to the
-    largest acceleration so far, and likewise for dry friction unless the element sticks. A step is
-    not rejected if it is already very short or ends at a scheduled event. STEP_LIMIT, the longest
-    allowed step, is reduced after a rejection, and doubles after an accepted step of that length.
-
-    Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-    """
-    a = block.a
-    d = block.flags[DIMENSIONS]
-    h = a[H, i]
-    a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], dot(a, K1, K1, d, i))
-    is_nonlinear = False
-    if block.flags[HAS_FORCES] != 0:
-        squared_change = 0.0
-        for k in range(d):
-            outer_sum = a[K1 + k, i] + a[K4 + k, i]
-            middle_sum = a[K2 + k, i] + a[K3 + k, i]
-            squared_change += (outer_sum - middle_sum) * (outer_sum - middle_sum)
-        is_nonlinear = squared_change > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
-    if block.flags[HAS_FRICTION] != 0:
-        largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
-        a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], largest)
-        negligible = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
-        squared_change = 0.0
-        for k in range(d):
-            change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
-            squared_change += change * change
-        change_size = abs(change) if d == 1 else np.sqrt(squared_change)
-        tolerance = FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(a[MAX_FRICTION, i], negligible)
-        if block.n[IS_STICKING, i] == 0 and change_size > tolerance:
-            is_nonlinear = True
-    is_rejected = False
-    if is_nonlinear:
-        is_rejected = h > MIN_STEP_SHARE * a[MAX_STEP, i] and has_no_pending_event(block, i)
-    if is_rejected:
-        a[STEP_LIMIT, i] = STEP_REDUCTION_FACTOR * h
-    elif h >= a[STEP_LIMIT, i]:
-        # The limit doubles with each accepted step of that length, as the nonlinearity may still be
-        # near.
-        a[STEP_LIMIT, i] = min(2.0 * a[STEP_LIMIT, i], a[MAX_STEP, i])
-    return is_rejected
 
 
 def has_no_pending_event(block: Block, i: int) -> bool:

@@ -21,7 +21,8 @@ from sims.core.effect import Contact, Effect, Force, Friction, HiddenState, Hidd
 from sims.core.engine import IntegrationBatch
 from sims.core.simulator import Array, Indices
 from sims.core.system import StateSnapshot, System
-from sims.engines.compiled.array_programs import (
+from sims.engines.compiled.data_layout import IntTable, ProgramArrays
+from sims.engines.compiled.register_programs import (
     MAX_CACHED_PROGRAMS,
     ArrayFunction,
     Evaluator,
@@ -31,7 +32,6 @@ from sims.engines.compiled.array_programs import (
     TracedSource,
     make_numpy_program,
 )
-from sims.engines.compiled.data_layout import IntTable, ProgramArrays
 from sims.engines.compiled.traced_array import PER_ELEMENT, PER_EVALUATION, PER_IMPACT
 
 _TEST_STATES = ((0.0, 0.0, 0.3), (0.37, 0.1, 2.0))

@@ -2,7 +2,7 @@
 
 The functions are compiled once for all programs (`sims.engines.compiled.kernel_build`). A register
 is a row, a slot a column. Forces that cannot be written as instructions are evaluated by a function
-of Python, which an instruction calls by its address (`sims.engines.compiled.array_programs`).
+of Python, which an instruction calls by its address (`sims.engines.compiled.register_programs`).
 Sine, cosine and exponential are computed in the same way for every element, with the argument
 reductions and coefficients of fdlibm (Sun Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and
 x = k ln 2 + r with |r| <= ln 2 / 2,
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.data_layout import FloatArray, IntTable
+from sims.engines.compiled.data_layout import Block, FloatArray, IntTable
 from sims.engines.compiled.intrinsics import call_external
 from sims.engines.compiled.traced_array import EXTERNAL, OPERATION_CODES
 
@@ -210,6 +210,20 @@ def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: in
             call_external(c, b, w)
         else:
             run_rare_instruction(op, r, o, a, b, w)
+
+
+def run_part(block: Block, part: int) -> None:
+    """Run one part of the force program on all slots in use, which hold one element each.
+
+    Entries `part` and `part + 1` of `block.ends` are the bounds of its instructions.
+
+    Args:
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        part: `CONSTANTS`, `FORCES` or `IMPACTS`.
+    """
+    run_instructions(block.code, block.ends[part], block.ends[part + 1], block.r, block.w)
 
 
 def run_rare_instruction(op: int, r: FloatArray, o: int, a: int, b: int, w: int) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sims.engines.compiled import mujoco_callback
-from sims.engines.compiled.array_functions import ArrayFunctions, load_stored
+from sims.engines.compiled.compiled_functions import CompiledFunctions
 from sims.engines.compiled.data_layout import (
     BLOCK_SHAPES,
     BatchArrays,
@@ -20,8 +20,9 @@ from sims.engines.compiled.data_layout import (
 )
 from sims.engines.compiled.element_stepping import step_elements
 from sims.engines.compiled.interpreter import run_instructions
+from sims.engines.compiled.machine_code_cache import load_stored
 
-COMPILED = ArrayFunctions(
+COMPILED = CompiledFunctions(
     __name__,
     "the batch engine",
     {

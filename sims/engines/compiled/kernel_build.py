@@ -44,7 +44,7 @@ def build_module(module: str, entry: str, pointers: int, constants: Mapping[str,
 
     Args:
         module: name of the module.
-        entry: name of the function, which receives pointers to integers, or of `ArrayFunctions`.
+        entry: name of the function, which receives pointers to integers, or of `CompiledFunctions`.
         pointers: number of these pointers.
         constants: values that replace constants of the module, by name.
 
@@ -82,7 +82,7 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
 
     Args:
         module: name of the module.
-        entry: name of the function, or of an `ArrayFunctions` object, which generates it.
+        entry: name of the function, or of an `CompiledFunctions` object, which generates it.
         pointers: number of the function's arguments, which are pointers to integers.
         constants: numbers that replace global constants of the module, by name.
     """

@@ -16,28 +16,42 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.accelerations import evaluate_forces, run_part
+from sims.engines.compiled.accelerations import evaluate_forces
 from sims.engines.compiled.data_layout import (
     CONSTANTS,
     DIMENSIONS,
     ELEMENT,
+    F1,
+    F2,
+    F3,
+    F4,
     FORCES,
+    HAS_FORCES,
+    HAS_FRICTION,
     HAS_HIDDEN_STATES,
     IN_U,
     IN_V,
     IN_X,
+    IS_STICKING,
     K1,
+    K2,
+    K3,
+    K4,
     MASS,
     MAX_ACCELERATION,
     MAX_FRICTION,
     MAX_PHASE,
+    MAX_STEP,
     SAMPLED_STEP,
+    STEP_LIMIT,
     Block,
+    H,
     V,
     X,
 )
-from sims.engines.compiled.element_clock import load_element
-from sims.engines.compiled.interpreter import nan_maximum
+from sims.engines.compiled.element_loading_and_recording import load_element
+from sims.engines.compiled.events import compute_norm, dot, has_no_pending_event
+from sims.engines.compiled.interpreter import nan_maximum, run_part
 
 MAX_PHASE_PER_STEP = 0.07
 """Maximum phase of an oscillation per step, in radians: error (1) is then 2e-7 of the phase."""
@@ -227,3 +241,75 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
     block_row = (X if row_of_result == MAX_ACCELERATION else V) + k
     for i in range(block.w):
         block.r[register + k, i] = a[block_row, i]
+
+
+FRICTION_NONLINEARITY_TOLERANCE = 6.0 * 0.05
+"""Tolerance of six times the nonlinearity (7) of dry friction.
+
+It is a fraction of the largest friction so far: the tail of a Stribeck peak, almost zero at speed,
+is strongly nonlinear in relation to itself.
+"""
+FORCE_NONLINEARITY_TOLERANCE = (6.0 * 0.005) ** 2
+"""Tolerance of the square of six times the nonlinearity (7) of the acceleration.
+
+It is a fraction of the square of the largest acceleration so far.
+"""
+NEGLIGIBLE_ACCELERATION_SHARE = 1e-5
+"""Fraction of the largest acceleration so far below which friction is negligible.
+
+Nonlinearity of negligible friction does not shorten a step.
+"""
+STEP_REDUCTION_FACTOR = 0.25
+"""Reduction factor of the length of a step in which forces are too nonlinear."""
+MIN_STEP_SHARE = 1.0 / 256.0
+"""Fraction of a full step below which steps are not shortened."""
+
+
+def shorten_if_nonlinear(block: Block, i: int) -> bool:
+    """Shorten the step just tried if its forces are too nonlinear; return whether it is rejected.
+
+    The measure is |k1 - k2 - k3 + k4| of the four Runge-Kutta accelerations, relative to the
+    largest acceleration so far, and likewise for dry friction unless the element sticks. A step is
+    not rejected if it is already very short or ends at a scheduled event. STEP_LIMIT, the longest
+    allowed step, is reduced after a rejection, and doubles after an accepted step of that length.
+
+    Args:
+        block: force program, batch elements and their buffers. Slot i holds one element: its
+            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
+            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        i: index of the slot, the column of the batch element.
+    """
+    a = block.a
+    d = block.flags[DIMENSIONS]
+    h = a[H, i]
+    a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], dot(a, K1, K1, d, i))
+    is_nonlinear = False
+    if block.flags[HAS_FORCES] != 0:
+        squared_change = 0.0
+        for k in range(d):
+            outer_sum = a[K1 + k, i] + a[K4 + k, i]
+            middle_sum = a[K2 + k, i] + a[K3 + k, i]
+            squared_change += (outer_sum - middle_sum) * (outer_sum - middle_sum)
+        is_nonlinear = squared_change > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
+    if block.flags[HAS_FRICTION] != 0:
+        largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
+        a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], largest)
+        negligible = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
+        squared_change = 0.0
+        for k in range(d):
+            change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
+            squared_change += change * change
+        change_size = abs(change) if d == 1 else np.sqrt(squared_change)
+        tolerance = FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(a[MAX_FRICTION, i], negligible)
+        if block.n[IS_STICKING, i] == 0 and change_size > tolerance:
+            is_nonlinear = True
+    is_rejected = False
+    if is_nonlinear:
+        is_rejected = h > MIN_STEP_SHARE * a[MAX_STEP, i] and has_no_pending_event(block, i)
+    if is_rejected:
+        a[STEP_LIMIT, i] = STEP_REDUCTION_FACTOR * h
+    elif h >= a[STEP_LIMIT, i]:
+        # The limit doubles with each accepted step of that length, as the nonlinearity may still be
+        # near.
+        a[STEP_LIMIT, i] = min(2.0 * a[STEP_LIMIT, i], a[MAX_STEP, i])
+    return is_rejected

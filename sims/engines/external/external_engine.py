@@ -28,8 +28,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sims.core.argument_checks import check_positive
 from sims.core.effect import Contact, Force, Friction
-from sims.core.engine import IntegrationBatch, Trajectories, check_positive
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
 from sims.core.system import System
 from sims.engines.compiled.data_layout import (
@@ -48,12 +49,7 @@ from sims.engines.compiled.data_layout import (
     OUT_MU,
 )
 from sims.engines.compiled.force_program import ForceProgram, get_force_program
-
-TIME_TOLERANCE = 1e-6
-"""Largest deviation of sample times from the engine's steps, as a fraction of an interval.
-
-Recordings round their time stamps.
-"""
+from sims.engines.time_grid import equalise_steps
 
 DEFAULT_MAX_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
 """Default longest step in seconds, by the system's kind."""
@@ -223,31 +219,6 @@ def _list_numbers(element: ElementWork) -> list[Array]:
         *element.inputs.values(),
         *(c for _, c in element.effects),
     ]
-
-
-def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
-    """Return equal steps if the given ones differ only by rounding.
-
-    A change of the step size costs an engine more than a step.
-
-    Shapes: S steps.
-
-    Args:
-        steps: (S,) step sizes in seconds, > 0.
-        steps_per_sample: number of steps from one sample to the next.
-
-    Returns:
-        The steps (S,), equal or unchanged.
-    """
-    if not steps.size:
-        return steps
-    # The error of the sample times is compared, not that of each step, because errors of rounded
-    # time stamps do not add up.
-    mean_step = math.fsum(steps) / steps.size
-    equal_times = mean_step * np.arange(1, steps.size + 1)
-    largest_deviation = np.abs(np.cumsum(steps) - equal_times).max()
-    are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * steps_per_sample
-    return np.full(steps.size, mean_step) if are_equal else steps
 
 
 def resolve_time_step(time_step: float | None, system: type[System]) -> float:

@@ -30,7 +30,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from sims.core.mujoco_import import disable_step_profiler
+from sims.core.mujoco_import import import_mujoco
 from sims.engines.external import ball_integration
 from sims.engines.external.ball_integration import BallState
 from sims.engines.external.external_engine import Vector
@@ -42,18 +42,6 @@ MuJoCo treats accelerations above 1e10 as a failure.
 """
 _CONTACT_IMPEDANCE = 0.9999
 """Impedance d of the contact: the largest value that MuJoCo allows."""
-
-
-@functools.cache
-def import_mujoco() -> Any:
-    """Import the module ``mujoco`` on first use.
-
-    The import is slow, and most commands never simulate.
-    """
-    import mujoco
-
-    disable_step_profiler()
-    return mujoco
 
 
 class CompiledWorld:

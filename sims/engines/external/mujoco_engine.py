@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import cast
 
-from sims.core.engine import Engine, IntegrationBatch, Trajectories, check_positive
+from sims.core.argument_checks import check_positive
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.mujoco_import import import_mujoco
 from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
@@ -27,7 +29,6 @@ from sims.engines.external.mujoco_bodies import (
     MujocoBall,
     MujocoJoint,
     MujocoSoftBall,
-    import_mujoco,
     write_joint_model,
 )
 from sims.engines.external.world_interface import (

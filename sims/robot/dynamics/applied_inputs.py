@@ -12,8 +12,9 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Input
 from sims.core.simulator import Array, Scenario
+from sims.engines.scenario_groups import ScenarioGroups
 from sims.engines.step_inputs import compute_applied_inputs
-from sims.engines.time_grid import ScenarioGroups, TimeGrid
+from sims.engines.time_grid import TimeGrid
 from sims.robot.dynamics.active_effects import slice_active_effects
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Effect, HiddenState
 from sims.core.simulator import Array
-from sims.engines.compiled.array_programs import (
+from sims.engines.compiled.register_programs import (
     ArrayFunction,
     Evaluator,
     PreparedProgram,

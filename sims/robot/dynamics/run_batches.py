@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Sensor
 from sims.core.simulator import Array, Scenario
-from sims.engines.time_grid import ScenarioGroups
+from sims.engines.scenario_groups import ScenarioGroups
 from sims.robot.dynamics.active_effects import (
     changes_derived_constants,
     find_active_elements,

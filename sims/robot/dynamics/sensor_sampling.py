@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Sensor, Signal
 from sims.core.simulator import Array
+from sims.effects.sensor_effects import apply_sensor_effects
 from sims.engines.time_grid import is_active
-from sims.system_simulator import apply_sensor_effects
 
 TIME_TOLERANCE_SHARE = 1e-6
 """Tolerance, as a share of a step, within which a time counts as the end of a step."""

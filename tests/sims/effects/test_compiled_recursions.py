@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sims.effects.compiled_recursions import CLAMP, LINEAR, RATE_LIMIT, run_recursion
-from sims.engines.compiled import array_functions
+from sims.engines.compiled import compiled_functions
 
 
 def test_recursions_of_few_steps_have_the_values_of_their_equations():
@@ -32,7 +32,7 @@ def test_compiled_and_interpreted_recursions_agree(kind, monkeypatch):
     start = rng.normal(size=(4, 1))
     compiled = run_recursion(kind, a, b, start)
     monkeypatch.setattr(
-        array_functions.ArrayFunctions,
+        compiled_functions.CompiledFunctions,
         "_bind",
         lambda _self, function, _sizes, arguments: partial(function, *arguments),
     )

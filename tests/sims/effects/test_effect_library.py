@@ -20,11 +20,11 @@ from sims.core.effect import (
     Input,
     Level,
     Sensor,
+    make_effect_parameters,
 )
 from sims.core.simulator import InputError
 from sims.core.system import SYSTEM_KINDS
 from sims.effects.readme_table import render_effects_table
-from sims.system_simulator import make_effect_parameters
 from tests.sims.effects.effect_systems import (
     NAMES,
     PAIRS,

@@ -9,7 +9,7 @@ from bench.core.plugin_registries import make_robot_simulator
 from sims import effects as library
 from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Scenario
-from sims.engines.compiled.array_programs import TracedPrograms
+from sims.engines.compiled.register_programs import TracedPrograms
 from sims.robot.dynamics import mujoco_batch, stepping_with_forces
 from sims.robot.dynamics.active_effects import is_evaluated_per_step
 from sims.robot.places.placed_effect_classes import make_placed_effect

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
-from sims.engines.compiled import array_functions
+from sims.engines.compiled import compiled_functions
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def run_both(runs):
 def test_compiled_and_interpreted_recursions_agree(monkeypatch):
     compiled = run_both(make_runs())
     monkeypatch.setattr(
-        array_functions.ArrayFunctions,
+        compiled_functions.CompiledFunctions,
         "_bind",
         lambda _self, function, _sizes, arguments: partial(function, *arguments),
     )

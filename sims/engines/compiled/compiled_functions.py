@@ -1,36 +1,28 @@
 """Functions on arrays in machine code: loaded from the user's cache, or compiled once.
 
 numba translates the functions (`kernel_build`), which takes up to 20 s. The machine code is stored
-and loaded with llvmlite alone (`machine_code`), in a few hundredths of a second and without numba.
+(`machine_code_cache`), and loaded with llvmlite alone (`machine_code`), in a few hundredths of a
+second and without numba.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from threading import Lock
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
-from sims.core.simulator import InputError
-from sims.engines.compiled import intrinsics, machine_code
+from sims.engines.compiled import intrinsics
 from sims.engines.compiled.data_layout import INTEGERS, Array, measure_arrays
-
-_MAX_COMPILE_SECONDS = 20
-"""Approximate compilation time of the batch engine in seconds, the longest one."""
-_PYTHON_MODULES = ("array_programs.py", "batch_runner.py", "force_program.py")
-"""Source files of this package on which no compiled code depends."""
-_lock = Lock()
+from sims.engines.compiled.machine_code_cache import load_stored
 
 
-class ArrayFunctions:
+class CompiledFunctions:
     """Functions on arrays of a module, compiled on first use into one piece of machine code."""
 
     def __init__(
@@ -198,103 +190,3 @@ def get_address(array: Array) -> int:
     if array.flags.writeable:
         return ctypes.addressof(_NullArray.from_buffer(array.data))
     return int(array.ctypes.data)
-
-
-def load_stored(
-    module: str, entry: str, description: str, pointers: int, constants: Mapping[str, int]
-) -> Callable[..., None]:
-    """Return a function as machine code: from the user's cache, or compiled now and stored there.
-
-    A lock prevents that two threads compile the same function.
-
-    Args:
-        module: name of the function's module.
-        entry: name of the function, or of `ArrayFunctions`.
-        description: what is compiled, for the message to the user.
-        pointers: number of pointer arguments of the function.
-        constants: values that replace constants of the module, by name.
-
-    Raises:
-        InputError: the compiler or its machine code cannot be used.
-    """
-
-    def compile_code() -> bytes:
-        """Compile the module with numba, and tell the user why this takes time."""
-        _print_line(
-            f"compiling {description}, once after an install: up to {_MAX_COMPILE_SECONDS} s"
-        )
-        from sims.engines.compiled.kernel_build import build_module
-
-        return build_module(module, entry, pointers, constants)
-
-    try:
-        with _lock:
-            data = _get_machine_code(make_cache_name(module, constants), compile_code)
-            return machine_code.load_machine_code(machine_code.MachineCode.unpack(data), pointers)
-    # A compiler that does not match this Python or its NumPy may raise any error.
-    except Exception as error:
-        text = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(
-            f"{description} cannot be compiled: {text}; expected working versions of numba and"
-            " llvmlite: install simgap again with the versions of requirements.lock"
-        ) from error
-
-
-def _get_machine_code(name: str, compile_code: Callable[[], bytes]) -> bytes:
-    """Return the machine code: from the file `name` of the cache, or compiled.
-
-    Compilation takes up to 20 s, so the code is stored in the user's cache. If the cache cannot
-    be written, each process compiles again.
-    """
-    folder = machine_code.get_cache_folder()
-    path = folder / name
-    data = machine_code.read_cached(path)
-    if data is not None:
-        return data
-    try:
-        return machine_code.make_cached(path, compile_code, _report_wait)
-    except OSError as error:
-        _print_line(
-            f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
-            " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
-        )
-        return compile_code()
-
-
-def _report_wait() -> None:
-    """Tell the user that another process is compiling, so that this one waits for its result."""
-    _print_line(
-        "another process compiles this code, once after an install:"
-        f" {_MAX_COMPILE_SECONDS} s at most"
-    )
-
-
-def _print_line(text: str) -> None:
-    """Write one line to the standard error output."""
-    sys.stderr.write(f"simgap: {text}\n")
-    sys.stderr.flush()
-
-
-def make_cache_name(module: str, constants: Mapping[str, int]) -> str:
-    """Return the name of the cached file with the machine code of a module.
-
-    The name contains a hash of everything on which the code depends: sources, constants, compiler
-    and processor. So a change of any of them leads to another file, and old code is never used.
-
-    Args:
-        module: name of the module.
-        constants: values that replace constants of the module, by name.
-    """
-    digest = hashlib.sha256()
-    for source in list_source_files(module):
-        digest.update(source.read_bytes())
-    digest.update(repr((machine_code.describe_processor(), sorted(constants.items()))).encode())
-    return f"{module.rpartition('.')[2]}-{digest.hexdigest()[:24]}.bin"
-
-
-def list_source_files(module: str) -> list[Path]:
-    """Return the source files from which the code of a module is compiled, and those around it."""
-    folder = Path(__file__).parent
-    files = [path for path in folder.glob("*.py") if path.name not in _PYTHON_MODULES]
-    files += [folder.parent / "ground_contact.py", Path(str(sys.modules[module].__file__))]
-    return sorted(set(files))

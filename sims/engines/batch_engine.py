@@ -9,12 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.core.engine import (
-    IntegrationBatch,
-    Trajectories,
-    check_positive,
-    make_unsupported_error,
-)
+from sims.core.argument_checks import check_positive
+from sims.core.engine import IntegrationBatch, Trajectories, make_unsupported_error
 from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
