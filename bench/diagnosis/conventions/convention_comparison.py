@@ -168,7 +168,8 @@ class ConventionComparison:
         Commands that are copies of measurements are returned alone: without commands, no other
         convention can be compared. Otherwise the search is greedy:
 
-        1. Find the joints at which the filter needs a missing force (suspects).
+        1. Find the suspects: the joints at which the filter can follow the log only with a large
+           additional force, which the model lacks.
         2. Select the best hypothesis about them, and correct the log by it.
         3. Repeat from 1 until no hypothesis is clearly better.
         4. Confirm all corrections together; if they are not confirmed, return none.
@@ -178,9 +179,9 @@ class ConventionComparison:
                 ConventionHypothesis(
                     f"command {command} equals {channel} digit for digit: it is a copy of the "
                     "measurement",
-                    {command: SignalChange(column)},
+                    changes={command: SignalChange(column)},
                 ),
-                np.inf,
+                gain=np.inf,
             )
             for command, channel, column in find_copied_commands(
                 self.subject.recording, self.subject.kind
@@ -195,10 +196,11 @@ class ConventionComparison:
             suspects = self._list_suspect_joints(
                 self._filter_runs(self._select_segments(corrected))
             )
-            # 2. The best hypothesis.
+            # 2. The best hypothesis about them.
             best = self._find_best_hypothesis(corrected, suspects) if suspects else None
             if best is None:
                 break
+            # 3. The next difference is searched in the corrected log.
             differences.append(best)
             corrected = best.hypothesis.applied(corrected)
         # 4. Confirmation.
@@ -328,7 +330,7 @@ class ConventionComparison:
         4. Refine free offsets, and require that factors of inputs are better than no inputs.
         5. Of equally likely hypotheses, select the simplest; the others are stated with it.
         """
-        # 1. Limits.
+        # 1. Limits. The log as described is the hypothesis without any changes.
         described = ConventionHypothesis("")
         limit = self._compute_log_likelihood(described, recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses already fail on the run that the log as described explains worst.
@@ -337,7 +339,7 @@ class ConventionComparison:
             for run in range(len(self._part_slices))
         ]
         worst_run = int(np.argmin(log_likelihood_by_run))
-        min_log_likelihood = (
+        min_worst_run_likelihood = (
             log_likelihood_by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
         )
         force_error = self._compute_log_force_error(described, recording, worst_run)
@@ -354,37 +356,34 @@ class ConventionComparison:
             )
             if force_error_growth > MAX_FORCE_ERROR_GROWTH:
                 continue
-            if (
-                not self._compute_log_likelihood(hypothesis, recording, worst_run)
-                > min_log_likelihood
-            ):
+            worst_run_likelihood = self._compute_log_likelihood(hypothesis, recording, worst_run)
+            if not worst_run_likelihood > min_worst_run_likelihood:
                 continue
             # 3. All runs.
             score = self._compute_log_likelihood(hypothesis, recording)
-            # For several offsets of one signal, the best one is refined.
-            best_known = best_by_description.get(hypothesis.description, (limit, hypothesis))
-            if score > best_known[0]:
+            # Hypotheses that differ only in an offset share their description; the best is kept.
+            best_score, _ = best_by_description.get(hypothesis.description, (limit, hypothesis))
+            if score > best_score:
                 best_by_description[hypothesis.description] = score, hypothesis
         # 4. Refinement.
-        ranked = sorted(best_by_description.values(), key=lambda pair: -pair[0])
-        refined = [self._refine_offset(*pair, recording) for pair in ranked[:MAX_REFINED]]
+        ranked = sorted(best_by_description.values(), key=lambda scored: scored[0], reverse=True)
+        refined = [
+            self._refine_offset(score, hypothesis, recording)
+            for score, hypothesis in ranked[:MAX_REFINED]
+        ]
         accepted = [
-            (score, rated_hypothesis)
-            for score, rated_hypothesis in (*refined, *ranked[MAX_REFINED:])
-            if score > limit and self._uses_inputs(score, rated_hypothesis, recording)
+            (score, hypothesis)
+            for score, hypothesis in (*refined, *ranked[MAX_REFINED:])
+            if score > limit and self._uses_inputs(score, hypothesis, recording)
         ]
         if not accepted:
             return None
         # 5. The simplest of the best.
         best = max(score for score, _ in accepted)
         equally_likely = [
-            rated_hypothesis
-            for score, rated_hypothesis in accepted
-            if score > best - EQUAL_LOG_LIKELIHOOD
+            hypothesis for score, hypothesis in accepted if score > best - EQUAL_LOG_LIKELIHOOD
         ]
-        simplest, *others = sorted(
-            equally_likely, key=lambda rated_hypothesis: rated_hypothesis.size
-        )
+        simplest, *others = sorted(equally_likely, key=lambda hypothesis: hypothesis.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
 
@@ -424,7 +423,8 @@ class ConventionComparison:
         """Return whether a hypothesis on units of inputs is better than having no inputs at all.
 
         A factor near zero switches an input off. This can improve the likelihood of a wrong model,
-        but it is not a unit. Hypotheses on other signals are accepted as they are.
+        but it is not a unit. The result is True for hypotheses that change other signals, or only
+        the signs or the order of inputs.
 
         Args:
             score: log-likelihood with the hypothesis.
@@ -432,14 +432,15 @@ class ConventionComparison:
             recording: segments of the recording.
         """
         inputs = recording.runs[0].inputs
-        signal_changes = hypothesis.changes
-        scales_inputs = all(
-            name in inputs and abs(c.scale) != 1.0 for name, c in signal_changes.items()
+        changes = hypothesis.changes
+        rescales_only_inputs = all(
+            name in inputs and abs(change.scale) != 1.0 for name, change in changes.items()
         )
-        if not signal_changes or not scales_inputs:
+        if not changes or not rescales_only_inputs:
             return True
         switched_off = {
-            name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in signal_changes.items()
+            name: replace(change, scale=OFF_FACTOR * change.scale)
+            for name, change in changes.items()
         }
         score_without_inputs = self._compute_log_likelihood(
             replace(hypothesis, changes=switched_off), recording
@@ -456,12 +457,13 @@ class ConventionComparison:
 
         Args:
             score: log-likelihood with the hypothesis.
-            hypothesis: hypothesis, with a first offset.
+            hypothesis: hypothesis, with a first offset. Without a free offset, it is returned as
+                it is.
             recording: short part of the recording.
 
         Returns:
-            Log-likelihood and hypothesis with the best offset; minus infinity if the offset is
-            negligible.
+            Log-likelihood and hypothesis with the best offset. If the best offset is negligible,
+            the log-likelihood is minus infinity, so that the hypothesis is rejected.
         """
         if not hypothesis.has_free_offset:
             return score, hypothesis
@@ -483,16 +485,14 @@ class ConventionComparison:
     ) -> float:
         """Return the log-likelihood of the recorded values under a hypothesis, on the short parts.
 
-        It is that of the filter's innovations for the converted signals, corrected for the change
-        of units: eq. (1) of the module docstring.
-
-        A factor k_c of channel c with N_c samples adds its Jacobian: log L(transformed y) + sum_c
-        N_c log |k_c| (1).
+        It is that of the filter's innovations for the converted signals. A factor k_c of channel c
+        with N_c samples rescales their density, so sum_c N_c log |k_c| is added: eq. (1) of the
+        module docstring.
 
         Args:
             hypothesis: Difference between the conventions.
             recording: Recording as it is described, or with some conventions corrected.
-            run: Number of the only run; None for all runs with parts.
+            run: Index of the only run to use; None for all runs of which parts are used.
         """
         self.evaluations += 1
         parts = self._select_segments(hypothesis.applied(recording), run)
@@ -589,11 +589,12 @@ class ConventionComparison:
 
         Args:
             recording: Recording as it is described, or with some conventions corrected.
-            run: Number of the only run; None for all runs with parts.
+            run: Index of the only run to use; None for all runs of which parts are used.
         """
+        # Only the first runs have parts.
         parts = [
-            run.part(part)
-            for run, part in zip(recording.training(), self._part_slices, strict=False)
+            training_run.part(part)
+            for training_run, part in zip(recording.training(), self._part_slices, strict=False)
         ]
         return replace(recording, runs=tuple(parts if run is None else parts[run : run + 1]))
 
@@ -620,7 +621,7 @@ def _cut_to_common_samples(first: Recording, second: Recording) -> tuple[Recordi
         second: the same runs, whose ends may be cut differently.
     """
     pairs = list(zip(first.runs, second.runs, strict=True))
-    counts = [min(a.times.size, b.times.size) for a, b in pairs]
+    counts = [min(run.times.size, same_run.times.size) for run, same_run in pairs]
 
     def cut(recording: Recording) -> Recording:
         runs = zip(recording.runs, counts, strict=True)
@@ -711,7 +712,8 @@ def _select_liveliest_part(run: Run) -> slice:
     Hypotheses are compared on such segments, because filtering whole runs would take too long. The
     starts that are compared are half a segment apart.
     """
-    # The commands after the end of a run are not known, and a hypothesis may move them.
+    # The hypothesis of late commands moves them to earlier samples, so the last samples of a run
+    # would have no command.
     count = run.times.size - max(LATE_SAMPLES)
     if count <= PART_SAMPLES:
         return slice(0, max(count, min(run.times.size, 2)))

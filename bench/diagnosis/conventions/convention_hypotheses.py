@@ -102,13 +102,14 @@ class ConventionHypothesis:
 
 
 def _advance_inputs(run: Run, delay: float) -> Run:
-    """Return a run with its inputs earlier by a delay in s, without its end, where they are lost.
+    """Return a run with its inputs moved to earlier times by a delay in s.
 
-    Samples are moved instead of the offset of the time stamps, because a part of a run contains no
-    inputs after its end. Inputs that are linear between samples are interpolated; others hold their
-    last value.
+    The end of the run is cut off, because its new inputs were not recorded. Samples are moved
+    instead of the offset of the time stamps, because a part of a run contains no inputs after its
+    end. Inputs that are linear between samples are interpolated; others hold their last value.
     """
     shifted_times = run.times + delay
+    # Samples whose new input was recorded, with half a delay of tolerance; a run has at least two.
     count = int(np.searchsorted(shifted_times, run.times[-1] + 0.5 * delay, side="right"))
     count = min(max(count, 2), run.times.size)
     inputs = {}
@@ -116,7 +117,7 @@ def _advance_inputs(run: Run, delay: float) -> Run:
         if name in run.linear:
             advanced = np.interp(shifted_times, run.times, values)
         else:
-            # The tolerance is for stamps that differ by rounding.
+            # Index of the last sample before; the tolerance is for stamps that differ by rounding.
             last_indices = (
                 np.searchsorted(run.times, shifted_times + 1e-6 * delay, side="right") - 1
             )
@@ -160,14 +161,26 @@ def list_recorded_joints(subject: Subject) -> list[JointSignals]:
     joints = []
     for coordinate in kind.system.coordinates:
         name = coordinate.removeprefix("q.")
-        actuators = [a for a in kind.robot.actuators if a.joint == name]
-        recorded = [a for a in actuators if f"u.{a.name}" in run.inputs]
+        names_by_quantity = {quantity: f"{quantity}.{name}" for quantity in QUANTITIES}
+        recorded_actuators = [
+            actuator
+            for actuator in kind.robot.actuators
+            if actuator.joint == name and f"u.{actuator.name}" in run.inputs
+        ]
         joints.append(
             JointSignals(
                 name=name,
-                channels={q: f"{q}.{name}" for q in QUANTITIES if f"{q}.{name}" in run.channels},
-                inputs=tuple(f"u.{a.name}" for a in recorded),
-                servo_inputs=tuple(f"u.{a.name}" for a in recorded if a.kind == "position"),
+                channels={
+                    q: channel
+                    for q, channel in names_by_quantity.items()
+                    if channel in run.channels
+                },
+                inputs=tuple(f"u.{actuator.name}" for actuator in recorded_actuators),
+                servo_inputs=tuple(
+                    f"u.{actuator.name}"
+                    for actuator in recorded_actuators
+                    if actuator.kind == "position"
+                ),
                 range=getattr(kind.robot.joint(name), "range", None),
                 is_hinge=units.get(coordinate) == "rad",
             )
@@ -226,10 +239,9 @@ class HypothesisGenerator:
         Args:
             recording: Recording in the units of its description.
         """
-        positions = self._list_channels("q")
+        positions, velocities, torques = map(self._list_channels, QUANTITIES)
         commands = [name for joint in self.joints for name in joint.servo_inputs]
-        groups = positions, commands, [*positions, *commands], self._list_channels("qd")
-        for names in (*groups, self._list_channels("tau")):
+        for names in (positions, commands, [*positions, *commands], velocities, torques):
             signals = [self._signals[name] for name in names]
             if len({(s.si, s.specified_unit, s.gain) for s in signals}) == 1:
                 yield from _generate_units(signals, recording)
@@ -250,10 +262,12 @@ class HypothesisGenerator:
             changes: dict[str, SignalChange] = {}
             for joint in limited:
                 assert joint.range is not None
+                # Position in rad or m of a percentage.
                 scale = compute_range_scale(*joint.range, from_zero=low == 0.0)
                 for name in (joint.channels["q"], *joint.servo_inputs):
-                    gain = scale.gain / self._signals[name].gain
-                    changes[name] = SignalChange(name, gain, scale.offset)
+                    # The values were multiplied by the gain of the stated unit, which is undone.
+                    factor = scale.gain / self._signals[name].gain
+                    changes[name] = SignalChange(name, factor, scale.offset)
             yield ConventionHypothesis(
                 f"positions and commands look normalised to {low:g} to {NORMALISED_RANGE:g} over "
                 "the range of each joint",
@@ -269,6 +283,7 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
+    # The only channel of a joint is in the first group already.
     if len(joint.channels) > 1:
         groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
     for names in groups:
@@ -293,6 +308,8 @@ def _generate_zero_offsets(
     hinge has a servo, the offset of the position alone is estimated as the mean difference of
     command and position.
 
+    The result is empty for a slide joint, or for a joint whose position is not recorded.
+
     Args:
         joint: joint with its recorded signals.
         recording: recording, of whose training runs the mean difference is taken.
@@ -309,8 +326,10 @@ def _generate_zero_offsets(
             changes = {name: SignalChange(name, 1.0, offset) for name in names}
             yield ConventionHypothesis(text, changes, has_free_offset=True)
         command = joint.servo_inputs[0]
-        differences = [run.inputs[command] - run.channels[position] for run in recording.training()]
-        position_offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
+        mean_differences = [
+            np.nanmean(run.inputs[command] - run.channels[position]) for run in recording.training()
+        ]
+        position_offsets = [float(np.mean(mean_differences))]
     # 2. Position alone.
     text = f"position {position} looks counted from another zero"
     for offset in position_offsets:
@@ -371,30 +390,33 @@ def _generate_joint_orders(
     orders = [{one: other, other: one} for one, other in combinations(suspect_indices, 2)]
     alphabetical = sorted(indices, key=lambda i: joints[i].name)
     orders += [
-        {i: alphabetical.index(i) for i in indices},
-        dict(enumerate(alphabetical)),
-        {i: len(joints) - 1 - i for i in indices},
+        {i: alphabetical.index(i) for i in indices},  # The log has the alphabetical order.
+        dict(enumerate(alphabetical)),  # The inverse.
+        {i: len(joints) - 1 - i for i in indices},  # The log has the reversed order.
     ]
     if has_commands and "q" in quantities:
         orders.append(_find_order_of_commands(joints, recording))
     for order in orders:
-        exchanged = {joint: source for joint, source in order.items() if joint != source}
+        exchanged = [
+            (joints[index], joints[source]) for index, source in order.items() if index != source
+        ]
         if not exchanged:
             continue
-        names = join_first_names([joints[joint].name for joint in sorted(exchanged)], MAX_NAMED)
+        exchanged_names = [
+            joints[index].name for index in indices if order.get(index, index) != index
+        ]
+        names = join_first_names(exchanged_names, MAX_NAMED)
         channels = {
-            joints[joint].channels[q]: SignalChange(joints[source].channels[q])
-            for joint, source in exchanged.items()
+            joint.channels[q]: SignalChange(source.channels[q])
+            for joint, source in exchanged
             for q in quantities
         }
         if channels:
             yield ConventionHypothesis(f"the channels of {names} look exchanged", channels)
         if not has_commands:
             continue
-        commands = {
-            joints[joint].inputs[0]: SignalChange(joints[source].inputs[0])
-            for joint, source in exchanged.items()
-        }
+        # Every joint has exactly one command.
+        commands = {joint.inputs[0]: SignalChange(source.inputs[0]) for joint, source in exchanged}
         yield ConventionHypothesis(f"the commands of {names} look exchanged", commands)
         if channels:
             text = f"the channels and commands of {names} look exchanged"
@@ -416,9 +438,10 @@ def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording
     count = len(joints)
     costs = np.zeros((count, count))
     for run in recording.training():
-        for a, b in np.ndindex(count, count):
-            difference = run.channels[joints[b].channels["q"]] - run.inputs[joints[a].inputs[0]]
-            costs[a, b] += float(np.nanvar(difference))
+        commands = [run.inputs[joint.inputs[0]] for joint in joints]
+        positions = [run.channels[joint.channels["q"]] for joint in joints]
+        for i, j in np.ndindex(count, count):
+            costs[i, j] += float(np.nanvar(positions[j] - commands[i]))
     return dict(enumerate(find_best_order(costs)))
 
 
@@ -433,7 +456,7 @@ def _generate_units(
 
     Args:
         signals: signals with the same stated unit.
-        recording: recorded runs, with their channels, inputs and constants.
+        recording: recording in SI units, converted as the description states.
     """
     first_signal = signals[0]
     names = [signal.name for signal in signals]
@@ -450,6 +473,7 @@ def _generate_units(
                 {name: SignalChange(name, scale) for name in names},
                 unit=unit,
             )
+    # Encoder ticks.
     if first_signal.si != "rad" or not _are_whole(signals, recording):
         return
     for ticks in TICKS_PER_TURN:
@@ -481,9 +505,9 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
 
 
 def _generate_late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield delays of command time stamps: the robot responds before them.
+    """Yield hypotheses that the time stamps of all commands are late by 1 to 8 samples.
 
-    A robot that seems to respond before a command shows that the stamps of commands are late.
+    Then the robot seems to respond before a command.
 
     Args:
         recording: Recording whose sampling interval is the unit of the delays.
@@ -511,7 +535,7 @@ MEASURED_QUANTITIES = {"position": "q", "velocity": "qd"}
 def find_copied_commands(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[tuple[str, str, str]]:
-    """Find commands of servos that equal the measurement of their joint in all samples.
+    """Yield the commands of servos that equal the measurement of their joint in all samples.
 
     Such a log does not contain the command: a servo whose command equals its position exerts no
     force.
@@ -520,7 +544,7 @@ def find_copied_commands(
         recording: Recording of a robot.
         kind: Simulator class of the robot.
 
-    Returns:
+    Yields:
         Name of the input, name of the channel that it equals, and the column that may be the
         command instead, `UNKNOWN_COLUMN` if there is none.
     """
@@ -536,6 +560,7 @@ def find_copied_commands(
         measured_values = np.concatenate([run.channels[channel] for run in runs])
         is_recorded = np.isfinite(measured_values)
         command_values, measured_values = command_values[is_recorded], measured_values[is_recorded]
+        # A joint that hardly moves may equal its command by chance.
         if len(np.unique(measured_values)) >= MIN_SAMPLES and np.array_equal(
             command_values, measured_values
         ):

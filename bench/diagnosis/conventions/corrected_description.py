@@ -68,11 +68,15 @@ def correct_description(
 def _move_to_column(
     tables: Mapping[str, Mapping[str, Any]], name: str, change: SignalChange
 ) -> dict[str, Any]:
-    """Return the description table of a signal after its values were taken from another column.
+    """Return a copy of a signal's table that reads the column from which a change takes the values.
 
-    The source of a change is another signal, whose table is taken over (if joints are exchanged),
-    or a column of the log that the description does not use. A table without ``column`` means the
-    column with the signal's name.
+    The source of a change is one of these:
+
+    - the signal itself: its table is returned unchanged;
+    - another signal, if joints are exchanged: its table is taken over, with its column;
+    - a column of the log that the description does not use: only the key ``column`` changes.
+
+    A table without ``column`` means the column with the signal's name.
 
     Args:
         tables: Tables of the description by signal.
@@ -81,12 +85,13 @@ def _move_to_column(
     """
     is_signal = change.source in tables
     table = dict(tables[change.source if is_signal else name])
-    if change.source != name:
-        if not is_signal:  # A column of the log that is not used so far.
-            return {**table, "column": change.source}
-        table.setdefault("column", change.source)
-        if table["column"] == name:
-            del table["column"]
+    if change.source == name:
+        return table
+    if not is_signal:
+        return {**table, "column": change.source}
+    table.setdefault("column", change.source)
+    if table["column"] == name:  # It is the default.
+        del table["column"]
     return table
 
 
@@ -97,16 +102,16 @@ def _change_scale(
 
     With the gain g of the stated unit and the present scale k and offset b of the table, a recorded
     value r is g (k r + b) in SI units. The correction converts this to c (g (k r + b)) + d, with
-    its factor c and its offset d in SI units. So the new scale is c k, and the new offset c b + d /
-    g.
+    its factor c and its offset d in SI units. So the new scale is c k, and the new offset is
+    c b + d / g. If the unit is wrong, only the key ``unit`` changes.
 
     Args:
-        table: present table of the signal in the description.
+        table: present table of the signal in the description; it is changed in place.
         si: SI unit of the signal.
         change: factor and offset that convert the present values to the right ones.
         hypothesis: the correction to which the change belongs, with the right unit if it has one.
     """
-    gain = compute_unit_scale(table["unit"], si).gain
+    unit_gain = compute_unit_scale(table["unit"], si).gain
     factor, offset = change.scale, change.offset
     if hypothesis.unit is not None:
         table["unit"] = hypothesis.unit
@@ -115,7 +120,7 @@ def _change_scale(
     if factor != 1.0:
         table["scale"] = _round_value(factor * old_scale)
     if offset or old_offset:
-        table["offset"] = _round_value(factor * old_offset + offset / gain)
+        table["offset"] = _round_value(factor * old_offset + offset / unit_gain)
     if change.unwrap:
         table["unwrap"] = change.command or True
     return table
@@ -129,6 +134,9 @@ def list_changed_tables(
     meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
 ) -> Iterator[str]:
     """Yield the lines that a user has to change in the description, one for each corrected signal.
+
+    A line has the name of the table and its new keys, such as ``[channels."q.elbow"] scale = -1``.
+    The last line corrects the time stamps, if commands are late.
 
     Args:
         meta: Content of the description.
@@ -204,15 +212,16 @@ def write_corrected(
             f'it, or write its column into [inputs."{unknown[0]}"] by hand'
         )
     description, meta = read_meta(recording)
+    old_folder, new_folder = description.parent.resolve(), path.parent.resolve()
     content = correct_description(meta, declared, differences)
     if "model" in content:
-        model = (description.parent / content["model"]).resolve()
-        content["model"] = os.path.relpath(model, path.parent.resolve())
+        content["model"] = os.path.relpath((old_folder / content["model"]).resolve(), new_folder)
     contents: dict[Path, str | bytes] = {path: tomli_w.dumps(content)}
     table = description.with_suffix(".csv")
     if table.exists():
         contents[path.with_suffix(".csv")] = table.read_bytes()
-    elif path.parent.resolve() != description.parent.resolve():
+    elif new_folder != old_folder:
+        # The description names the files of a log relative to its folder.
         raise InputError(
             f"{path}: expected a file in {description.parent}, where the log's files are"
         )

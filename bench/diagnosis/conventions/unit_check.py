@@ -202,6 +202,8 @@ class Hypothesis:
     def make_error(self, file: str, before: float | None, after: float | None) -> RecordingFault:
         """Return the hypothesis as a fault of the recording, with the lines that correct it.
 
+        The lines are those of the description file (TOML), one for the table of each signal.
+
         Args:
             file: Name of the description file.
             before: RMS residual of the base model in units of the noise; None if not measured.
@@ -300,14 +302,18 @@ class Subject:
         except InputError:
             # A recording made in memory has no description and is in SI units.
             conversions = {}
-        inputs = [c for c in self.kind.inputs if c.name in self.recording.runs[0].inputs]
-        declared_channels = [c for c in self.kind.channels if c.name in channels]
+        recorded_names = {"channels": channels, "inputs": self.recording.runs[0].inputs}
+        declared_signals = {"channels": self.kind.channels, "inputs": self.kind.inputs}
         signals = []
-        for kind, declared in (("channels", declared_channels), ("inputs", inputs)):
-            for c in declared:
-                signals.append(
-                    Signal(c.name, kind, c.unit, *conversions.get(c.name, (c.unit, 1.0, 1.0)))
-                )
+        for kind, names in recorded_names.items():
+            for declared in declared_signals[kind]:
+                if declared.name in names:
+                    specified_unit, gain, scale = conversions.get(
+                        declared.name, (declared.unit, 1.0, 1.0)
+                    )
+                    signals.append(
+                        Signal(declared.name, kind, declared.unit, specified_unit, gain, scale)
+                    )
         return tuple(signals)
 
     def rescale(self, factors: Mapping[str, float]) -> Recording:
@@ -334,6 +340,8 @@ def find_wrong_units(
     subject: Subject, evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
+
+    The base model is the simulator with fitted parameters, without effects.
 
     1. Stop if the base model explains every channel well enough.
     2. Select promising hypotheses, which rescale some signals.
@@ -362,38 +370,37 @@ def find_wrong_units(
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
     max_excess = MAX_REMAINING_SHARE * (before - 1.0)
-    accepted: list[tuple[Hypothesis, float]] = []
+    after_by_hypothesis: dict[Hypothesis, float] = {}
     alternative_texts: list[str] = []
-    # 3. Fits.
+    # 3. Fits. `after` is the RMS residual with the hypothesis, in units of the noise.
     for hypothesis in _select_promising(subject, hypotheses):
         after, residual_share = _fit_rescaled(subject, hypothesis.factors(), 1.0 + max_excess)
         if after - 1.0 > max_excess or residual_share > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction != "none":
-            accepted.append((hypothesis, after))
+            after_by_hypothesis[hypothesis] = after
         if distinction == "absorbed":
             alternative_texts += _describe_parameters_at_bounds(evaluator, base.fit)
-    if not accepted:
+    if not after_by_hypothesis:
         return None
     # 4. Choice.
     # Among hypotheses that fit equally well, the simplest is preferred.
-    lowest_misfit = min(after for _, after in accepted)
-    equally_good = [pair for pair in accepted if pair[1] <= MAX_EQUAL_RATIO * lowest_misfit]
-    equally_good.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
-    (best, after), *equal_others = equally_good
-    # Hypotheses that differ only in the sign are not alternatives.
-    same = best.signals, best.units
-    other_hypotheses = [pair for pair in equal_others if (pair[0].signals, pair[0].units) != same]
-    alternative_texts = [
-        *(
-            hypothesis.make_error(subject.file, None, None).says
-            for hypothesis, _ in other_hypotheses
-        ),
-        *alternative_texts,
+    max_equal_misfit = MAX_EQUAL_RATIO * min(after_by_hypothesis.values())
+    best, *others = sorted(
+        (h for h, after in after_by_hypothesis.items() if after <= max_equal_misfit),
+        key=lambda h: (len(h.signals), h.scale != 1.0),
+    )
+    other_texts = [
+        other.make_error(subject.file, None, None).says
+        for other in others
+        # Hypotheses that differ only in the sign are not alternatives.
+        if (other.signals, other.units) != (best.signals, best.units)
     ]
-    alternatives = tuple(dict.fromkeys(alternative_texts))
-    return replace(best.make_error(subject.file, known_before, after), alternatives=alternatives)
+    return replace(
+        best.make_error(subject.file, known_before, after_by_hypothesis[best]),
+        alternatives=tuple(dict.fromkeys([*other_texts, *alternative_texts])),
+    )
 
 
 def find_imitated_unit(
@@ -401,9 +408,9 @@ def find_imitated_unit(
 ) -> RecordingFault | None:
     """Return the wrong unit or sign that a fitted gain of a sensor or an input probably is.
 
-    The search may explain a wrong unit as a gain error: a gain of 57.3 is degrees instead of
-    radians. A gain that makes a reading nearly independent of the simulation is reported as a fault
-    too.
+    The search for causes may explain a wrong unit as a gain error: a gain of 57.3 is degrees
+    instead of radians. A gain that makes a reading nearly independent of the simulation is reported
+    as a fault too.
 
     1. Find the signal that the gain scales.
     2. Compare the gain with the factors of all units.
@@ -427,15 +434,12 @@ def find_imitated_unit(
     signal_name = evaluator.available_effects[cause.effect].signal
     kind = "channels" if effect == "sensor.gain" else "inputs"
     signals = [s for s in subject.signals(evaluator.channels) if s.kind == kind]
-    default_name = (
-        evaluator.simulator.system.reading(evaluator.channels) if kind == "channels" else ""
-    )
-    signal = next(
-        (s for s in signals if s.name == (signal_name or default_name)),
-        signals[0] if signals else None,
-    )
-    if signal is None or not gain:
+    if not signals or not gain:
         return None
+    if not signal_name and kind == "channels":
+        # An effect without a signal acts on the default reading of the system.
+        signal_name = evaluator.simulator.system.reading(evaluator.channels)
+    signal = next((s for s in signals if s.name == signal_name), signals[0])
     # 2. Units.
     # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
@@ -479,7 +483,9 @@ def _get_unit_gain(signal: Signal, unit: str) -> float:
 
 
 def _describe_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> tuple[str, ...]:
-    """Return a sentence for each parameter whose value in the base fit is at a bound of its range.
+    """Return a clause for each parameter whose value in the base fit is at a bound of its range.
+
+    Such a clause is stated as an alternative explanation of the misfit.
 
     Args:
         evaluator: the runs, with the bounds of the parameters.
@@ -510,15 +516,11 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
     residual_ratios = []
     for channel_index, sigma in enumerate(noise.sigma.tolist()):
         is_recorded = np.isfinite(evaluator.observed[..., channel_index])
-        deviation = (
-            float(np.std(evaluator.observed[..., channel_index][is_recorded]))
-            if is_recorded.any()
-            else 0.0
-        )
+        values = evaluator.observed[..., channel_index][is_recorded]
+        deviation = float(np.std(values)) if values.size else 0.0
         # A failed simulation counts as an infinite residual.
-        mean_square = float(
-            np.mean(np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf) ** 2)
-        )
+        channel_residual = np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf)
+        mean_square = float(np.mean(channel_residual**2))
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
         residual_ratios.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
     return np.array(residual_ratios)
@@ -540,19 +542,23 @@ def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) 
 
 
 def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[str] | None:
-    """Return the joints and actuators of a robot to check; None for other systems: check all.
+    """Return the joints and actuators of a robot whose signals may have a wrong unit or sign.
+
+    These are the joints of the `CHECKED_CHANNELS` channels with the largest residual, and the
+    actuators that drive them. For a system that is not a robot, the result is None: check all.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        shares: (C,) share of each channel in the squares of the residual.
+        shares: (C,) RMS residual of each channel, as a share of its standard deviation.
     """
     if not evaluator.kind.has_model:
         return None
-    worst = np.argsort(-shares)[:CHECKED_CHANNELS].tolist()
-    joints = {evaluator.channels[c].partition(".")[2] for c in worst}
-    robot: Any = evaluator.kind
-    drives = {a.name for a in robot.robot.actuators if a.joint in joints}
-    return frozenset(joints | drives)
+    worst_channels = np.argsort(-shares)[:CHECKED_CHANNELS].tolist()
+    # A channel is named after its joint, such as `q.elbow`.
+    joints = {evaluator.channels[channel].partition(".")[2] for channel in worst_channels}
+    kind: Any = evaluator.kind
+    actuators = {actuator.name for actuator in kind.robot.actuators if actuator.joint in joints}
+    return frozenset(joints | actuators)
 
 
 def _generate_hypotheses(
@@ -583,15 +589,17 @@ def _generate_hypotheses(
     # 3. Systems of units.
     for units in UNIT_SYSTEMS:
         related_signals = [s for s in signals if s.si in units]
+        # The values may be in this system instead of the specified units, or in SI units.
         for actual_units in (units, {si: si for si in units}):
             changed_signals = tuple(
                 s for s in related_signals if s.specified_unit != actual_units[s.si]
             )
+            # A single quantity is case 2.
             if len({s.si for s in changed_signals}) > 1:
                 yield Hypothesis(
                     changed_signals, tuple(actual_units[s.si] for s in changed_signals)
                 )
-        # A conversion to this system that was made twice multiplies all signals by one factor.
+        # If the log was converted from this system twice, all signals have the same wrong factor.
         if len({s.si for s in related_signals}) > 1:
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
@@ -619,8 +627,8 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
             yield Hypothesis(signals, (unit,) * len(signals))
             yield Hypothesis(signals, (unit,) * len(signals), -1.0)
             tested_factors.add(gain / stated)
-    # These factors undo a conversion that was made twice.
-    for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
+    double_conversions = [1.0 / gain for gain in units.values()] if units else [1e3, 1e-3]
+    for factor in double_conversions:
         if not any(math.isclose(factor, known, rel_tol=GAIN_TOLERANCE) for known in tested_factors):
             yield Hypothesis(signals, stated_units, factor)
             yield Hypothesis(signals, stated_units, -factor)
@@ -660,7 +668,7 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
         hypotheses: hypotheses to select from.
     """
 
-    def best(hypotheses: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+    def rank(hypotheses: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
         """Sort hypotheses by their misfit in the first `share` of each run, smallest first.
 
         The recording is simulated with the starting values of the base fit; nothing is fitted here.
@@ -676,10 +684,9 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
             evaluator.close()
         return [hypotheses[i] for i in np.argsort(scores, kind="stable").tolist()]
 
-    screened = best(hypotheses, SCREENING_SHARE)[:SCREENED_HYPOTHESES]
-    return list(
-        dict.fromkeys([*screened[:FITTED_HYPOTHESES], *best(screened, 1.0)[:FITTED_HYPOTHESES]])
-    )
+    best_at_beginning = rank(hypotheses, SCREENING_SHARE)[:SCREENED_HYPOTHESES]
+    best_in_whole_runs = rank(best_at_beginning, 1.0)[:FITTED_HYPOTHESES]
+    return list(dict.fromkeys([*best_at_beginning[:FITTED_HYPOTHESES], *best_in_whole_runs]))
 
 
 def _build_rescaled_evaluator(
@@ -713,7 +720,8 @@ def _fit_rescaled(
             of the runs exceeds it, or `MAX_RESIDUAL_SHARE`, both results are infinite.
 
     Returns:
-        RMS residual in units of the noise, and the largest share of a channel's deviation.
+        RMS residual in units of the noise, and the largest residual of a channel beyond the noise
+        as a share of the channel's standard deviation.
     """
     evaluator, noise = _build_rescaled_evaluator(subject, factors)
     is_recorded = np.isfinite(evaluator.observed)
@@ -730,23 +738,26 @@ def _fit_rescaled(
 
 
 def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float) -> float:
-    """Return the largest cost of a fit that leaves at most these residuals.
+    """Return the largest cost (sum of squared residuals in units of the noise) of a useful fit.
 
-    A fit with a larger cost explains the recording too badly, and need not be finished. If a
-    channel hardly moves, only the limit of all channels together applies.
+    A fit with a larger cost explains the recording too badly, and need not be finished. Two limits
+    apply, and the smaller one is returned: that of the RMS residual of all channels together, and
+    the sum of the limits of all channels, which is infinite if a channel hardly moves.
 
     Args:
         evaluator: Run evaluator of the rescaled recording.
         noise: White noise of each channel.
-        max_rms: Maximum RMS residual in units of the noise. In addition, the residual of each
-            channel is limited to `MAX_RESIDUAL_SHARE` of its standard deviation.
+        max_rms: Maximum RMS residual in units of the noise. The residual of each channel beyond its
+            noise is limited to `MAX_RESIDUAL_SHARE` of its standard deviation.
     """
     is_recorded = np.isfinite(evaluator.observed)
     max_squares = 0.0
     for channel_index, sigma in enumerate(noise.sigma.tolist()):
         values = evaluator.observed[..., channel_index][is_recorded[..., channel_index]]
         deviation = float(np.std(values)) if values.size else 0.0
-        excess = MAX_RESIDUAL_SHARE * deviation if deviation > MIN_MOTION_SIGMAS * sigma else np.inf
+        moves = deviation > MIN_MOTION_SIGMAS * sigma
+        excess = MAX_RESIDUAL_SHARE * deviation if moves else np.inf
+        # Squares of the excess and of the noise add.
         max_squares += values.size * ((excess / sigma) ** 2 + 1.0) if values.size else 0.0
     return min(max_rms**2 * float(is_recorded.sum()), max_squares)
 
@@ -754,11 +765,11 @@ def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float
 def _test_distinctness(
     subject: Subject, hypothesis: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
-    """Test whether a hypothesis fits clearly better than nearby factors, the second half of (1).
+    """Test whether a hypothesis fits clearly better than nearby factors.
 
     A wrong unit has one exact factor k. If other factors fit as well, the misfit has another
-    reason. With the excess residual e(k), the condition is e(k) < e(k / STEP) and e(k) < e(k STEP).
-    The tests are:
+    reason. With the RMS residual e(k), the condition is e(k) < e(k / s) and e(k) < e(k s), with the
+    step s = `FACTOR_STEP`. The tests are:
 
     1. A reversed sign has no nearby factors.
     2. A factor within 4 % of k that fits much better means a gain error.
@@ -778,9 +789,9 @@ def _test_distinctness(
 
     def residual_with_factor(step: float) -> float:
         """Return the RMS residual if the signals are multiplied by `step` in addition."""
-        return _fit_rescaled(subject, {name: step * k for name, k in hypothesis.factors().items()})[
-            0
-        ]
+        factors = {name: step * k for name, k in hypothesis.factors().items()}
+        rms, _ = _fit_rescaled(subject, factors)
+        return rms
 
     # 1. Sign.
     if hypothesis.scale == -1.0 and hypothesis.units == tuple(
