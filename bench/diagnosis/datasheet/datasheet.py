@@ -148,40 +148,35 @@ def build_datasheet(
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)
     is_driven = subject.is_driven(recording)
-    absent_effects = tuple(
-        name
-        for name, effect in (
-            (name, library.find_effect(name, kind.system))
-            for name in list_absent_effects(subject, extended)
-        )
-        if (is_driven or not _needs_drive(name, effect)) and not _is_stop(effect)
-    )
+    absent_effects = []
+    for absent_name in list_absent_effects(subject, extended):
+        effect = library.find_effect(absent_name, kind.system)
+        if (is_driven or not _needs_drive(absent_name, effect)) and not _is_stop(effect):
+            absent_effects.append(absent_name)
     candidates = [*extended.effects, *absent_effects]
     engine = None if kind.own_engine else extended.engine
     evaluator = RunEvaluator(kind, recording, recording.training(), engine, candidates=candidates)
     with closing(evaluator):
         # An effect on a channel that is not recorded has no visible influence.
         visible_effects = [
-            effect
-            for effect in absent_effects
-            if not evaluator.available_effects[effect].signal or _is_recorded(evaluator, effect)
+            absent_name
+            for absent_name in absent_effects
+            if not evaluator.available_effects[absent_name].signal
+            or _is_recorded(evaluator, absent_name)
         ]
-        rows = build_sheet_rows(
-            subject,
-            extended,
-            verdict,
-            compute_detection_limits(evaluator, extended, visible_effects),
-        )
+        limits = compute_detection_limits(evaluator, extended, visible_effects)
+        rows = build_sheet_rows(subject, extended, verdict, limits)
     return DataSheet(
         name or subject.joint or kind.name, subject, recording, verdict, extended, rows
     )
 
 
 def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
-    """List effects that can act here but are not in the model.
+    """Yield the names of effects that can act at the subject but are not in the model.
 
     Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
-    lack Coulomb friction. A coefficient of zero counts as absent.
+    lack Coulomb friction. So are effects at all places of a kind at once (families). An effect
+    whose coefficients are all zero counts as absent.
 
     Args:
         subject: Joint or system of the sheet.
@@ -189,18 +184,18 @@ def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> I
     """
     local_effects = [
         effect
-        for name, numbers in extended.effects.items()
-        for effect, _, number in subject.localise_effect(name, numbers)
-        if number.value != 0
+        for name, coefficients in extended.effects.items()
+        for effect, _, fitted_value in subject.localise_effect(name, coefficients)
+        if fitted_value.value != 0
     ]
     modelled = {*local_effects, *extended.effects}
-    effects = {effect.name: effect for effect in subject.list_effects()}
+    effect_classes = {effect.name: effect for effect in subject.list_effects()}
     simpler_effects = {
         contained_effect
         for name in local_effects
-        for contained_effect in getattr(effects.get(name), "contains", ())
+        for contained_effect in getattr(effect_classes.get(name), "contains", ())
     }
-    for name in effects:
+    for name in effect_classes:
         if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
             yield name
 

@@ -124,17 +124,22 @@ class _Rows:
     detection_limits: DetectionLimits
 
     def derived(self) -> Iterator[SheetRow]:
-        """Yield quantities derived from the system's parameters, by error propagation.
+        """Yield quantities that follow from the system's parameters, such as a stall torque.
 
-        The covariance of the fitted parameters is multiplied by the slopes of each derived
-        quantity, from forward differences. A quantity that needs an unknown or a varying constant
-        is left out.
+        The 95 % interval of a quantity with the gradient g by the fitted parameters, whose
+        covariance is C, extends by 1.96 sqrt(g'C g) to both sides (linear error propagation). The
+        gradient is computed by forward differences. A quantity that needs an unknown or a varying
+        constant is left out.
         """
-        parameters = self.extended.parameters
-        values = {name: fitted_value.value for name, fitted_value in parameters.items()}
-        values_by_name = {**self.extended.constants, **values}
-        free = [name for name in self.detection_limits.free if name in values]
-        indices = [self.detection_limits.free.index(name) for name in free]
+        parameters = {
+            name: fitted_value.value for name, fitted_value in self.extended.parameters.items()
+        }
+        values_by_name = {**self.extended.constants, **parameters}
+        indices, free = [], []
+        for index, name in enumerate(self.detection_limits.free):
+            if name in parameters:
+                indices.append(index)
+                free.append(name)
         covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
         for quantity in self.subject.kind.system.derived:
             try:
@@ -142,14 +147,11 @@ class _Rows:
             except (KeyError, ZeroDivisionError):
                 # A constant that differs between runs has no single value.
                 continue
-            slopes = []
-            for name in free:
+            gradient = np.zeros(len(free))
+            for i, name in enumerate(free):
                 step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
-                slopes.append(
-                    (quantity.of({**values_by_name, name: values_by_name[name] + step}) - value)
-                    / step
-                )
-            gradient = np.array(slopes)
+                stepped_values = {**values_by_name, name: values_by_name[name] + step}
+                gradient[i] = (quantity.of(stepped_values) - value) / step
             half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
             fitted_value = FittedValue(value, quantity.unit, value - half_width, value + half_width)
             row = SheetRow(
@@ -158,12 +160,14 @@ class _Rows:
             yield replace(row, strongest=quantity.strongest)
 
     def parameters(self) -> Iterator[SheetRow]:
-        """Yield the parameters of the system, or the free numbers of the robot's file here.
+        """Yield the parameters of the system, or those of the robot's joint.
 
-        Of a robot, the names have the form ``effect@place``, or ``effect@place.coefficient`` for
-        one of several coefficients; only numbers at this joint, its actuators and channels are
-        shown.
+        1. A system that is not a robot has all its parameters on the sheet.
+        2. The parameters of a robot are numbers of its model file that were fitted. Their names
+           have the form ``effect@place``, or ``effect@place.coefficient`` for one of several
+           coefficients. Only those at this joint, its actuators and its channels are on the sheet.
         """
+        # 1. System.
         if not self.subject.joint:
             for parameter in self.subject.kind.parameters:
                 nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
@@ -180,35 +184,29 @@ class _Rows:
                     ),
                 )
             return
+        # 2. Joint of a robot.
         for name, fitted_value in self.extended.parameters.items():
-            # The coefficient of an effect with several has its name after a point.
-            effect, _, place_and_coefficient = name.partition("@")
-            local_place = next(
-                (
-                    own_place
-                    for own_place in self.subject.places
-                    if place_and_coefficient
-                    in (own_place, f"{own_place}.{_get_coefficient_part(place_and_coefficient)}")
-                ),
-                "",
-            )
-            if local_place:
-                row = self._make_effect_row(f"{effect}@{local_place}", name, fitted_value, "fitted")
-                yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
+            effect_name, _, place = name.partition("@")
+            if place not in self.subject.places:
+                # Of an effect with several coefficients, the name of one follows after a point.
+                place, _, _ = place.rpartition(".")
+            if place in self.subject.places:
+                effect = f"{effect_name}@{place}"
+                row = self._make_effect_row(effect, name, fitted_value, "fitted")
+                yield self._add_prediction_interval(row, effect, name)
 
     def causes(self) -> Iterator[SheetRow]:
         """Yield the diagnosed causes that act at this joint, with their coefficients.
 
-        A cause at all places of a kind (a family) is resolved to the place of this joint. Its
-        coefficient here may be zero within its interval although it is not elsewhere: then the row
-        gives a detection limit instead.
+        A cause at all places of a kind, such as all joints (a family), is resolved to the places of
+        this joint. If the interval of its coefficient here contains zero, the row gives a detection
+        limit instead of the value.
         """
         for name, coefficients in self.extended.effects.items():
             local_coefficients = list(self.subject.localise_effect(name, coefficients))
             for effect, coefficient, fitted_value in local_coefficients:
+                # With a coefficient of zero, the effect is a row of `absent`.
                 if fitted_value.value == 0:
-                    # A coefficient of zero means that the effect is absent; its detection limit is
-                    # computed.
                     continue
                 has_several = (
                     sum(other_effect == effect for other_effect, _, _ in local_coefficients) > 1
@@ -220,12 +218,13 @@ class _Rows:
                 if _may_be_zero(fitted_value):
                     yield self._make_hidden_row(row, effect, fitted_value)
                     continue
-                place_suffix = (
-                    "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
-                )
-                parameter = (
-                    name if len(coefficients) == 1 else f"{name}.{coefficient}{place_suffix}"
-                )
+                # Name of the coefficient among the fitted parameters.
+                parameter = name
+                if len(coefficients) > 1:
+                    parameter += f".{coefficient}"
+                    if name.endswith(f"@{ALL_PLACES}"):
+                        _, _, place = effect.partition("@")
+                        parameter += f"@{place}"
                 yield self._add_prediction_interval(row, effect, parameter)
 
     def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
@@ -246,10 +245,10 @@ class _Rows:
         return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
-        """Build the row of a cause that acts at other places, but is not shown by the data here.
+        """Build the row of a cause that may be absent at this joint, although it acts at others.
 
         The row has a detection limit instead of a value: the larger end of the interval of the
-        coefficient.
+        coefficient, which contains zero.
 
         Args:
             row: row of the cause.
@@ -274,12 +273,17 @@ class _Rows:
 
         The detection limit is the smallest size that the data would have revealed.
         """
-        for (effect, coefficient), detection_limit in self.detection_limits.limits.items():
-            has_several = len({c for e, c in self.detection_limits.limits if e == effect}) > 1
-            label = f"{effect} {coefficient}" if has_several else effect
-            placed_effect = library.find_effect(effect, self.subject.kind.system)
-            c = next(c for c in placed_effect.coefficients if c.name == coefficient)
-            unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
+        system = self.subject.kind.system
+        limits = self.detection_limits.limits
+        for (effect, coefficient_name), detection_limit in limits.items():
+            has_several = sum(other_effect == effect for other_effect, _ in limits) > 1
+            label = f"{effect} {coefficient_name}" if has_several else effect
+            coefficient = next(
+                coefficient
+                for coefficient in library.find_effect(effect, system).coefficients
+                if coefficient.name == coefficient_name
+            )
+            unit = coefficient.unit_on(system, self.extended.observe) or "1"
             yield self._make_absent_effect_row(effect, label, unit, detection_limit)
 
     def _make_absent_effect_row(
@@ -331,6 +335,9 @@ class _Rows:
     ) -> SheetRow:
         """Build the row of a fitted parameter or a diagnosed cause.
 
+        The row of a cause also has its p-value, its alternatives, and the share of the held-out gap
+        that it closes, if the verdict states it.
+
         Args:
             effect: Effect with its place, as ``name@place``.
             label: Name of the row.
@@ -353,8 +360,9 @@ class _Rows:
         )
         if cause is None:
             return row
-        gains = [c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect]
-        share = next(iter(gains), None)
+        share = next(
+            (c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect), None
+        )
         return replace(row, p_value=cause.p_value, share=share, alternatives=cause.alternatives)
 
     def _find_cause(self, name: str) -> Cause | None:
@@ -381,10 +389,6 @@ def _make_fitted_row(
     """
     nominal = None if file_value is None else file_value.value
     return SheetRow(name, description, part, state, number.unit, number, nominal)
-
-
-def _get_coefficient_part(place: str) -> str:
-    return place.rpartition(".")[2]
 
 
 def _may_be_zero(number: FittedValue) -> bool:
@@ -500,8 +504,7 @@ class SheetContent:
             friction_text = "No friction law was found that holds it at rest"
         return (
             f"There is no drive: {reason}. Therefore this sheet has no drive and back-drive "
-            "diagram, and "
-            "no numbers of a drive; the table shows the other effects on the joint. "
+            "diagram, and no numbers of a drive; the table shows the other effects on the joint. "
             f"{friction_text}."
         )
 
@@ -520,22 +523,19 @@ class SheetContent:
     def lines(self) -> list[str]:
         """Format the sheet as text for the terminal: numbers first, then effects not detected.
 
-        Only a few of these are named; the files give the detection limit of each.
+        At most `NAMES_IN_TERMINAL` of the latter are named.
         """
         lines = [f"{sanitise(self.name, MAX_LINE_NAME_LENGTH)}: {self.verdict.verdict}"]
-        identified = [row for row in self.rows if row.number is not None]
         lines += [
             f"  {sanitise(row.name, MAX_LINE_NAME_LENGTH)} = {format_fitted_value(row.number)}"
-            for row in identified
-            if row.number
+            for row in self.rows
+            if row.number is not None
         ]
-        all_absent_names = [row.name for row in self.rows if row.number is None]
-        absent_names = all_absent_names[:NAMES_IN_TERMINAL]
-        unnamed_count = len(all_absent_names) - NAMES_IN_TERMINAL
+        absent_names = [row.name for row in self.rows if row.number is None]
+        unnamed_count = len(absent_names) - NAMES_IN_TERMINAL
         if unnamed_count > 0:
-            absent_names = [
-                *absent_names,
-                f"{unnamed_count} more (the sheet gives the detection limit of each)",
+            absent_names[NAMES_IN_TERMINAL:] = [
+                f"{unnamed_count} more (the sheet gives the detection limit of each)"
             ]
         lines.append(
             f"not detected in these data: {sanitise(joined(absent_names), 2000) or 'nothing'}"
@@ -590,6 +590,9 @@ def format_short_name(row: SheetRow) -> str:
 def format_evidence(row: SheetRow, is_short: bool = False) -> str:
     """Format the evidence for a number on the sheet.
 
+    For a cause, it is the p-value, the share of the held-out gap (the error on runs that were not
+    fitted) that the cause closes alone, and the alternatives.
+
     Args:
         row: Row of the sheet.
         is_short: Whether to use the short form for print.
@@ -597,11 +600,9 @@ def format_evidence(row: SheetRow, is_short: bool = False) -> str:
     if row.state == "derived":
         return "computed from the numbers below"
     if row.state == "fitted":
-        return (
-            "fitted"
-            if row.number and row.number.low is not None
-            else "not identified by these data"
-        )
+        has_interval = row.number is not None and row.number.low is not None
+        return "fitted" if has_interval else "not identified by these data"
+    # Otherwise the row is a diagnosed cause.
     is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
     unjudged_text = "not tested" if is_short else "the search ended before it was tested"
     phrases = [format_p_value(row.p_value) if is_judged else unjudged_text]
@@ -624,7 +625,8 @@ def format_detection_limit(row: SheetRow) -> str:
         row: Row of an effect that is not in the model.
 
     Returns:
-        Text such as "0 ± 0.02 N·m": a coefficient in this range would not have been detected.
+        Text such as "0 ± 0.02 N·m": a coefficient in this range would not have been detected. For a
+        backlash or a stop, it is such as "none above 0.1 rad".
     """
     detection_limit = row.detection_limit
     if detection_limit is None or detection_limit.size == float("inf"):
@@ -635,12 +637,8 @@ def format_detection_limit(row: SheetRow) -> str:
     if detection_limit.limit:
         return append_unit(f"none {detection_limit.limit} {size}", row.unit)
     if detection_limit.is_nonzero_if_fitted:
-        return (
-            append_unit(
-                f"{format_number(detection_limit.estimate_if_fitted, 2)} ± {size}", row.unit
-            )
-            + ", not diagnosed"
-        )
+        estimate = format_number(detection_limit.estimate_if_fitted, 2)
+        return append_unit(f"{estimate} ± {size}", row.unit) + ", not diagnosed"
     return append_unit(f"0 ± {size}", row.unit)
 
 

@@ -97,13 +97,14 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     """
     load_range, unit = diagram.axis_limit, format_unit(diagram.unit)
     load = diagram.load
+    # Infinite boundaries are drawn beyond the axes.
+    beyond_axes = 2 * load_range
     forward, backward = (
-        np.clip(boundary, -2 * load_range, 2 * load_range)
-        for boundary in (diagram.forward, diagram.back)
+        np.clip(boundary, -beyond_axes, beyond_axes) for boundary in (diagram.forward, diagram.back)
     )
-    axes.fill_between(load, forward, 2 * load_range, color=style.PALE_BLUE, linewidth=0)
+    axes.fill_between(load, forward, beyond_axes, color=style.PALE_BLUE, linewidth=0)
     axes.fill_between(load, backward, forward, color=style.HELD_OUT_GREY, linewidth=0)
-    axes.fill_between(load, -2 * load_range, backward, color=style.PALE_RUST, linewidth=0)
+    axes.fill_between(load, -beyond_axes, backward, color=style.PALE_RUST, linewidth=0)
     axes.plot(load, forward, color=style.BLUE, linewidth=1.5)
     axes.plot(load, backward, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
     axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
@@ -176,7 +177,7 @@ def draw_sheet(content: SheetContent) -> Figure:
 
 
 def _draw_heading(figure: Figure, content: SheetContent) -> float:
-    """Draw name, title and verdict; return the height of the space below, as a share.
+    """Draw the name of the sheet, the title of the log and the verdict at the top of the page.
 
     Args:
         figure: the page.
@@ -198,34 +199,40 @@ def _draw_heading(figure: Figure, content: SheetContent) -> float:
 
 
 def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> float:
-    """Draw the table of identified numbers; return the height of the space below, as a share.
+    """Draw the table of identified numbers, with the names of diagnosed causes in bold.
 
     Args:
         figure: figure to draw on.
         content: content of the data sheet.
         top: height of the top of the table, as a share of the page.
+
+    Returns:
+        Upper end of the free space below, as a share of the page height.
     """
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
-    table_cells = [
-        (
-            title(row, content.is_driven),
-            sanitise(format_name(row), 60),
-            sanitise(format_fitted_value(row.number), 70),
-            format_prediction_interval(row),
-            sanitise(format_evidence(row, is_short=True), 60),
+    table_cells: list[tuple[str, ...]] = []
+    cell_weights: list[tuple[str, ...]] = []
+    for row in content.rows:
+        if row.number is None:
+            continue
+        table_cells.append(
+            (
+                title(row, content.is_driven),
+                sanitise(format_name(row), 60),
+                sanitise(format_fitted_value(row.number), 70),
+                format_prediction_interval(row),
+                sanitise(format_evidence(row, is_short=True), 60),
+            )
         )
-        for row in content.rows
-        if row.number is not None
-    ]
-    is_cause = [row.state == "found" for row in content.rows if row.number is not None]
+        name_weight = "bold" if row.state == "found" else "normal"
+        cell_weights.append(("normal", name_weight, "normal", "normal", "normal"))
     size, columns = _choose_table_layout([heads, *table_cells])
     for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top", fontsize=size)
-    for cells, is_found in zip(table_cells, is_cause, strict=True):
+    for cells, weights in zip(table_cells, cell_weights, strict=True):
         # Lines of the table are a quarter wider apart than those of a text.
         top -= _LINE * 1.25
-        for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
-            weight = "bold" if is_found and i == 1 else "normal"
+        for x, text, weight in zip(columns, cells, weights, strict=True):
             figure.text(x, top, text, va="top", weight=weight, fontsize=size)
     return top - _LINE * 1.5
 
@@ -241,21 +248,18 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
     Returns:
         Font size in points, and left edges of the columns as shares of the page width.
     """
+    page_width, _ = A4_INCHES
     size = _TABLE_SIZE
     while True:
+        # Widths of the columns, and of the space between two of them, in inches.
         widths = [measure_text_width(column, size, "bold") for column in zip(*rows, strict=True)]
-        # Space between two columns in inches, for this font size.
         gap = 0.14 * size / _TABLE_SIZE
-        if (
-            sum(widths) + gap * (len(widths) - 1) <= A4_INCHES[0] * (1 - 2 * _MARGIN)
-            or size < _LEAST_SIZE
-        ):
+        table_width = sum(widths) + gap * (len(widths) - 1)
+        if table_width <= page_width * (1 - 2 * _MARGIN) or size < _LEAST_SIZE:
             break
         size -= 0.25
-    column_positions = np.concatenate(
-        [[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))]
-    )
-    return size, (_MARGIN + column_positions / A4_INCHES[0]).tolist()
+    left_edges = np.concatenate([[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))])
+    return size, (_MARGIN + left_edges / page_width).tolist()
 
 
 def _draw_effects_not_shown(
@@ -274,28 +278,30 @@ def _draw_effects_not_shown(
             foot of the page.
 
     Returns:
-        Height of the top of the table, as a share of the page.
+        Height of the top of the table with its heading, as a share of the page.
     """
-    lines_by_effect = []
-    names = [format_short_name(row) for row in content.rows if row.number is None]
-    name_length = min(max(map(len, names), default=0), _NAME_LETTERS)
+    absent_rows = [row for row in content.rows if row.number is None]
+    page_width, _ = A4_INCHES
+    name_length = min(
+        max((len(format_short_name(row)) for row in absent_rows), default=0), _NAME_LETTERS
+    )
     # A character of the monospaced font is 0.602 of its size wide.
-    limit_offset = (0.602 * size / POINTS * name_length + 0.12) / A4_INCHES[0]
-    letters = int((_HALF_WIDTH - limit_offset) * A4_INCHES[0] * POINTS / (_LETTER * size))
-    for row in content.rows:
-        if row.number is None:
-            confounding = format_confounding(row)
-            limit_text = format_detection_limit(row) + (
-                f" (confounded with {confounding})" if confounding and row.detection_limit else ""
-            )
-            lines = textwrap.wrap(limit_text, letters)
-            lines_by_effect.append((format_short_name(row), lines))
-    line = _SMALL * 1.2 * size / _SMALL_SIZE
+    limit_offset = (0.602 * size / POINTS * name_length + 0.12) / page_width
+    letters = int((_HALF_WIDTH - limit_offset) * page_width * POINTS / (_LETTER * size))
+    lines_by_effect: list[tuple[str, list[str]]] = []
+    for row in absent_rows:
+        limit_text = format_detection_limit(row)
+        confounding = format_confounding(row)
+        if confounding and row.detection_limit:
+            limit_text += f" (confounded with {confounding})"
+        lines_by_effect.append((format_short_name(row), textwrap.wrap(limit_text, letters)))
+    # The first column ends as soon as it has half of the lines.
     heights = [len(lines) for _, lines in lines_by_effect]
     split_row = next(
-        (i for i in range(len(lines_by_effect) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0
+        (i for i in range(len(heights) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0
     )
-    table_height = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
+    line_height = _SMALL * 1.2 * size / _SMALL_SIZE
+    table_height = line_height * max(sum(heights[:split_row]), sum(heights[split_row:]))
     # A long table must not overlap the foot of the page.
     table_top = max(table_top, _FOOT_HEIGHT + table_height)
     for column, part in enumerate((lines_by_effect[:split_row], lines_by_effect[split_row:])):
@@ -306,7 +312,7 @@ def _draw_effects_not_shown(
             )
             limit_text = "\n".join(lines)
             figure.text(x + limit_offset, y, limit_text, va="top", fontsize=size, linespacing=1.25)
-            y -= line * len(lines)
+            y -= line_height * len(lines)
     heading = "Not detected in these data, with the detection limit (95 %)"
     figure.text(_MARGIN, table_top + 0.018, heading, weight="bold", va="top")
     text = "Limits and backlash are detectable from the given size on. Made by simgap datasheet."

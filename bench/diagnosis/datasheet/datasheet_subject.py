@@ -28,12 +28,12 @@ class ModelFileValue(NamedTuple):
     Attributes:
         value: Value in the model file.
         unit: Unit of the value.
-        share: Whether the effect is a relative change of the value, not a difference from it.
+        is_relative: Whether the effect is a relative change of the value, not a difference from it.
     """
 
     value: float
     unit: str
-    share: bool
+    is_relative: bool
 
     def compute_total(self, number: FittedValue) -> FittedValue:
         """Return the value of the model file with an effect's coefficient applied.
@@ -56,10 +56,10 @@ class ModelFileValue(NamedTuple):
 
     def compute_half_width(self, coefficient_half_width: float) -> float:
         """Convert half an interval of the coefficient to half an interval of the total."""
-        return coefficient_half_width * self.value if self.share else coefficient_half_width
+        return coefficient_half_width * self.value if self.is_relative else coefficient_half_width
 
     def _add_correction(self, c: float) -> float:
-        return self.value * (1.0 + c) if self.share else self.value + c
+        return self.value * (1.0 + c) if self.is_relative else self.value + c
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,7 @@ class SheetSubject:
         """Return whether the joint is prismatic, not rotary."""
         if not self.joint:
             return self.kind.system.kind != "rotary"
-        (joint,) = (s for s in self._get_effect_places()["joint"] if s.name == self.joint)
-        return bool(joint.kind == "slide")
+        return bool(self._get_joint_place().kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
         """Return whether a drive acts here.
@@ -123,31 +122,35 @@ class SheetSubject:
     ) -> Iterator[tuple[str, str, FittedValue]]:
         """Yield the coefficients that a fitted effect has at this joint or system.
 
-        An effect at all places (a family) has a coefficient for each place, or one for all; effects
-        at other places yield nothing.
+        The name of an effect on a robot has the form ``EFFECT@PLACE``, where a place is a joint, an
+        actuator or a channel. There are two cases:
+
+        1. An effect at one place yields its coefficients if the place belongs to this subject.
+        2. An effect at all places of a kind (a family) has a coefficient ``NAME@PLACE`` for each
+           place, or one for all. It yields those of the places of this subject.
 
         Args:
             name: Name of the effect, possibly of a family.
-            coefficients: Fitted coefficients.
+            coefficients: Fitted coefficients by name.
 
         Yields:
             Name of the effect at this place, name of the coefficient, and its value.
         """
         effect_name, _, place = name.partition("@")
+        # 1. One place.
         if place != ALL_PLACES:
             if self.acts_here(library.find_effect(name, self.kind.system)):
-                yield from ((name, key, fitted_value) for key, fitted_value in coefficients.items())
+                for key, fitted_value in coefficients.items():
+                    yield name, key, fitted_value
             return
-        local_places = [
-            own_place.place for own_place in self.list_effects() if own_place.of == effect_name
-        ]
+        # 2. A family.
+        local_places = [effect.place for effect in self.list_effects() if effect.of == effect_name]
         for key, fitted_value in coefficients.items():
             coefficient, _, named_place = key.partition("@")
-            # A family with one coefficient for all places, such as a delay, has the same value
-            # here.
-            for own_place in [named_place] if named_place else local_places:
-                if own_place in self.places:
-                    yield f"{effect_name}@{own_place}", coefficient, fitted_value
+            # A coefficient for all places, such as a delay, has the same value here.
+            for coefficient_place in [named_place] if named_place else local_places:
+                if coefficient_place in self.places:
+                    yield f"{effect_name}@{coefficient_place}", coefficient, fitted_value
 
     def get_model_file_value(self, effect: str) -> ModelFileValue | None:
         """Return the value in the model file that an effect changes; None if there is none."""
@@ -162,30 +165,39 @@ class SheetSubject:
         """Return the model file's value of the number that an effect changes here.
 
         `base` is the name of the effect without its place, and `effect_place` the joint or
-        actuator. A number that an effect changes by a share of its value has its own unit; for
-        others the value has the unit of the effect's coefficient.
+        actuator, whose `stated` has the values by effect. A number that an effect changes by a
+        share of its value has its own unit; others have the unit of the effect's coefficient.
         """
         length, force = ("m", "N") if effect_place.kind == "slide" else ("rad", "N*m")
-        share = base in RELATIVE_VALUE_UNITS
-        effect = library.find_effect(f"{base}@{effect_place.name}", self.kind.system)
-        unit = RELATIVE_VALUE_UNITS[base] if share else effect.coefficients[0].units[0] or "1"
+        is_relative = base in RELATIVE_VALUE_UNITS
+        if is_relative:
+            unit = RELATIVE_VALUE_UNITS[base]
+        else:
+            effect = library.find_effect(f"{base}@{effect_place.name}", self.kind.system)
+            unit = effect.coefficients[0].units[0] or "1"
         # A servo has a negative bias, but its gain is positive.
         value = abs(effect_place.stated[base])
-        return ModelFileValue(value, unit.format(force=force, length=length), share)
+        return ModelFileValue(value, unit.format(force=force, length=length), is_relative)
 
     def _get_effect_places(self) -> Mapping[str, Any]:
         effect_places: Mapping[str, Any] = getattr(self.kind.system, "places", {})
         return effect_places
 
     def _is_on_joint(self, effect_place: Any) -> bool:
-        (joint,) = (s for s in self._get_effect_places()["joint"] if s.name == self.joint)
-        return bool(effect_place.coordinate == joint.coordinate)
+        return bool(effect_place.coordinate == self._get_joint_place().coordinate)
+
+    def _get_joint_place(self) -> Any:
+        (joint,) = (
+            place for place in self._get_effect_places()["joint"] if place.name == self.joint
+        )
+        return joint
 
 
 def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject:
     """Make the subject of a data sheet: a system, or a joint of a robot.
 
-    Effects belong to a joint if they act at it, at its actuators or at its channels.
+    An effect belongs to a joint if its place is the joint, one of its actuators or one of its
+    channels. A system that is not a robot is described as a whole.
 
     Args:
         kind: Simulator class of the system.
@@ -205,8 +217,7 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
     joint = joints[0] if joint is None else joint
     if joint not in joints:
         raise make_unknown_name_error(f"joint of robot {kind.name}", joint, joints)
-    subject_without_places = SheetSubject(kind, joint, frozenset())
-    channels = {f"{kind_of}.{joint}" for kind_of in ("q", "qd", "tau")}
-    return SheetSubject(
-        kind, joint, frozenset({joint, *subject_without_places.actuators, *channels})
-    )
+    # The actuators of a joint are those of a subject, which is made without its places first.
+    actuators = SheetSubject(kind, joint, frozenset()).actuators
+    channels = {f"{quantity}.{joint}" for quantity in ("q", "qd", "tau")}
+    return SheetSubject(kind, joint, frozenset({joint, *actuators, *channels}))

@@ -217,6 +217,7 @@ def _add_small_gaps(
         fit: fit of the model, at which the directions are computed.
         directions: directions of all candidates.
     """
+    # A probe is an effect with given coefficients; that of backlash has one: its size.
     smallest_probes: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:
         is_backlash = (
@@ -224,10 +225,8 @@ def _add_small_gaps(
             and evaluator.available_effects[probe.effect].coefficients[0].of
             not in NONLINEAR_COEFFICIENT_KINDS
         )
-        if is_backlash and (
-            probe.effect not in smallest_probes
-            or probe.coefficients[0] < smallest_probes[probe.effect].coefficients[0]
-        ):
+        smallest = smallest_probes.get(probe.effect)
+        if is_backlash and (smallest is None or probe.coefficients[0] < smallest.coefficients[0]):
             smallest_probes[probe.effect] = probe
     smaller_probes = [
         replace(probe, coefficients=probe.coefficients * 0.5**halvings)
@@ -236,14 +235,15 @@ def _add_small_gaps(
     ]
     if not smaller_probes:
         return directions
-    values = np.nan_to_num(
+    # Shape: sizes, runs, samples, channels. A failed simulation counts as no change.
+    responses = np.nan_to_num(
         compute_responses(
             evaluator, fit, [(probe.effect, probe.coefficients) for probe in smaller_probes]
         )
     )
     return DirectionSet(
         (*directions.candidates, *smaller_probes),
-        np.concatenate([directions.responses, np.moveaxis(values, 0, -1)], axis=3),
+        np.concatenate([directions.responses, np.moveaxis(responses, 0, -1)], axis=3),
     )
 
 
@@ -261,18 +261,21 @@ def _linearise_extended(
     """
     theta = build_theta(evaluator, extended)
     (prediction,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
-    known_values = [
-        extended.parameters.get(p.name)
-        for p in evaluator.parameters[: evaluator.system_parameter_count]
+    fitted_values = [
+        extended.parameters.get(parameter.name)
+        for parameter in evaluator.parameters[: evaluator.system_parameter_count]
     ]
     # A parameter without an interval was not fitted.
-    unfitted_parameters = {
-        i for i, number in enumerate(known_values) if number is None or number.low is None
-    }
+    unfitted_indices = frozenset(
+        index
+        for index, fitted_value in enumerate(fitted_values)
+        if fitted_value is None or fitted_value.low is None
+    )
     start = FitStart(tuple(extended.effects), theta, prediction.states)
-    return TrajectoryFitter(evaluator, noise, frozenset(unfitted_parameters)).fit_models(
-        [start], iterations=0
-    )[0]
+    # Without iterations, the fitter only simulates and differentiates at the start.
+    fitter = TrajectoryFitter(evaluator, noise, unfitted_indices)
+    (fit,) = fitter.fit_models([start], iterations=0)
+    return fit
 
 
 class _DetectionLimitCalculator:
@@ -333,15 +336,20 @@ class _DetectionLimitCalculator:
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, for the shape that is detected best.
 
-        A shape is a choice of the effect's other coefficients, such as a frequency. A limit or
-        backlash does not change the runs in proportion to its size, so its detection limit is the
-        smallest detectable size that was tried. At its best shape, an effect may equal a simpler
-        one that it contains; its next shape is used then.
+        There are two kinds of effects:
+
+        - Proportional effects: a shape is a choice of the effect's other coefficients, such as a
+          frequency, and its direction is one candidate of index k. At its best shape, an effect
+          may equal a simpler one that it contains; its next shape is used then. If all shapes
+          equal simpler effects, the effect gets no limit.
+        - Switching effects (a limit or backlash) do not change the runs in proportion to their
+          size, so their detection limit is one of the sizes that were tried.
 
         Args:
             prediction_half_widths: half the 95 % interval of each parameter in a run that is not
                 yet recorded, by name; passed on to the result.
         """
+        # Indices of the shapes by effect and coefficient index, the most informative first.
         shapes_by_coefficient: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.direction_set.candidates[k]
@@ -349,17 +357,14 @@ class _DetectionLimitCalculator:
                 shapes_by_coefficient.setdefault(
                     (probe.effect, probe.coefficient_index), []
                 ).append(k)
-        best_shape = {key: probe_indices[0] for key, probe_indices in shapes_by_coefficient.items()}
+        best_shape = {key: shapes[0] for key, shapes in shapes_by_coefficient.items()}
         switching_effects = dict.fromkeys(
             probe.effect for probe in self.direction_set.candidates if probe.is_single_size
         )
         detection_limits = {}
-        for (name, coefficient_index), probe_indices in shapes_by_coefficient.items():
-            # At that shape a richer law may be equivalent to a simpler one that it contains.
+        for (name, coefficient_index), shapes in shapes_by_coefficient.items():
             new_shapes = [
-                k
-                for k in probe_indices
-                if not self._is_covered_by_simpler_effect(name, k, best_shape)
+                k for k in shapes if not self._is_covered_by_simpler_effect(name, k, best_shape)
             ]
             if name not in switching_effects and new_shapes:
                 detection_limits[name, self._get_coefficient_name(name, coefficient_index)] = (
@@ -396,21 +401,14 @@ class _DetectionLimitCalculator:
             k: index of the direction.
         """
         power = self.powers[k]
-        size = Z95 / np.sqrt(power) if power > 0 else np.inf
-        parameter = self.evaluator.parameters[
-            self._get_coefficient_index(self.direction_set.candidates[k])
-        ]
-        low, high = parameter.bounds
+        size = float(Z95 / np.sqrt(power)) if power > 0 else np.inf
+        confounded_with = self._list_confounded_parameters(k)
+        coefficient_index = self._get_coefficient_index(self.direction_set.candidates[k])
+        low, high = self.evaluator.parameters[coefficient_index].bounds
         # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
-            return DetectionLimit(
-                float(size), confounded_with=self._list_confounded_parameters(k), is_unbounded=True
-            )
-        return DetectionLimit(
-            float(size),
-            float(self.newton_steps[k]),
-            confounded_with=self._list_confounded_parameters(k),
-        )
+            return DetectionLimit(size, confounded_with=confounded_with, is_unbounded=True)
+        return DetectionLimit(size, float(self.newton_steps[k]), confounded_with=confounded_with)
 
     def _get_coefficient_index(self, probe: CandidateDirection) -> int:
         return self.evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
@@ -418,9 +416,10 @@ class _DetectionLimitCalculator:
     def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
         """Return the parameters of the model that together have nearly the same influence.
 
-        Without the parameters, the information on coefficient k would be `products[i, i]`; with
-        them only `powers[k]` remains. If the share that remains is above 1 -
-        `CONFOUNDING_CORRELATION`^2, nothing is confounded with it.
+        `products` has the inner products of the columns of the least-squares problem: first the q
+        parameters, then the candidates. Without the parameters, the information on candidate k
+        would be its diagonal element i = q + k; with them only `powers[k]` remains. If the share
+        that remains is above 1 - `CONFOUNDING_CORRELATION`^2, nothing is confounded with it.
 
         Args:
             k: Index of the candidate coefficient.
@@ -431,11 +430,11 @@ class _DetectionLimitCalculator:
         i = self.q + k
         if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.products[i, i]:
             return ()
-        # Contributions are relative to the largest one.
-        parts = np.abs(self.projections[k]) * np.sqrt(np.diagonal(self.products)[: self.q])
-        parts /= max(float(parts.max(initial=0.0)), 1e-300)
-        order = np.argsort(-parts).tolist()
-        return tuple(self.free[j] for j in order if parts[j] > MIN_CONFOUNDING_SHARE)
+        # Norm of each parameter's part in the direction of the candidate, relative to the largest.
+        contributions = np.abs(self.projections[k]) * np.sqrt(np.diagonal(self.products)[: self.q])
+        contributions /= max(float(contributions.max(initial=0.0)), 1e-300)
+        order = np.argsort(-contributions).tolist()
+        return tuple(self.free[j] for j in order if contributions[j] > MIN_CONFOUNDING_SHARE)
 
     def _is_covered_by_simpler_effect(
         self, name: str, k: int, best: Mapping[tuple[str, int], int]
@@ -443,30 +442,34 @@ class _DetectionLimitCalculator:
         """Return whether a simpler effect that this effect contains has an equivalent coefficient.
 
         Then both change the runs alike (their directions are nearly parallel), and a limit for the
-        richer effect would only repeat that of the simpler one. The simpler effect may be in the
-        model or not.
+        richer effect would only repeat that of the simpler one. The simpler effect may be absent,
+        or it may be in the model.
 
         Args:
             name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-            k: index of the probe of its coefficient.
-            best: index of the probe with the best shape, by effect and coefficient index.
+            k: index of the candidate direction of its coefficient.
+            best: index of the candidate direction with the best shape, by effect and coefficient
+                index.
         """
         simpler_effects = set(self.evaluator.available_effects[name].contains)
-        other_columns = [
-            self.q + column for (effect, _), column in best.items() if effect in simpler_effects
+        # Columns of the least-squares problem: the fitted parameters, then the candidates.
+        simpler_columns = [
+            self.q + candidate
+            for (effect, _), candidate in best.items()
+            if effect in simpler_effects
         ]
         for effect in simpler_effects & set(self.evaluator.coefficient_slices):
-            effect_places = self.evaluator.get_coefficient_indices(effect)
-            other_columns += [
-                column for column, place in enumerate(self.free_indices) if place in effect_places
+            coefficient_indices = self.evaluator.get_coefficient_indices(effect)
+            simpler_columns += [
+                column
+                for column, parameter_index in enumerate(self.free_indices)
+                if parameter_index in coefficient_indices
             ]
         own_column = self.q + k
-        for column in other_columns:
-            scale = np.sqrt(self.products[own_column, own_column] * self.products[column, column])
-            if (
-                scale > 0
-                and abs(self.products[own_column, column]) / scale > SAME_COEFFICIENT_CORRELATION
-            ):
+        for column in simpler_columns:
+            norms = np.sqrt(self.products[own_column, own_column] * self.products[column, column])
+            product = abs(self.products[own_column, column])
+            if norms > 0 and product / norms > SAME_COEFFICIENT_CORRELATION:
                 return True
         return False
 
@@ -475,32 +478,26 @@ class _DetectionLimitCalculator:
 
         Directions of several fixed sizes of the effect were computed. A size is detectable if it
         changes the runs by at least `MIN_DETECTABLE_LIMIT_SIGMAS`, after the parameters of the
-        model have absorbed what they can.
+        model have absorbed what they can. The result is the largest detectable size of a limit
+        (which has more influence the smaller it is), or the smallest one of backlash (which has
+        more influence the larger it is); infinite if no size is detectable.
 
         Args:
             name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
-        probes = [
-            (k, p)
-            for k, p in enumerate(self.direction_set.candidates)
-            if p.effect == name and p.is_single_size
-        ]
-        sizes_with_index = sorted((float(p.coefficients[0]), k) for k, p in probes)
+        sizes_and_candidates = sorted(
+            (float(probe.coefficients[0]), k)
+            for k, probe in enumerate(self.direction_set.candidates)
+            if probe.effect == name and probe.is_single_size
+        )
         detectable_sizes = [
             size
-            for size, k in sizes_with_index
+            for size, k in sizes_and_candidates
             if np.sqrt(self.powers[k]) >= MIN_DETECTABLE_LIMIT_SIGMAS
         ]
-        # A limit has more influence the smaller it is, and backlash the larger it is.
-        smallest_information, largest_information = (
-            self.products[self.q + k, self.q + k]
-            for _, k in (sizes_with_index[0], sizes_with_index[-1])
-        )
-        is_upper_limit = bool(smallest_information > largest_information)
-        if not detectable_sizes:
-            return DetectionLimit(np.inf, limit="below" if is_upper_limit else "above")
-        return (
-            DetectionLimit(max(detectable_sizes), limit="below")
-            if is_upper_limit
-            else DetectionLimit(min(detectable_sizes), limit="above")
-        )
+        # Information on a candidate before the parameters absorb a part of it.
+        (_, smallest), (_, largest) = sizes_and_candidates[0], sizes_and_candidates[-1]
+        information = np.diagonal(self.products)[self.q : -1]
+        if information[smallest] > information[largest]:
+            return DetectionLimit(max(detectable_sizes, default=np.inf), limit="below")
+        return DetectionLimit(min(detectable_sizes, default=np.inf), limit="above")

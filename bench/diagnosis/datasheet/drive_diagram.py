@@ -127,6 +127,7 @@ def compute_drive_diagram(
     joint = _Joint(subject, extended)
     zero = np.zeros(1)
     no_load_friction = float(joint.friction(zero, zero)[0])
+    # Without friction either, any range shows the diagram.
     load_range = force_limit or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
     load = np.linspace(-load_range, load_range, LOAD_POINT_COUNT)
     search_range = MAX_FORCE_FACTOR * load_range
@@ -137,6 +138,7 @@ def compute_drive_diagram(
     def backward_balance(u: Array, p: Array) -> Array:
         return u - p + joint.pull(u, p) + joint.friction(u, p)  # (2)
 
+    # Increases with the load, and is zero where the load starts to drive the motor.
     def unpowered_balance(p: Array) -> Array:
         return -backward_balance(np.zeros_like(p), p)
 
@@ -165,14 +167,15 @@ def _find_roots(function: Callable[[Array], Array], search_range: float, count: 
         count: number N of functions.
     """
     low, high = np.full(count, -search_range), np.full(count, search_range)
-    is_below_zero, is_above_zero = function(high) <= 0, function(low) > 0
+    is_never_positive, is_always_positive = function(high) <= 0, function(low) > 0
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         is_positive = function(middle) > 0
         low, high = np.where(is_positive, low, middle), np.where(is_positive, middle, high)
-    # A zero is only found up to the rounding error of the bisection.
-    middle = np.where(np.abs(high) < ROUNDING_SHARE * search_range, 0.0, 0.5 * (low + high))
-    root: Array = np.where(is_below_zero, np.inf, np.where(is_above_zero, -np.inf, middle))
+    # Points within the rounding error of the bisection are exactly zero.
+    root: Array = np.where(np.abs(high) < ROUNDING_SHARE * search_range, 0.0, 0.5 * (low + high))
+    root[is_always_positive] = -np.inf
+    root[is_never_positive] = np.inf
     return root
 
 
@@ -182,27 +185,25 @@ class _Joint:
     def __init__(self, subject: SheetSubject, extended: ExtendedSimulator) -> None:
         """Collect the static force and friction laws that the extended simulator has at the joint.
 
-        `laws` has each law with its coefficients (k, 1, 1). `without` names the laws with a hidden
-        state; the diagram omits them because they act before the drive force. `stated` is the
+        `laws` has each law with its K coefficients (K, 1, 1). `without` names the laws with a
+        hidden state, which have no fixed force at rest; the diagram omits them. `stated` is the
         Coulomb friction in the model file, in N or N·m; 0 if there is none.
         """
         self.system = _Slide() if subject.is_prismatic else _StaticJoint()
         self.laws: list[tuple[Effect, Array]] = []
         self.without: tuple[str, ...] = ()
-        by_effect: dict[str, dict[str, float]] = {}
-        for name, numbers in extended.effects.items():
-            for effect, coefficient, number in subject.localise_effect(name, numbers):
-                by_effect.setdefault(effect, {})[coefficient] = number.value
-        for name, values in by_effect.items():
+        values_by_effect: dict[str, dict[str, float]] = {}
+        for name, coefficients in extended.effects.items():
+            for effect, coefficient, fitted_value in subject.localise_effect(name, coefficients):
+                values_by_effect.setdefault(effect, {})[coefficient] = fitted_value.value
+        for name, values in values_by_effect.items():
             law = library.get_effect(name.partition("@")[0])
-            # The law of a drive acts before the drive force, which is given here.
             if issubclass(law, HiddenStateEffect):
                 self.without = (*self.without, law.name)
+            # The law of a drive changes the drive force, which is given here.
             elif law.at == "joint" and issubclass(law, Friction | Force):
-                c = np.array(
-                    [values.get(law_coefficient.name, 0.0) for law_coefficient in law.coefficients]
-                )
-                self.laws.append((law(), c[:, None, None]))
+                law_values = np.array([values.get(c.name, 0.0) for c in law.coefficients])
+                self.laws.append((law(), law_values[:, None, None]))
         file_friction = (
             subject.get_model_file_value(f"friction.coulomb@{subject.joint}")
             if subject.joint
@@ -218,14 +219,16 @@ class _Joint:
         """
         moment = self._make_rest_state(drive, load)
         limits = [np.full(len(drive), self.stated)]
-        for law, c in self.laws:
+        for law, coefficients in self.laws:
             if isinstance(law, Friction):
-                limits.append(law.limit(_expand_coefficients(c, drive), moment)[:, 0])
+                limits.append(law.limit(_expand_coefficients(coefficients, drive), moment)[:, 0])
         holding_force: Array = np.maximum(np.sum(limits, axis=0), 0.0)
         return holding_force
 
     def pull(self, drive: Array, load: Array) -> Array:
-        """Compute the sum (N,) of the other forces on the joint at rest, such as a bias.
+        """Compute the sum (N,) of the forces on the joint at rest that are not friction.
+
+        An example is a constant bias. The drive force and the load are not included.
 
         Args:
             drive: (N,) forces of the drive, in N or N·m.
@@ -233,9 +236,9 @@ class _Joint:
         """
         moment = self._make_rest_state(drive, load)
         forces = [np.zeros(len(drive))]
-        for law, c in self.laws:
+        for law, coefficients in self.laws:
             if isinstance(law, Force):
-                forces.append(law.force(_expand_coefficients(c, drive), moment)[:, 0])
+                forces.append(law.force(_expand_coefficients(coefficients, drive), moment)[:, 0])
         pull: Array = np.sum(forces, axis=0)
         return pull
 

@@ -82,9 +82,9 @@ def describe_log_for_model(
 ) -> Iterator[tuple[str, str]]:
     """Yield file name and text of a description of the log, in which its runs are marked held out.
 
-    With it, the exported model can be scored on the same log. Signals get the names of the model.
-    Runs in which the motor is off for a time are not marked, since the model cannot switch it.
-    Nothing is yielded for a log of several files.
+    With it, the exported model can be scored on the same log, as scores are computed on held-out
+    runs. Signals get the names of the model. Runs in which the motor is off for a time are not
+    marked, since the model cannot switch it. Nothing is yielded for a log of several files.
 
     Args:
         sheet: content of the data sheet, with the recording.
@@ -173,13 +173,15 @@ def _compute_friction_limits(
     (coordinate,) = system.coordinates
     position = run.channels[coordinate]
     rate = np.gradient(position, run.times)
+    # The samples are the T elements of a batch, each with one state.
     shape = (len(position), 1)
     theta = np.array([[group.numbers[p.name] for p in kind.parameters]])
-    effect_coefficients = effect.on(system)
-    coefficients = [
-        numbers[coefficient.name].value if coefficient.name in numbers else 0.0
-        for coefficient in effect_coefficients
-    ]
+    coefficients = np.array(
+        [
+            numbers[coefficient.name].value if coefficient.name in numbers else 0.0
+            for coefficient in effect.on(system)
+        ]
+    )
     state = StateSnapshot(
         system,
         np.repeat(theta, len(position), axis=0),
@@ -192,10 +194,8 @@ def _compute_friction_limits(
         rate[:, None],
         {name: values[:, None] for name, values in run.inputs.items()},
     )
-    batch_coefficients = np.array(coefficients)[:, None, None]
-    limit: Array = effect().limit(
-        np.broadcast_to(batch_coefficients, (len(batch_coefficients), *shape)), state
-    )[:, 0]
+    batch_coefficients = np.broadcast_to(coefficients[:, None, None], (len(coefficients), *shape))
+    limit: Array = effect().limit(batch_coefficients, state)[:, 0]
     return limit
 
 
@@ -330,17 +330,17 @@ def _render_class(
     from sims.robot.export.xml_editing import NotEditableError
 
     applied = apply_causes(robot, causes, sheet.extended.title)
-    ids = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    joint_id = robot.joint(joint).id
+    actuator_id = robot.actuator(actuator).id if actuator else None
     class_notes = [*notes, *applied.notes]
-    text = render_default_class(applied, *ids, name, class_notes)
+    text = render_default_class(applied, joint_id, actuator_id, name, class_notes)
     try:
+        model = render_model_using_class(robot, applied, joint_id, actuator_id, name, text)
+    except NotEditableError as error:
         return _DefaultClass(
-            text, class_notes, render_model_using_class(robot, applied, *ids, name, text)
+            text, [*class_notes, f"no model that uses the class is written: {error}"]
         )
-    except NotEditableError as unfit:
-        return _DefaultClass(
-            text, [*class_notes, f"no model that uses the class is written: {unfit}"]
-        )
+    return _DefaultClass(text, class_notes, model)
 
 
 def make_class_name(name: str) -> str:
@@ -358,6 +358,7 @@ def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
     """
     title = sheet.recording.title or sheet.recording.path.stem
     heading = f"{make_class_name(sheet.name)}: data sheet from {title}; written by simgap datasheet"
+    # An XML comment must not contain two hyphens in a row.
     escaped_heading = re.sub(r"-(?=-)", "- ", heading)
     inner = "\n".join(rendered.text for rendered in classes).replace("\n", "\n    ")
     return (
@@ -405,10 +406,12 @@ def _map_effects_to_model(
                 f"{mean_limit:.4g} N·m"
             )
             continue
+        # An effect on the environment has no place.
         place = place_by_kind.get(effect.at, "")
         zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
-            c.name: numbers.get(c.name, zero_value) for c in effect.on(sheet.subject.kind.system)
+            coefficient.name: numbers.get(coefficient.name, zero_value)
+            for coefficient in effect.on(sheet.subject.kind.system)
         }
         coefficients_by_place[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
