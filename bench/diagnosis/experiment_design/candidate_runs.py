@@ -1,8 +1,7 @@
 """Candidate runs that could be recorded next, within the limits that a model file specifies.
 
-An MJCF specifies joint ranges, force limits of joints (`actuatorfrcrange`), control ranges and
-force ranges of actuators. A URDF specifies joint ranges, efforts and velocities; MuJoCo does not
-compile the velocities, so they are read from the file (`urdf_loading.read_velocity_limits`).
+There are two kinds: runs by a plan (`RigModel`), and present runs with one change
+(`iterate_changed_runs`).
 
 A plan sets the driven inputs, the form, size and offset of the command, the initial state, the
 constants (such as a load) and the sampling rate.
@@ -11,166 +10,25 @@ constants (such as a load) and the sampling rate.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.core.input_signals import evaluate_signal
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.safety_limits import (
+    UNLIMITED,
+    Interval,
+    StatedLimits,
+    read_model_file_limits,
+)
 from sims.core.simulator import Array, Scenario
 
-Interval = tuple[float, float]
-UNLIMITED: Interval = (-np.inf, np.inf)
 MAX_PROBE_FREQUENCY = 8.0
 """Largest frequency of a proposed command, Hz."""
 MAX_CYCLES_PER_SAMPLE = 0.1
 """Largest frequency of a proposed command, in cycles per sample interval."""
-
-
-@dataclass(frozen=True)
-class StatedLimits:
-    """Limits of a robot's model file; empty for a system without one.
-
-    Attributes:
-        commands: Minimum and maximum of each limited input, in its unit. The command of a joint's
-            actuator respects its control range and the limits of the joint: a torque respects
-            effort and force range, a set point the joint's range or velocity.
-        positions: Limits of joints by channel ``q.JOINT``, in rad or m.
-        velocities: Limits of joints by channel ``qd.JOINT``, in rad/s or m/s.
-        forces: Limits of joints by channel ``tau.JOINT``, in N m or N; infinite if the simulation
-            itself limits the force of every actuator of the joint.
-    """
-
-    commands: Mapping[str, Interval] = field(default_factory=dict)
-    positions: Mapping[str, Interval] = field(default_factory=dict)
-    velocities: Mapping[str, Interval] = field(default_factory=dict)
-    forces: Mapping[str, Interval] = field(default_factory=dict)
-
-    @property
-    def states(self) -> Mapping[str, Interval]:
-        """Limits of positions and velocities, by name of the state."""
-        return {**self.positions, **self.velocities}
-
-    @property
-    def channels(self) -> Mapping[str, Interval]:
-        """Limits of all channels, by name."""
-        return {**self.states, **self.forces}
-
-
-def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
-    """Read the limits of commands, positions, velocities and forces from a robot's model file.
-
-    Proposed runs must stay within them. A system without a model file has none. A force is
-    unlimited here if the simulation itself limits that of every actuator of the joint.
-
-    Args:
-        evaluator: Evaluator of the recorded runs.
-    """
-    if not evaluator.kind.has_model:
-        return StatedLimits()
-    kind: Any = evaluator.kind
-    robot = kind.robot
-    joints = {joint.name: joint for joint in robot.joints if joint.has_one_coordinate}
-    forces = {}
-    for name, joint in joints.items():
-        drives = [actuator for actuator in robot.actuators if actuator.joint == name]
-        if joint.effort is not None:
-            forces[f"tau.{name}"] = _get_effort_limit(robot, joint)
-        elif drives and all(actuator.force is not None for actuator in drives):
-            forces[f"tau.{name}"] = UNLIMITED
-    commands = {
-        f"u.{actuator.name}": _compute_command_range(robot, actuator)
-        for actuator in robot.actuators
-    }
-    commands |= {f"force.{name}": _get_effort_limit(robot, joint) for name, joint in joints.items()}
-    return StatedLimits(
-        {name: interval for name, interval in commands.items() if interval != UNLIMITED},
-        {f"q.{name}": joint.range for name, joint in joints.items() if joint.range},
-        {f"qd.{name}": (-v, v) for name, v in robot.speeds.items() if name in joints},
-        forces,
-    )
-
-
-def _compute_command_range(robot: Any, actuator: Any) -> Interval:
-    """Compute the range of an actuator's command that respects all limits of actuator and joint.
-
-    It is in the unit of the command: a force for a motor, a position or velocity for a servo.
-    Limits of the joint are converted by gear and gain.
-
-    Args:
-        robot: model of the robot.
-        actuator: actuator whose command is limited.
-    """
-    interval = actuator.range or UNLIMITED
-    if actuator.joint is None:
-        return interval
-    joint = robot.joint(actuator.joint)
-    gear = float(robot.compiled.actuator_gear[actuator.id, 0])
-    if actuator.kind == "motor":
-        # The actuator force is gain times control, and the joint force is gear times actuator
-        # force.
-        gain = float(robot.compiled.actuator_gainprm[actuator.id, 0])
-        interval = _intersect(interval, _divide_interval(actuator.force, gain))
-        # Several motors of a joint may act at the same time.
-        motors = [a for a in robot.actuators if a.joint == joint.name and a.kind == "motor"]
-        force_per_control = gear * gain * len(motors)
-        return _intersect(
-            interval, _divide_interval(_get_effort_limit(robot, joint), force_per_control)
-        )
-    # The set point of a servo is the gear times the desired value at the joint.
-    if actuator.kind in ("position", "pid"):
-        interval = _intersect(interval, _multiply_interval(joint.range, gear))
-    elif actuator.kind == "velocity" and joint.name in robot.speeds:
-        speed = robot.speeds[joint.name]
-        interval = _intersect(interval, _multiply_interval((-speed, speed), gear))
-    return interval
-
-
-def _get_effort_limit(robot: Any, joint: Any) -> Interval:
-    """Return the interval of the effort of all actuators on a joint, in N or N·m.
-
-    A proposed run must not ask for more than the joint's limit. It is unlimited if the model file
-    states no limit of the effort (``actuatorfrcrange`` in MJCF, ``effort`` in URDF).
-
-    Args:
-        robot: model of the robot.
-        joint: the joint.
-    """
-    if joint.effort is None:
-        return UNLIMITED
-    # `joint.effort` is only the upper limit; the compiled model has both.
-    low, high = robot.compiled.jnt_actfrcrange[joint.id].tolist()
-    return low, high
-
-
-def _intersect(first: Interval, second: Interval) -> Interval:
-    """Intersect two intervals; return the first if they are disjoint.
-
-    Args:
-        first: an interval.
-        second: another one.
-    """
-    low, high = max(first[0], second[0]), min(first[1], second[1])
-    return (low, high) if low <= high else first
-
-
-def _multiply_interval(interval: Interval | None, factor: float) -> Interval:
-    """Multiply an interval by a factor; unlimited without an interval or with a zero factor."""
-    if interval is None or not factor:
-        return UNLIMITED
-    low, high = sorted((interval[0] * factor, interval[1] * factor))
-    return low, high
-
-
-def _divide_interval(interval: Interval | None, divisor: float) -> Interval:
-    """Return an interval divided by a number; unlimited if the number is zero.
-
-    Args:
-        interval: lower and upper end; None for no limit.
-        divisor: the number, such as a gear ratio; a negative one swaps the ends.
-    """
-    return _multiply_interval(interval, 1.0 / divisor) if divisor else UNLIMITED
 
 
 COMMAND_SIZE_FACTORS = (1.0, 2.0, 0.4)
@@ -190,8 +48,6 @@ REST_STATE = 0.05
 """Minimum magnitude of an initial coordinate to which `INITIAL_STATE_FACTORS` apply."""
 RELEASE_SHARE = 0.2
 """Share of a run after which a pushed system is released."""
-HOLD_LEVEL_COUNT = 6
-"""Number of levels in a run of holds."""
 
 
 @dataclass(frozen=True)
@@ -267,12 +123,11 @@ class RigModel:
         """
         states = self.evaluator.prepared_runs[0].initial_state_guess.copy()
         rates = set(self.evaluator.simulator.system.rates)
-        for state_index, name in enumerate(self.evaluator.state_names):
-            states[state_index] = (
-                0.0
-                if name in rates
-                else self._clip_to_joint_range(name, float(states[state_index]))
-            )
+        for index, name in enumerate(self.evaluator.state_names):
+            if name in rates:
+                states[index] = 0.0
+            else:
+                states[index] = self._clip_to_joint_range(name, float(states[index]))
         return states
 
     def _clip_to_joint_range(self, name: str, value: float) -> float:
@@ -289,15 +144,17 @@ class RigModel:
     def list_basic_plans(self) -> Iterator[RunPlan]:
         """Yield plans of every form and size, for each input alone and for all together.
 
-        Plans that only release the system from other initial states are included.
+        Plans that only release the system from other initial states come first.
         """
         for state in self._iterate_initial_states():
             yield RunPlan(states=(state,))
-        groups = [(name,) for name in self.driven_inputs]
-        for input_groups in [*groups, self.driven_inputs] if len(groups) > 1 else groups:
+        input_groups = [(name,) for name in self.driven_inputs]
+        if len(input_groups) > 1:
+            input_groups.append(self.driven_inputs)
+        for driven_inputs in input_groups:
             for size in COMMAND_SIZE_FACTORS:
                 for form in COMMAND_FORMS:
-                    yield RunPlan(input_groups, form, size)
+                    yield RunPlan(driven_inputs, form, size)
 
     def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
         """Yield variants of a plan with one property changed, to improve the best plans.
@@ -309,11 +166,13 @@ class RigModel:
             plan: Plan of a run.
         """
         for name, value in self._iterate_initial_states():
-            yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
+            states = {**dict(plan.states), name: value}
+            yield replace(plan, states=tuple(states.items()))
         for name, values in self._list_adjustable_constants().items():
-            other_constants = tuple(pair for pair in plan.constants if pair[0] != name)
+            other_constants = dict(plan.constants)
+            other_constants.pop(name, None)
             for value in values:
-                yield replace(plan, constants=(*other_constants, (name, value)))
+                yield replace(plan, constants=(*other_constants.items(), (name, value)))
         if plan.driven_inputs:
             for level in COMMAND_OFFSET_FACTORS:
                 yield replace(plan, level=level)
@@ -326,39 +185,41 @@ class RigModel:
     def _iterate_initial_states(self) -> Iterator[tuple[str, float]]:
         """Yield other initial states for a proposed run, each as the name of a state and its value.
 
-        They are multiples of the recorded initial coordinates. Except for robots, which start at
-        rest, they are also the largest initial rates that were recorded, in both directions. States
-        that are specified in all runs are not changed.
+        States that are specified in all runs are not changed. The others are:
+
+        1. Multiples of the initial coordinates of the first run.
+        2. The largest initial rates that were recorded, in both directions. A robot cannot be
+           started in motion, so it has none of them.
         """
-        system, evaluator = self.evaluator.simulator.system, self.evaluator
+        evaluator = self.evaluator
+        system = evaluator.simulator.system
         known_states = {
             evaluator.state_names[i] for i in np.flatnonzero(evaluator.known_state_mask.all(axis=0))
         }
+        # 1. Coordinates.
         for name in system.coordinates:
+            if name in known_states:
+                continue
             usual_value = float(self.initial_state[evaluator.state_names.index(name)])
-            values = [
-                share * usual_value if abs(usual_value) > REST_STATE else share
-                for share in INITIAL_STATE_FACTORS
-            ]
+            # Multiples of a value near zero would hardly differ, so the factors are the values.
+            scale = usual_value if abs(usual_value) > REST_STATE else 1.0
             # Outside its range a joint begins at the limit, which is tried only once.
-            reachable_values = dict.fromkeys(
-                self._clip_to_joint_range(name, value) for value in values
+            yield from dict.fromkeys(
+                (name, self._clip_to_joint_range(name, scale * factor))
+                for factor in INITIAL_STATE_FACTORS
             )
-            for value in reachable_values if name not in known_states else ():
-                yield name, value
+        # 2. Rates.
         if evaluator.kind.has_model:
             return
         for name in system.rates:
-            fastest = float(
-                np.abs(evaluator.initial_state_guesses[:, evaluator.state_names.index(name)]).max()
-            )
-            for value in (
-                (fastest, -fastest) if fastest > REST_RATE and name not in known_states else ()
-            ):
-                yield name, value
+            initial_rates = evaluator.initial_state_guesses[:, evaluator.state_names.index(name)]
+            fastest = float(np.abs(initial_rates).max())
+            if name not in known_states and fastest > REST_RATE:
+                yield name, fastest
+                yield name, -fastest
 
     def _list_adjustable_constants(self) -> dict[str, list[float]]:
-        """Return the constants that differ between runs, with their values, which are available.
+        """Return the values of the constants that differ between the recorded runs, by name.
 
         A constant that has had several values, such as a load, can be set by the experimenter.
         """
@@ -367,9 +228,9 @@ class RigModel:
             for name, value in run.constants.items():
                 values.setdefault(name, set()).add(value)
         return {
-            name: sorted(values_of_constant)
-            for name, values_of_constant in values.items()
-            if len(values_of_constant) > 1
+            name: sorted(recorded_values)
+            for name, recorded_values in values.items()
+            if len(recorded_values) > 1
         }
 
     # -- runs
@@ -396,14 +257,15 @@ class RigModel:
         # 2. Signals of the driven inputs.
         limited_inputs = []
         for number, name in enumerate(plan.driven_inputs):
-            signal = plan.size * _compute_command(
-                plan.form, times, self.step, np.random.default_rng(number)
-            )
+            # Inputs that are driven together get different random signals.
+            rng = np.random.default_rng(number)
+            signal = plan.size * _compute_command(plan.form, times, self.step, rng)
             command = self.median_commands[name] + self.largest_commands[name] * (
                 signal + plan.level
             )
             inputs[name] = self._limit_command(name, command)
-            limited_inputs += [name] if (inputs[name] != command).any() else []
+            if (inputs[name] != command).any():
+                limited_inputs.append(name)
         # 3. Initial states and constants.
         for name, value in plan.states:
             initial_state[self.evaluator.state_names.index(name)] = value
@@ -482,7 +344,7 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     sampling interval.
 
     Args:
-        form: name of the form, a key of `COMMAND_FORMS`, or one of those that are computed here.
+        form: name of the form, a key of `COMMAND_FORMS`.
         times: (T,) sample times from zero, s.
         step: sampling interval, s.
         rng: random numbers of forms with random phases or levels.
@@ -493,9 +355,9 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     if form == "holds":
         # Levels alternate with a large change each time, so that friction becomes visible.
         levels = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 0.25])
-        return levels[
-            np.minimum((run_fraction * HOLD_LEVEL_COUNT).astype(np.intp), HOLD_LEVEL_COUNT - 1)
-        ]
+        level_indices = (run_fraction * levels.size).astype(np.intp)
+        # The last sample, at the fraction 1, has the last level.
+        return levels[np.minimum(level_indices, levels.size - 1)]
     if form == "a push, then zero input":
         return np.where(run_fraction < RELEASE_SHARE, 1.0, 0.0)
     seconds = float(times[-1])
@@ -509,3 +371,196 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
         slow=slow_frequency, middle=min(1.0, 0.5 * fast_frequency), fast=fast_frequency
     )
     return evaluate_signal(formula, times, rng)
+
+
+CHANGED_STATE_FACTORS = (0.3, 2.0, -1.0)
+"""Factors of an initial state that are tried."""
+MIN_DROP_HEIGHT = 1.0
+"""Minimum initial height in metres of a system that bounces."""
+INPUT_FACTORS = (0.3, 3.0)
+"""Factors of an input that are tried."""
+ROBOT_INPUTS = (0.3, 2.0)
+"""Factors of a robot's input that are tried: it may be driven at most twice as hard as before."""
+MIN_INPUT_FACTOR = 1.1
+"""Minimum factor by which an input must change, up or down, to be a different run."""
+
+
+class ChangedRun(NamedTuple):
+    """Candidate run that could be recorded."""
+
+    says: str
+    change: dict[str, float]
+    scenario: Scenario
+    states: Array
+
+
+def iterate_changed_runs(evaluator: RunEvaluator) -> Iterator[ChangedRun]:
+    """Yield runs like the first recorded one with one changed duration, initial state or input.
+
+    If several discriminate two models equally well, the first one is proposed.
+    """
+    limits = read_model_file_limits(evaluator)
+    first = _get_first_run(evaluator, limits)
+    yield _lengthen_run(first)
+    yield from _change_initial_states(evaluator, first, limits)
+    yield from _scale_inputs(evaluator, first, limits)
+
+
+def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> ChangedRun:
+    """Return the first fitted run, as the basis of the proposals.
+
+    A robot starts at rest, because it cannot be started in motion, and with commands and positions
+    within their limits.
+
+    Args:
+        evaluator: run evaluator of the runs to which models are fitted.
+        limits: limits of the model file; empty for a system.
+    """
+    run_data = evaluator.prepared_runs[0]
+    if not evaluator.kind.has_model:
+        return ChangedRun("", {}, run_data.scenario, run_data.initial_state_guess)
+    rates = set(evaluator.simulator.system.rates)
+    states = [
+        0.0 if name in rates else _clip(value, limits.states.get(name))
+        for name, value in zip(evaluator.state_names, run_data.initial_state_guess, strict=True)
+    ]
+    recorded_inputs = run_data.scenario.inputs
+    inputs = {
+        name: _clip(values, limits.commands.get(name)) for name, values in recorded_inputs.items()
+    }
+    is_limited = any((inputs[name] != values).any() for name, values in recorded_inputs.items())
+    limit_note = ", with commands limited as the model file states" if is_limited else ""
+    return ChangedRun(limit_note, {}, replace(run_data.scenario, inputs=inputs), np.array(states))
+
+
+def _clip(values: Any, limits: Interval | None) -> Any:
+    """Clip a number or an array to an interval.
+
+    Args:
+        values: number or array.
+        limits: lower and upper end; None for no limit.
+    """
+    return values if limits is None else np.clip(values, *limits)
+
+
+def _lengthen_run(first: ChangedRun) -> ChangedRun:
+    """Return the run recorded for twice the time, with its inputs repeated from the beginning.
+
+    Args:
+        first: Run to lengthen.
+    """
+    times = first.scenario.times
+    later_times = times[1:] - times[0]
+    doubled_times = np.concatenate([times, times[-1] + later_times])
+    # The last sample of the run is the first one of its repetition.
+    inputs = {
+        name: np.concatenate([signal, signal[1:]]) for name, signal in first.scenario.inputs.items()
+    }
+    scenario = replace(first.scenario, times=doubled_times, inputs=inputs)
+    change = {"seconds": float(doubled_times[-1] - doubled_times[0])}
+    return ChangedRun(f"Record twice as long{first.says}", change, scenario, first.states)
+
+
+def _change_initial_states(
+    evaluator: RunEvaluator, first: ChangedRun, limits: StatedLimits
+) -> Iterator[ChangedRun]:
+    """Yield runs that differ from a recorded run in one initial state.
+
+    A state is multiplied by several factors; a state near zero gets the factors as values. The
+    initial velocities of a robot are not changed, because it starts at rest. A bouncing body is
+    released at least `MIN_DROP_HEIGHT` above the ground; its height is the last coordinate.
+
+    Args:
+        evaluator: evaluator of the recorded runs.
+        first: recorded run that is changed.
+        limits: limits of the model file; empty for a system.
+    """
+    system = evaluator.simulator.system
+    height_index = len(system.coordinates) - 1
+    states_with_units = zip(evaluator.state_names, _list_state_units(evaluator), strict=True)
+    for index, (name, unit) in enumerate(states_with_units):
+        is_height = system.bounces and index == height_index
+        if evaluator.kind.has_model and name not in system.coordinates:
+            continue
+        first_value = float(first.states[index])
+        for factor in CHANGED_STATE_FACTORS:
+            # A body cannot be released below the ground.
+            if is_height and factor < 0:
+                continue
+            value = factor * first_value if abs(first_value) > REST_STATE else factor
+            if is_height:
+                value = max(value, MIN_DROP_HEIGHT)
+            value = float(_clip(value, limits.states.get(name)))
+            initial_state = first.states.copy()
+            initial_state[index] = value
+            description = f"Start with {name} = {value:.3g} {unit}{first.says}"
+            yield ChangedRun(description, {name: value}, first.scenario, initial_state)
+
+
+def _scale_inputs(
+    evaluator: RunEvaluator, first: ChangedRun, limits: StatedLimits
+) -> Iterator[ChangedRun]:
+    """Yield runs that differ from a recorded run in the amplitude of one input.
+
+    Inputs that are zero throughout are not scaled. An input is never scaled beyond the limits of
+    its command: a factor that would exceed them is replaced by the largest possible one. Factors
+    near one are left out, because they change too little.
+
+    Args:
+        evaluator: evaluator of the recorded runs.
+        first: recorded run that is changed.
+        limits: limits of commands that the model file states.
+    """
+    factors = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
+    for name, signal in first.scenario.inputs.items():
+        if not signal.any():
+            continue
+        low, high = limits.commands.get(name, UNLIMITED)
+        largest_factor = _compute_largest_factor(signal, (low, high))
+        for factor in dict.fromkeys(min(factor, largest_factor) for factor in factors):
+            scaled_signal = factor * signal
+            if (
+                1.0 / MIN_INPUT_FACTOR < factor < MIN_INPUT_FACTOR
+                or scaled_signal.min() < low
+                or scaled_signal.max() > high
+            ):
+                continue
+            inputs = {**first.scenario.inputs, name: scaled_signal}
+            comparison = "smaller" if factor < 1 else "larger"
+            description = (
+                f"Make the input {name} {comparison}, {factor:.3g} times what it was{first.says}"
+            )
+            scenario = replace(first.scenario, inputs=inputs)
+            yield ChangedRun(description, {name: factor}, scenario, first.states)
+
+
+def _compute_largest_factor(signal: Array, limits: Interval) -> float:
+    """Return the largest factor that keeps a signal within its limits, rounded down.
+
+    It is infinite if nothing limits the signal. It has three decimals, as such a factor is easy to
+    set.
+    """
+    extremes = float(signal.min()), float(signal.max())
+    # No factor reaches a limit of the opposite sign.
+    factors = [
+        limit / extreme
+        for extreme, limit in zip(extremes, limits, strict=True)
+        if np.isfinite(limit) and extreme * limit > 0
+    ]
+    return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
+
+
+def _list_state_units(evaluator: RunEvaluator) -> list[str]:
+    """List the units of the states: coordinates, their rates, and further states.
+
+    Args:
+        evaluator: Run evaluator of the system.
+    """
+    system = evaluator.simulator.system
+    units = {channel.name: channel.unit for channel in evaluator.kind.channels}
+    coordinate_units = [units.get(name, "m") for name in system.coordinates]
+    rate_units = [f"{unit}/s" for unit in coordinate_units]
+    # A user-defined system may have further states after the rates, in any unit.
+    further_states = system.rates[len(coordinate_units) :]
+    further_units = [units.get(name, "SI") for name in further_states]
+    return [*coordinate_units, *rate_units, *further_units]

@@ -91,14 +91,14 @@ class _LinearisedRun(NamedTuple):
     """Linearisation of a run with a model, whitened.
 
     Attributes:
-        centre: (n,) prediction.
-        numbers: (n, q) derivatives by the parameters, each in units of its spread.
-        states: (n, s) derivatives by the initial state.
+        prediction: (n,) prediction.
+        parameter_jacobian: (n, q) derivatives by the parameters, each in units of its spread.
+        state_jacobian: (n, s) derivatives by the initial state.
     """
 
-    centre: Array
-    numbers: Array
-    states: Array
+    prediction: Array
+    parameter_jacobian: Array
+    state_jacobian: Array
 
 
 class RunValue(NamedTuple):
@@ -129,11 +129,13 @@ class RunRanker:
     def __init__(self, models: ModelSet, competing_models: Sequence[FittedModel]) -> None:
         """Prepare the noise, the limits of the setup, and the covariances of the parameters.
 
-        `information` has the covariance of the parameters of each model, as C in eq. (1). `pairs`
-        has all ordered pairs (true model, competing model). `max_total_value` is the total value
-        above which a run gains nothing more, and `max_exact_evaluations` the maximum number of
-        exact evaluations in a row. `is_free_state` (s,) marks the initial states that have to be
-        estimated.
+        The attributes are:
+
+        - `information`: inverse covariance of the parameters of each model, C^-1 in eq. (1).
+        - `pairs`: all ordered pairs of indices (true model, competing model).
+        - `max_total_value`: total value above which a run gains nothing more.
+        - `max_exact_evaluations`: maximum number of exact evaluations in a row.
+        - `is_free_state`: (s,) mask of the initial states that have to be estimated.
 
         Shapes: s states of a run.
 
@@ -143,11 +145,13 @@ class RunRanker:
                 if only its parameters are uncertain.
         """
         self.models, self.evaluator = models, models.evaluator
-        self.information = [_compute_prior_covariance(models, model) for model in competing_models]
+        self.information = [
+            _compute_parameter_information(models, model) for model in competing_models
+        ]
         self.noise: NoiseModel = compute_fisher_blocks(models, competing_models[0]).noise
         self.limits = RigLimits(self.evaluator, competing_models[0])
-        count = len(competing_models)
-        self.pairs = list(permutations(range(count), 2))
+        self.pairs = list(permutations(range(len(competing_models)), 2))
+        # Both orders of a pair count once. An information gain has no limit.
         self.max_total_value = (
             MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
         )
@@ -173,40 +177,39 @@ class RunRanker:
         ]
         if self.evaluator.kind.has_model:
             allowed_runs = self._select_distinct_runs(allowed_runs)
-        entries = []
+        run_values = []
         for run in allowed_runs:
             linearisations = [
                 self._linearise_run(run, information, information.model.fit.theta)
                 for information in self.information
             ]
-            if all(linearisation is not None for linearisation in linearisations):
-                entries.append(
-                    self._rank_run(
-                        run,
-                        [entry for entry in linearisations if entry is not None],
-                    )
-                )
-        return sorted(entries, key=get_sort_key)
+            successful = [entry for entry in linearisations if entry is not None]
+            if len(successful) == len(linearisations):
+                run_values.append(self._evaluate_linearised(run, successful))
+        return sorted(run_values, key=get_sort_key)
 
-    def _rank_run(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
-        """Value a run with linearised models, one per model of the ranker.
+    def _evaluate_linearised(
+        self, run: CandidateRun, linearisations: Sequence[_LinearisedRun]
+    ) -> RunValue:
+        """Compute the value of a run to first order, from its linearisation with each model.
 
         With several models the value is the discrimination T of eq. (1), for each pair of a true
         and a competing model; with one model it is the information gain D of eq. (2).
 
         Args:
             run: run that could be recorded: its plan, scenario and initial state.
-            slopes: its linearisation with each model of the ranker.
+            linearisations: its linearisation with each model of the ranker.
         """
         if not self.pairs:
-            value = _compute_information_gain(slopes[0], self.information[0])
+            value = _compute_information_gain(linearisations[0], self.information[0])
             return RunValue(run, np.array([value]), value)
-        discrimination = np.zeros((len(slopes), len(slopes)))
+        discrimination = np.zeros((len(linearisations), len(linearisations)))
         for true_index, competing_index in self.pairs:
-            difference = slopes[true_index].centre - slopes[competing_index].centre
-            discrimination[true_index, competing_index] = _compute_remaining_difference(
-                difference, slopes[competing_index], self.information[competing_index]
-            )[0]
+            competing = linearisations[competing_index]
+            difference = linearisations[true_index].prediction - competing.prediction
+            discrimination[true_index, competing_index], _, _ = _compute_remaining_difference(
+                difference, competing, self.information[competing_index]
+            )
         return RunValue(run, discrimination, _sum_discrimination(discrimination))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
@@ -234,19 +237,22 @@ class RunRanker:
     def _select_distinct_runs(self, runs: Sequence[CandidateRun]) -> list[CandidateRun]:
         """Select the runs of a robot with the largest difference of the models before any refit.
 
-        The exact evaluation of a robot's run is slow. With a single model, the size of its motion
-        is used instead.
+        At most `MAX_EVALUATED_RUNS` are selected, because the exact evaluation of a robot's run is
+        slow. The size of a run is the sum over the pairs of models of log(1 + |d|^2), with the
+        whitened difference d of their predictions; the logarithm prevents that one pair dominates.
+        With a single model, d is its motion about the mean.
         """
-        differences = []
+        thetas = [information.model.fit.theta for information in self.information]
+        sizes = []
         for run in runs:
-            thetas = [information.model.fit.theta for information in self.information]
             whitened = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
-            gaps = [other - one for one, other in combinations(whitened, 2)]
-            # A single model has no pair.
-            gaps = gaps or [whitened[0] - whitened[0].mean()]
-            size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
-            differences.append(size if np.isfinite(size) else -np.inf)
-        order = np.argsort(-np.array(differences), kind="stable")
+            differences = [second - first for first, second in combinations(whitened, 2)]
+            if not differences:
+                differences = [whitened[0] - whitened[0].mean()]
+            size = float(sum(np.log1p(np.square(d).sum()) for d in differences))
+            # A run that cannot be simulated is the last one.
+            sizes.append(size if np.isfinite(size) else -np.inf)
+        order = np.argsort(-np.array(sizes), kind="stable")
         return [runs[index] for index in order[:MAX_EVALUATED_RUNS].tolist()]
 
     # -- one run
@@ -267,7 +273,10 @@ class RunRanker:
         return self.evaluator.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
 
     def _whiten(self, values: Array) -> Array:
-        """Whiten observations, or differences of them, to (L, n)."""
+        """Whiten L predictions of a run (L, T, C), or differences of them, to vectors (L, T C).
+
+        `whiten` expects one run with L columns, (1, T, C, L), and the mask (1, T, C).
+        """
         is_observed = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         columns = np.moveaxis(values, 0, -1)[None]
         result: Array = np.moveaxis(whiten(columns, is_observed, self.noise)[0], -1, 0)
@@ -301,33 +310,32 @@ class RunRanker:
             The linearisation; None if the simulation fails, or if the run amplifies differences of
             the initial state so much that its result could not be interpreted.
         """
-        # 1. Simulations.
+        # 1. Simulations: the point itself, displaced parameters, then displaced initial states.
         initial_state = run.states if states is None else states
         free_indices = information.model.fit.free_indices.tolist()
-        thetas = [theta] * (1 + len(free_indices) + int(self.is_free_state.sum()))
-        for row, index in enumerate(free_indices):
+        thetas, initial_states = [theta], [initial_state]
+        for index, step in zip(free_indices, information.spread, strict=True):
             displaced_theta = theta.copy()
-            displaced_theta[index] += information.spread[row]
-            thetas[1 + row] = displaced_theta
-        shifts = STATE_STEP_SHARE * np.eye(initial_state.size)[self.is_free_state]
-        initial_states = [initial_state] * (1 + len(free_indices)) + [
-            initial_state + shift for shift in shifts
-        ]
+            displaced_theta[index] += step
+            thetas.append(displaced_theta)
+            initial_states.append(initial_state)
+        for shift in STATE_STEP_SHARE * np.eye(initial_state.size)[self.is_free_state]:
+            thetas.append(theta)
+            initial_states.append(initial_state + shift)
         simulated = self._simulate_run(run, thetas, initial_states)
         if not np.isfinite(simulated).all():
             return None
+        prediction, differences = simulated[:1], simulated[1:] - simulated[0]
         # 2. Amplification.
-        differences = np.abs(simulated[1 + len(free_indices) :] - simulated[0])
+        parameter_count = len(free_indices)
         channel_scales = np.array([channel.scale for channel in self.evaluator.simulator.channels])
-        if (
-            differences.size
-            and (differences / channel_scales).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
-        ):
+        amplification = np.abs(differences[parameter_count:]) / channel_scales
+        if amplification.max(initial=0.0) > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE:
             return None
-        # 3. Whitening.
-        whitened = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
-        parameter_responses = whitened[1 : 1 + len(free_indices)]
-        state_responses = whitened[1 + len(free_indices) :]
+        # 3. Whitening. A parameter is displaced by its unit, so its difference is the derivative.
+        whitened = self._whiten(np.concatenate([prediction, differences]))
+        parameter_responses = whitened[1 : 1 + parameter_count]
+        state_responses = whitened[1 + parameter_count :]
         return _LinearisedRun(
             whitened[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE
         )
@@ -344,7 +352,8 @@ class RunRanker:
         difference d of two models, the derivatives J by parameters and B by the initial state, and
         the covariance C of the parameters. The prediction of `true_model` takes the place of the
         recording. The fit of `competing_model` by Levenberg-Marquardt may move its parameters as
-        far as the present data allow.
+        far as the present data allow. T is 0 if a model cannot be simulated on the run, so that
+        such a run is not proposed.
 
         1. Simulate the prediction of the true model.
         2. Propose a step from the linearisation.
@@ -360,46 +369,44 @@ class RunRanker:
         linearisation, damping = self._linearise_run(run, competing_model, theta), FIRST_DAMPING
         if linearisation is None or not np.isfinite(target).all():
             return 0.0
-        lowest_cost = float(np.square(target - linearisation.centre).sum())
+        lowest_cost = float(np.square(target - linearisation.prediction).sum())
         for _ in range(MAX_FIT_ITERATIONS):
             if damping > MAX_DAMPING:
                 break
             # 2. Step.
             _, step, state_step = _compute_remaining_difference(
-                target - linearisation.centre, linearisation, competing_model, deviation, damping
+                target - linearisation.prediction,
+                linearisation,
+                competing_model,
+                deviation,
+                damping,
             )
             trial_theta, trial_states = theta.copy(), initial_state.copy()
             trial_theta[fit.free_indices] += step * competing_model.spread
             trial_states[self.is_free_state] += state_step
+            trial_deviation = deviation + step
             trial_linearisation = self._linearise_run(
                 run, competing_model, trial_theta, trial_states
             )
-            residual_cost = (
-                np.inf
-                if trial_linearisation is None
-                else float(np.square(target - trial_linearisation.centre).sum())
-            )
-            cost = residual_cost + float(
-                (deviation + step) @ competing_model.inverse @ (deviation + step)
-            )
+            cost = np.inf
+            if trial_linearisation is not None:
+                cost = float(np.square(target - trial_linearisation.prediction).sum())
+                cost += float(trial_deviation @ competing_model.inverse @ trial_deviation)
             # 3. Acceptance.
             if trial_linearisation is None or not cost < lowest_cost:
                 # The step was too long or failed, so the next one is much shorter (Marquardt).
                 damping *= DAMPING_INCREASE
                 continue
             is_converged = lowest_cost - cost < MIN_RELATIVE_DECREASE * lowest_cost
-            theta = trial_theta
-            initial_state = trial_states
-            deviation = deviation + step
-            linearisation = trial_linearisation
-            lowest_cost = cost
+            theta, initial_state, deviation = trial_theta, trial_states, trial_deviation
+            linearisation, lowest_cost = trial_linearisation, cost
             damping /= DAMPING_DECREASE
             if is_converged:
                 break
         return lowest_cost
 
 
-def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _ParameterInformation:
+def _compute_parameter_information(models: ModelSet, model: FittedModel) -> _ParameterInformation:
     """Compute the information on a model's parameters from the present runs, for eqs. (1) and (2).
 
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
@@ -411,10 +418,8 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Paramete
         model: Model whose covariance is computed.
     """
     covariance = compute_covariance(models, model)
-    bounds = np.array(
-        [models.evaluator.parameters[i].bounds for i in model.fit.free_indices]
-    ).reshape(-1, 2)
-    max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
+    bounds = [models.evaluator.parameters[index].bounds for index in model.fit.free_indices]
+    max_spread = 0.1 * np.array([high - low for low, high in bounds])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)
     inverse = np.asarray(np.linalg.pinv(covariance / np.outer(spread, spread), hermitian=True))
     return _ParameterInformation(model, np.asarray(spread), inverse)
@@ -422,17 +427,15 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Paramete
 
 def _sum_discrimination(values: Array) -> float:
     """Sum the discrimination over all pairs; each pair counts up to `MAX_USEFUL_DISCRIMINATION`."""
+    # Either model of a pair may be true, so the smaller discrimination counts.
     discrimination = np.minimum(values, values.T)
-    return float(
-        np.minimum(
-            discrimination[np.triu_indices(len(discrimination), 1)], MAX_USEFUL_DISCRIMINATION
-        ).sum()
-    )
+    pairs = discrimination[np.triu_indices(len(discrimination), 1)]
+    return float(np.minimum(pairs, MAX_USEFUL_DISCRIMINATION).sum())
 
 
 def _compute_remaining_difference(
-    gap: Array,
-    slopes: _LinearisedRun,
+    difference: Array,
+    linearisation: _LinearisedRun,
     information: _ParameterInformation,
     deviation: Array | None = None,
     damping: float = FIRST_ORDER_DAMPING,
@@ -446,8 +449,8 @@ def _compute_remaining_difference(
     Shapes: q fitted parameters.
 
     Args:
-        gap: (n,) difference d: prediction of the true model minus that of the competing model.
-        slopes: Linearisation of the competing model.
+        difference: (n,) difference d: prediction of the true model minus that of the other one.
+        linearisation: Linearisation of the competing model.
         information: Information of the present runs on the competing model.
         deviation: (q,) difference of the parameters from their present estimates, in units of
             `spread`.
@@ -458,31 +461,38 @@ def _compute_remaining_difference(
     """
     parameter_count = len(information.spread)
     deviation = np.zeros(parameter_count) if deviation is None else deviation
-    columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
-    normal, right_hand_side = columns.T @ columns, columns.T @ gap
+    columns = np.concatenate(
+        [linearisation.parameter_jacobian, linearisation.state_jacobian], axis=1
+    )
+    normal, right_hand_side = columns.T @ columns, columns.T @ difference
     normal[:parameter_count, :parameter_count] += information.inverse
     right_hand_side[:parameter_count] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
     step = np.linalg.solve(damped, right_hand_side)
-    initial_cost = float(gap @ gap + deviation @ information.inverse @ deviation)
+    initial_cost = float(difference @ difference + deviation @ information.inverse @ deviation)
     minimum_cost = initial_cost - 2.0 * float(right_hand_side @ step) + float(step @ normal @ step)
     return max(minimum_cost, 0.0), step[:parameter_count], step[parameter_count:]
 
 
-def _compute_information_gain(slopes: _LinearisedRun, information: _ParameterInformation) -> float:
+def _compute_information_gain(
+    linearisation: _LinearisedRun, information: _ParameterInformation
+) -> float:
     """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty.
 
     It is D = 1/2 log det(I + C J' (I - B B^+) J) (2), with the derivatives J by parameters and B by
     the initial state, and the covariance C of the parameters.
 
     Args:
-        slopes: the run, linearised by parameters and initial states.
+        linearisation: the run, linearised by parameters and initial states.
         information: information of the present runs on the parameters.
     """
-    basis, _ = np.linalg.qr(slopes.states)
-    projected_slopes = slopes.numbers - basis @ (basis.T @ slopes.numbers)
+    basis, _ = np.linalg.qr(linearisation.state_jacobian)
+    # (I - B B^+) J
+    projected_jacobian = linearisation.parameter_jacobian - basis @ (
+        basis.T @ linearisation.parameter_jacobian
+    )
     covariance = np.linalg.pinv(information.inverse, hermitian=True)
     _, value = np.linalg.slogdet(
-        np.eye(len(covariance)) + covariance @ (projected_slopes.T @ projected_slopes)
+        np.eye(len(covariance)) + covariance @ (projected_jacobian.T @ projected_jacobian)
     )
     return float(0.5 * value)

@@ -140,45 +140,38 @@ def design_next_run(
     # 3. Longer runs.
     if ranked_runs and _may_longer_run_help(ranked_runs[0], max_seconds / seconds):
         longer_rig = RigModel(models.evaluator, max_seconds)
-        longer_runs = ranker.rank_runs(
-            [
-                longer_rig.make_run(run_value.run.plan)
-                for run_value in ranked_runs[:PLANS_TESTED_FOR_LENGTH]
-            ]
-        )
-        ranked_runs = sorted(
-            [ranked_runs[0], *_evaluate_fully(ranker, longer_runs)[:1]], key=get_sort_key
-        )
-    return (
-        _describe_best_run(models, [model, *competing_models], rig, ranked_runs[0])
-        if ranked_runs
-        else None
-    )
+        plans = [run_value.run.plan for run_value in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
+        longer_runs = ranker.rank_runs([longer_rig.make_run(plan) for plan in plans])
+        best_longer_runs = _evaluate_fully(ranker, longer_runs)[:1]
+        ranked_runs = sorted([ranked_runs[0], *best_longer_runs], key=get_sort_key)
+    if not ranked_runs:
+        return None
+    return _describe_best_run(models, [model, *competing_models], rig, ranked_runs[0])
 
 
 def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
     """Return whether a longer run may distinguish models that the best run does not.
 
-    The discrimination of a pair grows about in proportion to the duration, and here by up to twice
-    as much.
+    The discrimination of a pair of models grows about in proportion to the duration; growth by up
+    to twice as much is considered possible. The result is False if no models compete.
 
     Args:
         best: the best run, with the discrimination of each pair of models.
         length_factor: duration of the longest allowed run, in durations of this run.
     """
+    has_pairs = best.values.ndim == 2
+    if length_factor <= 1.0 or not has_pairs:
+        return False
+    # Either model of a pair may be true, so the smaller discrimination counts.
     discrimination = np.minimum(best.values, best.values.T)
     undistinguished = discrimination[
         (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
     ]
-    return (
-        length_factor > 1.0
-        and best.values.ndim == 2
-        and bool((undistinguished * 2.0 * length_factor > DISCRIMINATION_THRESHOLD).any())
-    )
+    return bool((undistinguished * 2.0 * length_factor > DISCRIMINATION_THRESHOLD).any())
 
 
 def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValue]:
-    """Evaluate the most valuable runs exactly, and sort all runs by value.
+    """Evaluate the most valuable runs exactly, and sort all runs: exact ones first, then by value.
 
     Linearised values tend to be too high, so a run is proposed only after an exact evaluation. The
     best run that is only linearised is evaluated next; its value then usually falls, and another
@@ -190,19 +183,18 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     """
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
-        next_index = next(
-            (
-                k
-                for k, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
-                if not run_value.is_exact
-            ),
-            None,
-        )
-        if next_index is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_total_value):
+        linearised_indices = [
+            index
+            for index, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
+            if not run_value.is_exact
+        ]
+        # A run of the largest value that counts cannot be improved.
+        is_best_found = ranked and ranked[0].is_exact and ranked[0].value >= ranker.max_total_value
+        if not linearised_indices or is_best_found:
             break
+        next_index = linearised_indices[0]
         ranked[next_index] = ranker.evaluate_exactly(ranked[next_index])
         ranked.sort(key=get_sort_key)
-    # Runs that are evaluated exactly come before those that are only linearised.
     return sorted(ranked, key=lambda run_value: (not run_value.is_exact, *get_sort_key(run_value)))
 
 
@@ -221,25 +213,23 @@ def _describe_best_run(
         rig: Experimental setup.
         run_value: Best run with its value.
     """
-    run, competing_models = run_value.run, models_compared[1:]
+    run = run_value.run
+    diagnosed_model, *competing_models = models_compared
+    effect = ""
     discrimination: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
-    effect, gain = "", float(run_value.values[0]) if not competing_models else 0.0
     if competing_models:
+        # Either model of a pair may be true, so the smaller discrimination counts.
         pair_discrimination = np.minimum(run_value.values, run_value.values.T)
-        diagnosed_model = models_compared[0]
-        names = [
-            _list_other_effects(competing_model, diagnosed_model)
-            for competing_model in competing_models
-        ]
         effect = _list_other_effects(diagnosed_model, competing_models[0])
-        discrimination = {
-            name: float(value)
-            for name, value in zip(names, pair_discrimination[0, 1:], strict=True)
-        }
+        names = [_list_other_effects(model, diagnosed_model) for model in competing_models]
+        # The first row has the pairs with the diagnosed model.
+        discrimination = dict(zip(names, pair_discrimination[0, 1:].tolist(), strict=True))
         groups = tuple(_iterate_connected_groups([effect, *names], pair_discrimination))
         gain = min(discrimination.values())
-    constants = dict(run.plan.constants)
+    else:
+        gain = float(run_value.values[0])
+    recorded_constants = rig.recorded_scenario.constants
     return NextRunDesign(
         says=run.says,
         by="T" if competing_models else "D",
@@ -250,7 +240,9 @@ def _describe_best_run(
         inputs=dict(run.scenario.inputs),
         initial=dict(zip(models.evaluator.state_names, run.states.tolist(), strict=True)),
         constants={
-            k: v for k, v in constants.items() if rig.recorded_scenario.constants.get(k) != v
+            name: value
+            for name, value in run.plan.constants
+            if recorded_constants.get(name) != value
         },
         groups=groups,
     )
@@ -264,9 +256,10 @@ def _list_other_effects(model: FittedModel, other_model: FittedModel) -> str:
 def _iterate_connected_groups(
     names: Sequence[str], discrimination: Array
 ) -> Iterator[tuple[str, ...]]:
-    """Yield connected groups of names that are linked by pairs that are not distinguished.
+    """Yield the connected components of the models, linked where a run does not distinguish them.
 
     Models of different groups would be distinguished by the run; those of one group might not be.
+    Each group is found by a breadth-first search.
 
     Args:
         names: names of N models.

@@ -9,16 +9,16 @@ import simgap
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import (
-    UNLIMITED,
     RigModel,
     RunPlan,
+    _compute_largest_factor,
+    iterate_changed_runs,
+)
+from bench.diagnosis.experiment_design.safety_limits import (
+    UNLIMITED,
+    RigLimits,
     read_model_file_limits,
 )
-from bench.diagnosis.experiment_design.discriminating_run import (
-    _compute_largest_factor,
-    _iterate_changed_runs,
-)
-from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from tests.bench.diagnosis.simulated_logs import describe, write_log
@@ -163,7 +163,7 @@ def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     # The recorded command exceeds the limits, which hold for runs with this command too.
     evaluator, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
     limits = read_model_file_limits(evaluator)
-    runs = list(_iterate_changed_runs(evaluator))
+    runs = list(iterate_changed_runs(evaluator))
     assert len(runs) > 4
     for run in runs:
         assert np.abs(run.scenario.inputs["u.m"]).max() <= 1.0
@@ -187,7 +187,7 @@ def test_what_the_runs_so_far_did_wrongly_is_not_proposed_again(tmp_path):
     kind = kind_of(tmp_path, URDF.replace('velocity="2.5"', 'velocity="0.5"'), actuators=MOTOR)
     evaluator, model = world_of(kind, 0.9 * np.sin(3.0 * TIMES))
     rig, limits = RigModel(evaluator, 2.0), RigLimits(evaluator, model)
-    assert np.abs(limits.past[0]["qd.hip"]).max() > 0.5
+    assert np.abs(limits.present_runs[0]["qd.hip"]).max() > 0.5
     assert limits.bounds["qd.hip"] == (-0.5, 0.5)
     strong, weak = (rig.make_run(RunPlan(("u.m",), "slow sine", size)) for size in (1.0, 0.05))
     assert limits(model, [strong, weak]) == [False, True]

@@ -68,7 +68,7 @@ def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):
 def test_what_nothing_states_is_as_fast_and_as_strong_as_it_was(arm):
     evaluator, model = arm(0.0)
     limits, rig = RigLimits(evaluator, model), RigModel(evaluator, 2.0)
-    past = limits.past[0]
+    past = limits.present_runs[0]
     assert limits.bounds["qd.hip"][1] == pytest.approx(
         SPEED_AND_FORCE_FACTOR * np.abs(past["qd.hip"]).max()
     )
