@@ -136,6 +136,23 @@ RECORDED_PART_GREY = "#EEEEEE"
 """Background of the recorded part of a film, and of errors that count as equal."""
 
 # Dark and light colours alternate, so that neighbours differ in greyscale, too.
+BASE_MODEL_LINE: Mapping[str, Any] = {
+    "color": VERMILION,
+    "linestyle": (0, (5, 2)),
+    "linewidth": 1.3,
+}
+"""Line style of the fitted base model: dashed, so that it is recognised without colour."""
+EXTENDED_MODEL_LINE: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
+"""Line style of the extended model."""
+BASE_MODEL_MARKER: Mapping[str, Any] = {
+    "marker": "s",
+    "markersize": 6,
+    "markerfacecolor": "white",
+    "color": VERMILION,
+}
+"""Marker style of the fitted base model: open squares, recognised without colour."""
+EXTENDED_MODEL_MARKER: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
+"""Marker style of the extended model."""
 _COLOURS = (BLACK, ORANGE, BLUE, SKY_BLUE, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
 _DARK = {

@@ -31,6 +31,7 @@ from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.diagnosis.verdict import Cause, Verdict
 from sims import effects as library
 from sims.core.effect import ALL_PLACES
+from sims.core.simulator import Array
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 from sims.recording.recording import Recording
 
@@ -147,7 +148,7 @@ class _Rows:
             except (KeyError, ZeroDivisionError):
                 # A constant that differs between runs has no single value.
                 continue
-            gradient = np.zeros(len(free))
+            gradient: Array = np.zeros(len(free))
             for i, name in enumerate(free):
                 step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
                 stepped_values = {**values_by_name, name: values_by_name[name] + step}

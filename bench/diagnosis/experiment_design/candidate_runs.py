@@ -148,7 +148,7 @@ class RigModel:
         """
         for state in self._iterate_initial_states():
             yield RunPlan(states=(state,))
-        input_groups = [(name,) for name in self.driven_inputs]
+        input_groups: list[tuple[str, ...]] = [(name,) for name in self.driven_inputs]
         if len(input_groups) > 1:
             input_groups.append(self.driven_inputs)
         for driven_inputs in input_groups:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,9 +23,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     sanitise,
     split_effect_name,
 )
-from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.verdict import Candidate, Cause
-from bench.figures.robot_figure import PlaceMark
+from bench.diagnosis.verdict import Cause
 from sims.robot.fitted_causes import GRAVITY_COMPENSATED
 
 MAX_NAMED_MEMBERS = 6
@@ -173,10 +170,10 @@ def format_number_error(cause: Cause) -> str:
     if base in _STEP_ERROR_TEXTS:
         return f"{_STEP_ERROR_TEXTS[base]}: {sanitise(cause.says).rstrip('.')}"
     values = list(cause.coefficients.values())
-    if base not in _MODEL_FILE_ERRORS or not place or place == ALL_PLACES or not values:
+    if base not in MODEL_FILE_ERRORS or not place or place == ALL_PLACES or not values:
         return ""
     first, norm = values[0], float(np.linalg.norm([n.value for n in values]))
-    return _MODEL_FILE_ERRORS[base].format(
+    return MODEL_FILE_ERRORS[base].format(
         place=format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(),
         percent=format_percent(abs(first.value)),
         size=append_unit(format_number(abs(first.value), 2), first.unit),
@@ -195,7 +192,7 @@ def is_overstated(cause: Cause) -> bool:
 
 _SHARE = "the {} {{place}} is {{percent}} {{larger}} than the model file states"
 _DIFFERENCE = "the {} {{place}} is {{size}} {{larger}} than the model file states"
-_MODEL_FILE_ERRORS = {
+MODEL_FILE_ERRORS = {
     "mass.scale": _SHARE.format("mass"),
     "inertia.scale": _SHARE.format("inertia"),
     "actuator.stiffness": _SHARE.format("stiffness"),
@@ -264,167 +261,6 @@ def format_values(cause: Cause) -> str:
 def strip_place(description: str) -> str:
     """Remove the place in brackets from a description, because its noun names the place already."""
     return re.sub(r" \(at [^()]*\)$", "", description)
-
-
-def has_placed_causes(report: DiagnosisReportData) -> bool:
-    """Return whether any candidate acts at a place."""
-    return any("@" in candidate.effect for candidate in report.verdict.candidates)
-
-
-def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
-    """List the diagnosed places, to be marked on the drawing of the robot.
-
-    Args:
-        report: Data of the report.
-
-    Returns:
-        One mark per place; alternatives of a cause are marked, too.
-    """
-    marks: dict[tuple[str, str, str], PlaceMark] = {}
-    for cause in report.verdict.causes:
-        is_certain = not cause.alternatives
-        for name in (cause.effect, *cause.alternatives):
-            noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
-            for place in _list_places(report, name, cause):
-                # The coefficients are those of the cause, not of its alternatives.
-                size = _format_coefficient(cause, name, place) if name == cause.effect else ""
-                # A family and one of its places give the same mark, which is kept once.
-                marks.setdefault(
-                    (kind, place, noun), PlaceMark(kind, place, f"{noun}{size}", is_certain)
-                )
-    return list(marks.values())
-
-
-def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
-    """List the places at which an effect acts, for marks on the drawing of the robot.
-
-    An effect at all places (``@*``) has those of its coefficients; if these name none, it has all
-    joints, actuators or bodies of the robot.
-
-    Args:
-        report: content of the report, with the robot.
-        effect: name of the effect, with its place.
-        cause: the cause, whose coefficients may be named by places.
-    """
-    _, place = split_effect_name(effect)
-    if place != ALL_PLACES:
-        return [place] if place else []
-    coefficient_places = [
-        split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect
-    ]
-    robot = report.robot
-    if any(coefficient_places) or robot is None:
-        return list(dict.fromkeys(name for name in coefficient_places if name))
-    tables = {
-        "joint": [joint.name for joint in robot.joints],
-        "actuator": [actuator.name for actuator in robot.actuators],
-        "body": [body.name for body in robot.bodies],
-    }
-    return tables.get(get_place_kind(effect), [])
-
-
-def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
-    """Format the coefficient of a cause at a place for a label; empty for several coefficients.
-
-    Args:
-        cause: the cause with its coefficients.
-        effect: name of the effect, with its place.
-        place: place of the label, such as a joint.
-    """
-    at_place = [
-        n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
-    ]
-    if len(at_place) != 1:
-        return ""
-    fitted = at_place[0]
-    if split_effect_name(effect)[0] in _MODEL_FILE_ERRORS and fitted.unit == "1":
-        sign = "+" if fitted.value > 0 else ""
-        return f": {sign}{format_percent(fitted.value)}"
-    return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
-
-
-MAX_SHOWN_CANDIDATES = 12
-"""Maximum number of candidates that a figure shows."""
-MIN_FAMILY_SCORE_RATIO = 1.3
-"""Minimum ratio of a family's score to that of its best place for the family to represent the
-effect.
-"""
-
-
-class RankedCandidate(NamedTuple):
-    """Candidate that represents its effect, and the other places of that effect, best first."""
-
-    best: Candidate
-    elsewhere: tuple[Candidate, ...] = ()
-
-
-def get_candidate_status(report: DiagnosisReportData, effect: str) -> str:
-    """Return the status of an effect: found, found but indistinguishable, or not needed.
-
-    Args:
-        report: Report data.
-        effect: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
-    """
-    for cause in report.verdict.causes:
-        if effect in (cause.effect, *cause.alternatives):
-            return "found, but not distinguishable" if cause.alternatives else "found"
-    return "not needed"
-
-
-def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
-    """List all candidates as entries, the highest score first.
-
-    If effects act at places, such as joints, an effect would appear once for each of them. So it is
-    one entry: its best place, with the others in `elsewhere`. Each diagnosed cause has its own
-    entry.
-
-    Args:
-        report: Data of the report.
-    """
-    ordered_candidates = sorted(report.verdict.candidates, key=lambda c: c.score, reverse=True)
-    if not has_placed_causes(report):
-        return [RankedCandidate(candidate) for candidate in ordered_candidates]
-    causes = {cause.effect for cause in report.verdict.causes}
-    groups: dict[str, list[Candidate]] = {}
-    for candidate in ordered_candidates:
-        groups.setdefault(split_effect_name(candidate.effect)[0], []).append(candidate)
-    entries = []
-    for group in groups.values():
-        # A diagnosed cause represents its effect even if another place has a higher score.
-        heads = [c for c in group if c.effect in causes] or [_choose_representative(group)]
-        other_members = tuple(c for c in group if c not in heads)
-        entries += [
-            RankedCandidate(heads[0], other_members),
-            *(RankedCandidate(head) for head in heads[1:]),
-        ]
-    return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
-
-
-def _choose_representative(group: list[Candidate]) -> Candidate:
-    """Return the best place, unless the family explains much more; it explains at least as much."""
-    best_place = next((c for c in group if split_effect_name(c.effect)[1] != ALL_PLACES), group[0])
-    return (
-        best_place
-        if group[0].score < MIN_FAMILY_SCORE_RATIO * max(best_place.score, 1.0)
-        else group[0]
-    )
-
-
-def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
-    """Select the candidates to show, the highest score first; diagnosed causes are included.
-
-    At most `MAX_SHOWN_CANDIDATES` are shown, unless there are more causes: candidates that are not
-    needed are left out, those with the lowest scores first.
-    """
-    ordered_candidates = [entry.best for entry in rank_candidates(report)]
-    # A diagnosed cause is shown even with a low score.
-    unneeded_candidates = [
-        c for c in ordered_candidates if get_candidate_status(report, c.effect) == "not needed"
-    ]
-    hidden_candidates = unneeded_candidates[
-        max(0, MAX_SHOWN_CANDIDATES - len(ordered_candidates) + len(unneeded_candidates)) :
-    ]
-    return [c for c in ordered_candidates if c not in hidden_candidates]
 
 
 LONGEST_PLACE = 64

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from bench.pages.text_format import append_unit as append_unit
 from bench.pages.text_format import format_estimate as format_estimate
@@ -19,6 +19,8 @@ from sims import effects
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 
+QUANTITY_LABELS: Mapping[str, str] = {"q": "position", "qd": "velocity", "tau": "torque"}
+"""Quantities of a joint, by the first part of a channel's name; a sensor has its own row."""
 END = {"low": "lower", "high": "upper"}
 """Words for the ends of a range."""
 ALL_PLACES = "*"
@@ -170,6 +172,17 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
         if format_unit(unit)
         else sanitise(name, max_length)
     )
+
+
+def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:
+    """Format a text from a file, optionally with its unit, short enough for a label.
+
+    Args:
+        name: Text of the label.
+        unit: Unit; ``1`` for none.
+        max_length: Maximum number of characters of the text.
+    """
+    return format_label(sanitise(name, max_length), sanitise(unit, 12))
 
 
 def format_fitted_value(fitted: FittedValue) -> str:

@@ -11,20 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from bench.diagnosis.report import cause_text, effect_and_unit_text, summary_text
-from bench.diagnosis.report.cause_text import (
-    format_effect_set,
+from bench.diagnosis.report.candidate_ranking import (
     get_candidate_status,
     has_placed_causes,
-    list_place_marks,
     rank_candidates,
-    strip_place,
 )
+from bench.diagnosis.report.cause_text import format_effect_set, strip_place
 from bench.diagnosis.report.consistency_section import (
     MAX_TABLE_ROWS,
     build_agreement_rows,
     format_consistency,
     pluralise_group,
 )
+from bench.diagnosis.report.diagnosed_places import find_joint, list_place_marks
 from bench.diagnosis.report.effect_and_unit_text import (
     ALL_PLACES,
     format_effect_name,
@@ -34,13 +33,8 @@ from bench.diagnosis.report.effect_and_unit_text import (
     sanitise,
     split_effect_name,
 )
-from bench.diagnosis.report.figure_panels import (
-    MAX_LABEL_LENGTH,
-    has_extended_model,
-    select_informative_profiles,
-)
 from bench.diagnosis.report.identifiability_section import build_identifiability_section
-from bench.diagnosis.report.joint_figure import find_joint, is_robot
+from bench.diagnosis.report.joint_figure import is_robot
 from bench.diagnosis.report.motion_chart import (
     BASE_MODEL_STYLE,
     EXTENDED_MODEL_STYLE,
@@ -52,6 +46,7 @@ from bench.diagnosis.report.report_data import (
     DiagnosisReportData,
     ResidualProfile,
 )
+from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import shorten_name
@@ -157,7 +152,7 @@ def build_gap_location_table(report: DiagnosisReportData) -> Table:
             "samples": location.samples,
             "before": location.before,
         }
-        if has_extended_model(report):
+        if report.has_extended_model:
             row["after"] = location.after
         if is_robot(report):
             name = location.label if location.kind == "channel" else ""
@@ -182,7 +177,7 @@ def build_residual_profile_table(report: DiagnosisReportData) -> Table:
             "variable": sanitise(profile.variable, 80),
         }
         means_by_model = {"before": profile.before} | (
-            {"after": profile.after} if has_extended_model(report) else {}
+            {"after": profile.after} if report.has_extended_model else {}
         )
         for model, means in means_by_model.items():
             for centre, mean, error in zip(profile.centres, means, profile.error, strict=True):
@@ -210,7 +205,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         "after": EXTENDED_MODEL_STYLE._replace(marker="o"),
         "before": BASE_MODEL_STYLE._replace(marker="s"),
     }
-    models = ("after", "before") if has_extended_model(report) else ("before",)
+    models = ("after", "before") if report.has_extended_model else ("before",)
     shown_ids = {id(profile) for profile in select_informative_profiles(report.profiles)}
     panels = []
     for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown_ids):

@@ -12,24 +12,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.cause_text import list_place_marks
-from bench.diagnosis.report.effect_and_unit_text import ALL_PLACES, format_number, sanitise
-from bench.diagnosis.report.figure_panels import (
-    BASE_MODEL_LINE,
-    EXTENDED_MODEL_LINE,
-    MAX_OUTLINED_DOTS,
-    MAX_SAMPLES,
-    RunView,
-    format_selected_run,
-    has_extended_model,
-    select_worst_run,
+from bench.diagnosis.report.diagnosed_places import list_marked_joints, list_place_marks
+from bench.diagnosis.report.effect_and_unit_text import (
+    QUANTITY_LABELS,
+    format_number,
+    sanitise,
     shorten_label,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.run_selection import RunView, format_selected_run, select_worst_run
 from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
+    BASE_MODEL_LINE,
     BLUE,
     CAPTION_GREY,
+    EXTENDED_MODEL_LINE,
     NEUTRAL_MARK,
     NOISE_BAND_GREY,
     ZERO_LINE_GREY,
@@ -43,10 +40,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+MAX_SAMPLES = 3000
+"""Maximum number of samples drawn of a run; of a longer run the extremes of each part are drawn."""
+MAX_OUTLINED_DOTS = 1000
+"""Maximum number of dots drawn as vector outlines; more dots are rasterised in vector files too."""
 MAX_JOINTS = 10
 """Maximum number of rows; those with the largest residuals are shown."""
-QUANTITY_LABELS: Mapping[str, str] = {"q": "position", "qd": "velocity", "tau": "torque"}
-"""Quantities of a joint, by the first part of a channel's name; a sensor has its own row."""
 MIN_RESIDUAL_AXIS_SIGMAS = 4.0
 """Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
 the panel.
@@ -145,7 +144,7 @@ def draw_run_figure(report: DiagnosisReportData) -> Figure:
     rows = _select_worst_rows(report, view)
     quantities = [name for name in QUANTITY_LABELS if any(name in row.channels for row in rows)]
     height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
-    named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
+    named_joints = {mark.name for mark in list_place_marks(report)} | list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
     # Widths in inches: names, panels of motion and legend, and each panel of residuals.
     names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_GAP_INCHES)
@@ -238,9 +237,9 @@ def _draw_motion(
         zorder=1,
         rasterized=shown_samples.size > MAX_OUTLINED_DOTS,
     )
-    base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
+    base_label = "simulated before (tuned)" if report.has_extended_model else "simulated (tuned)"
     panel.plot(shown_times, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
-    if has_extended_model(report):
+    if report.has_extended_model:
         # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
         panel.plot(shown_times, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
     quantity, _, joint = channel.name.partition(".")
@@ -292,7 +291,7 @@ def _draw_residual(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
     )
     panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
-    models = ("before", "after") if has_extended_model(report) else ("before",)
+    models = ("before", "after") if report.has_extended_model else ("before",)
     for model in models:
         residual = view.compute_residual(model, channel_index)
         rows = thin_signal(residual, MAX_SAMPLES)
@@ -345,37 +344,6 @@ def _unify_scale(
         panel.set_ylim(-limit, limit)
 
 
-def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
-    """Return the joint that a place belongs to; empty without a joint or a robot.
-
-    Args:
-        report: Report data.
-        kind: Kind of the place: joint, channel, actuator or body.
-        place: Name of the place.
-    """
-    robot = report.robot
-    if kind == "joint":
-        return "" if place == ALL_PLACES else sanitise(place, 40)
-    if kind == "channel":
-        quantity, _, name = place.partition(".")
-        # A sensor has its own row.
-        return sanitise(name if quantity in QUANTITY_LABELS and name else place, 40)
-    if robot is None:
-        return ""
-    if kind == "actuator":
-        return next((sanitise(a.joint or "", 40) for a in robot.actuators if a.name == place), "")
-    if kind == "body":
-        body_ids = {body.id for body in robot.bodies if body.name == place}
-        joints = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in body_ids]
-        return sanitise(joints[0], 40) if joints else ""
-    return ""
-
-
-def _list_marked_joints(report: DiagnosisReportData) -> set[str]:
-    """Return the joints of the channels, actuators and bodies in the diagnosis."""
-    return {find_joint(report, mark.kind, mark.name) for mark in list_place_marks(report)}
-
-
 def _add_title_and_legend(
     figure: Figure,
     axes: Any,
@@ -420,7 +388,7 @@ def _add_title_and_legend(
         ncols=4,
         fontsize=9,
     )
-    before = "before → after" if has_extended_model(report) else "its size"
+    before = "before → after" if report.has_extended_model else "its size"
     note = f"residual: measured − simulated; above each its RMS in σ, {before}"
     figure.text(0.5, 0.14 / height, note, fontsize=8, ha="center", va="center", color=CAPTION_GREY)
     figure.subplots_adjust(

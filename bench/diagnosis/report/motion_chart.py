@@ -10,14 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.report.effect_and_unit_text import (
+    QUANTITY_LABELS,
     format_label,
     format_number,
     format_unit,
     sanitise,
 )
-from bench.diagnosis.report.figure_panels import RunView, has_extended_model, rank_runs
-from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_joint_rows
+from bench.diagnosis.report.joint_figure import is_robot, list_joint_rows
 from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.run_selection import RunView, rank_runs
 from bench.figures.signal_thinning import select_extreme_samples
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style, shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
@@ -81,7 +82,7 @@ def build_motion_table(report: DiagnosisReportData) -> MotionTable:
         _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
     ]
     names = ["run", "channel", "t", "measured", "before", "residual_before"]
-    if has_extended_model(report):
+    if report.has_extended_model:
         names = [*names[:5], "after", "residual_before", "residual_after"]
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
@@ -110,7 +111,7 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
             two.
         max_rows: maximum number of samples of a run in the chart.
     """
-    return max(1, max_rows // (6 if has_extended_model(report) else 4))
+    return max(1, max_rows // (6 if report.has_extended_model else 4))
 
 
 def _format_rows(
@@ -127,7 +128,7 @@ def _format_rows(
         max_rows: maximum number of samples.
     """
     channel, times = report.channels[channel_index], run.times
-    models = ("before", "after") if has_extended_model(report) else ("before",)
+    models = ("before", "after") if report.has_extended_model else ("before",)
     observed = run.get_samples("observed", channel_index)
     simulated = [run.get_samples(model, channel_index) for model in models]
     residuals = [run.compute_residual(model, channel_index) for model in models]
@@ -292,7 +293,7 @@ def _make_panels(
         "run": sanitise(run.name, 80),
         "channel": sanitise(channel.name, 80),
     }
-    extended = has_extended_model(report)
+    extended = report.has_extended_model
     series = [Series("measured", "measured", MEASURED_STYLE, selection, draw="points", under=True)]
     residuals = [Series("simulated before", "residual_before", BASE_MODEL_STYLE, selection)]
     if extended:

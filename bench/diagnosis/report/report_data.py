@@ -203,3 +203,14 @@ class DiagnosisReportData:
     def validation_run(self) -> str:
         """Word before the name of a run of `held_out`."""
         return "left-out" if self.cross_validated else "held-out"
+
+    @property
+    def has_extended_model(self) -> bool:
+        """Return whether there is an extended model to show next to the base model."""
+        return bool(self.verdict.causes)
+
+    @property
+    def data_splits(self) -> list[DataSplit]:
+        """The fitted runs and the held-out runs, as far as they exist."""
+        splits = (self.fitting, self.held_out)
+        return [split for split in splits if split is not None and split.names]

@@ -6,20 +6,20 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from bench.diagnosis.report.cause_text import (
+from bench.diagnosis.report.candidate_ranking import (
     MAX_SHOWN_CANDIDATES,
     get_candidate_status,
     select_shown_candidates,
 )
 from bench.diagnosis.report.explanation_figures import draw_figure, render_figures
 from bench.diagnosis.report.explanation_page import render_report
-from bench.diagnosis.report.figure_panels import (
+from bench.diagnosis.report.report_data import GapLocation
+from bench.diagnosis.report.residual_figure import (
     draw_profile_panel,
     select_gap_locations,
     select_informative_profiles,
-    select_worst_run,
 )
-from bench.diagnosis.report.report_data import GapLocation
+from bench.diagnosis.report.run_selection import select_worst_run
 from bench.figures.figure_settings import pdf_figures
 from tests.bench.diagnosis.sample_report_data import evil, make_report
 

@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from bench.diagnosis.report.cause_text import (
+from bench.diagnosis.report.candidate_ranking import (
     MAX_SHOWN_CANDIDATES,
-    format_effect_set,
-    format_missing_causes,
-    list_place_marks,
     rank_candidates,
     select_shown_candidates,
+)
+from bench.diagnosis.report.cause_text import (
+    format_effect_set,
+    format_missing_causes,
     shorten_effect_name,
     strip_place,
 )
+from bench.diagnosis.report.diagnosed_places import list_place_marks
 from bench.diagnosis.report.effect_and_unit_text import (
     format_effect,
     format_effect_name,

@@ -3,6 +3,7 @@ import re
 import numpy as np
 import pytest
 
+from bench.diagnosis.report.detectable_gap import compute_detectable_gap
 from bench.diagnosis.report.effect_and_unit_text import (
     format_effect,
     format_effect_name,
@@ -16,7 +17,6 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
 from bench.diagnosis.report.summary_text import (
-    compute_detectable_gap,
     format_gain,
     format_gain_and_caveats,
     format_headline,

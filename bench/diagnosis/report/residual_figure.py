@@ -1,33 +1,36 @@
-"""Panels of the figures of an explanation, and the choice of the run that they show."""
+"""Figure of the residual: where the gap is, and how the residual depends on other variables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from bench.diagnosis.report.effect_and_unit_text import format_label, sanitise
 from bench.diagnosis.report.report_data import (
-    DataSplit,
     DiagnosisReportData,
     GapLocation,
     ResidualProfile,
 )
-from bench.diagnosis.report.summary_text import list_data_splits
 from bench.figures.style import (
-    BLUE,
+    BASE_MODEL_LINE,
+    BASE_MODEL_MARKER,
     CONNECTOR_GREY,
+    EXTENDED_MODEL_LINE,
+    EXTENDED_MODEL_MARKER,
     NEUTRAL_MARK,
     NULL_LEVEL_GREY,
-    VERMILION,
     ZERO_LINE_GREY,
     break_name,
+    count_max_lines,
+    make_panel_grid,
+    measure_text_width,
 )
-from sims.core.simulator import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 MAX_RUNS = 8
@@ -43,23 +46,6 @@ _NAME_LINE = 32
 """Maximum number of characters per line of the name of a gap location or variable."""
 SHORT_LABEL_LENGTH = 9
 """Maximum number of characters of a unit next to a panel."""
-BASE_MODEL_LINE: Mapping[str, Any] = {
-    "color": VERMILION,
-    "linestyle": (0, (5, 2)),
-    "linewidth": 1.3,
-}
-"""Line style of the fitted base model: dashed, so that it is recognised without colour."""
-EXTENDED_MODEL_LINE: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
-"""Line style of the extended model."""
-BASE_MODEL_MARKER: Mapping[str, Any] = {
-    "marker": "s",
-    "markersize": 6,
-    "markerfacecolor": "white",
-    "color": VERMILION,
-}
-"""Marker style of the fitted base model: open squares, recognised without colour."""
-EXTENDED_MODEL_MARKER: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
-"""Marker style of the extended model."""
 _SPAN_FOR_LOG = 8.0
 """Minimum ratio of the largest to the smallest value for a logarithmic axis."""
 _FLOOR = "1: noise floor"
@@ -72,22 +58,119 @@ _NEXT_KIND = 2.1
 """Distance to the first row of another kind, with space for its heading."""
 _FIRST = 1.0
 """Position of the first row."""
+_HEADING_OFFSET = 0.22
+"""Distance from the upper edge to the middle of a heading, in inches."""
+_HEADING_SIZE = 11.0
+"""Maximum font size of a heading, in points."""
+_MIN_NAMES_WIDTH = 1.9
+"""Minimum width for the names of places, in inches."""
+_PROFILES_AFTER = 4.1
+"""Distance from the end of the names of places to the profiles, in inches."""
+FONT_SIZE = 9
+"""Font size of the figures of an explanation, in points."""
 
 
-def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:
-    """Format a text from a file, optionally with its unit, short enough for a label.
+def draw_residual_figure(report: DiagnosisReportData) -> Figure:
+    """Draw the gap locations on the left, and the most informative profiles on the right.
+
+    A gap location is a run, channel or phase of the motion with its RMS residual. A profile is the
+    mean residual in bins of another variable, such as the speed. All sizes are in inches, because
+    texts do not grow with the figure.
 
     Args:
-        name: Text of the label.
-        unit: Unit; ``1`` for none.
-        max_length: Maximum number of characters of the text.
+        report: Data of the report.
     """
-    return format_label(sanitise(name, max_length), sanitise(unit, 12))
+    locations = select_gap_locations(report.gap_locations)
+    profiles = select_informative_profiles(report.profiles)
+    rows = min(2, len(profiles))
+    columns = -(-len(profiles) // 2)
+    names = place_names(locations)
+    left_margin = max(_MIN_NAMES_WIDTH, 0.25 + measure_text_width(names, FONT_SIZE))
+    profiles_from = left_margin + _PROFILES_AFTER
+    # A single column of profiles is wider than one of several columns.
+    # Widths in inches: panel of the gaps, and each column of profiles.
+    width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
+    # Height of a row in inches, and of each further line of a name.
+    row_height = 0.27 + 0.13 * (count_max_lines(names) - 1)
+    # Variables of robots have long names, which need several lines below the panels.
+    label_height = 0.15 * (
+        count_max_lines([format_profile_label(profile) for profile in profiles]) - 1
+    )
+    # Height in inches of title, axis and rows; or of titles and panels of the profiles.
+    height = max(2.6 + row_height * len(locations), 1.5 + (1.9 + label_height) * rows)
+    figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
+    layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
+    # Left, bottom, width and height, given in inches, as shares of the figure.
+    axis.set_position((left_margin / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
+    draw_gap_location_panel(axis, locations, report)
+    layout.heading(0.15, "Where the gap is")
+    figure.legend(
+        *get_legend_entries(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0
+    )
+    if not profiles:
+        return figure
+
+    channels = {profile.channel for profile in profiles}
+    channel_text = (
+        f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
+    )
+    layout.heading(profiles_from, f"Residual{channel_text} against other variables")
+    note = "means in bins, bars: ±2 standard errors; residual: measured − simulated"
+    figure.text(layout.across(profiles_from), layout.up(0.2), note, fontsize=8.5, va="center")
+    grid = figure.add_gridspec(
+        rows,
+        columns,
+        left=layout.across(profiles_from),
+        right=1 - layout.across(0.12),
+        # The labels below the panels need 0.85 inches and their further lines.
+        bottom=layout.up(0.85 + label_height),
+        top=1 - layout.up(0.5),
+        hspace=0.45 + 0.6 * label_height,
+        wspace=0.42,
+    )
+    units = {c.name: c.unit for c in report.channels}
+    for i, profile in enumerate(profiles):
+        axis = figure.add_subplot(grid[i // columns, i % columns])
+        unit = units.get(profile.channel, "1")
+        draw_profile_panel(
+            axis, profile, unit, report.has_extended_model, one_channel=len(channels) == 1
+        )
+    return figure
 
 
-def has_extended_model(report: DiagnosisReportData) -> bool:
-    """Return whether there is an extended model to show next to the base model."""
-    return bool(report.verdict.causes)
+class _FigureLayout(NamedTuple):
+    """Figure layout in inches, so that margins do not change with the figure size.
+
+    Attributes:
+        figure: Figure that is laid out.
+        width: Width in inches.
+        height: Height in inches.
+    """
+
+    figure: Figure
+    width: float
+    height: float
+
+    def across(self, inches: float) -> float:
+        """Convert a distance from the left edge in inches to a share of the width."""
+        return inches / self.width
+
+    def up(self, inches: float) -> float:
+        """Convert a distance from the lower edge in inches to a share of the height."""
+        return inches / self.height
+
+    def heading(self, inches: float, text: str) -> None:
+        """Write a heading at a distance from the left edge, in a font size that fits.
+
+        Args:
+            inches: Distance from the left edge.
+            text: Text of the heading.
+        """
+        # Hinting makes letters wider on the page than their outlines.
+        available_width = self.width - inches - 0.3
+        size = _HEADING_SIZE * min(1.0, available_width / measure_text_width([text], _HEADING_SIZE))
+        y = 1 - self.up(_HEADING_OFFSET)
+        self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
 
 
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
@@ -140,12 +223,12 @@ def draw_gap_location_panel(
     axis.axvline(1.0, color=NEUTRAL_MARK, linewidth=1.0, linestyle=":", label=_FLOOR)
     before_values = [p.before for p in places]
     after_values = [p.after for p in places]
-    if has_extended_model(report):
+    if report.has_extended_model:
         axis.hlines(row_positions, after_values, before_values, color=CONNECTOR_GREY, linewidth=0.9)
         axis.plot(after_values, row_positions, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
-    name = "before" if has_extended_model(report) else "simulated (tuned)"
+    name = "before" if report.has_extended_model else "simulated (tuned)"
     axis.plot(before_values, row_positions, linestyle="", label=name, **BASE_MODEL_MARKER)
-    shown_values = [*before_values, *after_values] if has_extended_model(report) else before_values
+    shown_values = [*before_values, *after_values] if report.has_extended_model else before_values
     # The noise floor must be visible, whatever the sizes.
     _use_log_axis_if_needed(axis, [*shown_values, 1.0])
     axis.set_yticks(row_positions, place_names(places), linespacing=1.05)
@@ -314,99 +397,3 @@ def draw_profile_panel(
         break_name(format_label(label, sanitise(unit, SHORT_LABEL_LENGTH)), MAX_LABEL_LENGTH)
     )
     axis.locator_params(nbins=5)
-
-
-MAX_SAMPLES = 3000
-"""Maximum number of samples drawn of a run; of a longer run the extremes of each part are drawn."""
-MAX_OUTLINED_DOTS = 1000
-"""Maximum number of dots drawn as vector outlines; more dots are rasterised in vector files too."""
-
-
-class RunView(NamedTuple):
-    """Run that a figure or chart shows.
-
-    Attributes:
-        data_split: Data split of the run.
-        row: Index of the run in it.
-        held_out: Whether the run is held out.
-        sigma: (C,) Standard deviation of the noise of each channel.
-        gap: RMS residual of the base model over all channels, in units of the noise.
-    """
-
-    data_split: DataSplit
-    row: int
-    held_out: bool
-    sigma: Array
-    gap: float
-
-    @property
-    def name(self) -> str:
-        """Name of the run."""
-        return self.data_split.names[self.row]
-
-    @property
-    def times(self) -> Array:
-        """Sample times (T,) of the run, s."""
-        return self.data_split.times[self.row]
-
-    def count_samples(self) -> int:
-        """Count the sample times; one counts once, however many channels were recorded."""
-        return int(np.isfinite(self.data_split.observed[self.row]).any(axis=1).sum())
-
-    def get_samples(self, signal: str, channel_index: int) -> Array:
-        """Return the samples (T,) of a channel.
-
-        Args:
-            signal: ``observed``, ``before`` (base model) or ``after`` (extended model).
-            channel_index: index of the channel.
-        """
-        samples: Array = getattr(self.data_split, signal)
-        return samples[self.row, : len(self.times), channel_index]
-
-    def compute_residual(self, model: str, channel_index: int) -> Array:
-        """Compute the residual (T,) of a channel in units of its noise.
-
-        Args:
-            model: ``before`` (base model) or ``after`` (extended model).
-            channel_index: index of the channel.
-        """
-        observed = self.get_samples("observed", channel_index)
-        difference = observed - self.get_samples(model, channel_index)
-        residual: Array = difference / self.sigma[channel_index]
-        return residual
-
-
-def rank_runs(report: DiagnosisReportData) -> list[RunView]:
-    """List all runs by descending gap, but the worst held-out run first, if there is any."""
-    sigma = np.array([c.sigma for c in report.channels])
-    runs = []
-    for split in list_data_splits(report):
-        squares = np.square((split.observed - split.before) / sigma)
-        for row, run_squares in enumerate(squares):
-            finite = run_squares[np.isfinite(run_squares)]
-            gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
-            runs.append(RunView(split, row, split is report.held_out, sigma, gap))
-    last_split = runs[-1].data_split
-    runs.sort(key=lambda run: -run.gap)
-    worst = next(run for run in runs if run.data_split is last_split)
-    return [worst, *(run for run in runs if run is not worst)]
-
-
-def select_worst_run(report: DiagnosisReportData) -> RunView:
-    """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
-    return rank_runs(report)[0]
-
-
-def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
-    """Format the phrase of a caption that names a run and says why it is shown.
-
-    For example "Run swing3, the held-out run with the largest gap".
-
-    Args:
-        report: content of the report, whose verdict gives the reason.
-        view: the run that `select_worst_run` selected.
-    """
-    # `validation_run` is an adjective: "held-out" or "left-out".
-    kind = f"{report.validation_run} run" if view.held_out else "run"
-    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
-    return f"Run {shorten_label(view.name)}, the {kind} {reason}"

@@ -1,0 +1,122 @@
+"""Places of a robot that a diagnosis names: marks for its drawing, and their joints."""
+
+from __future__ import annotations
+
+from bench.diagnosis.report.cause_text import MODEL_FILE_ERRORS
+from bench.diagnosis.report.effect_and_unit_text import (
+    ALL_PLACES,
+    QUANTITY_LABELS,
+    append_unit,
+    format_effect_name,
+    format_number,
+    format_percent,
+    get_place_kind,
+    sanitise,
+    split_effect_name,
+)
+from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.verdict import Cause
+from bench.figures.robot_figure import PlaceMark
+
+
+def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
+    """List the diagnosed places, to be marked on the drawing of the robot.
+
+    Args:
+        report: Data of the report.
+
+    Returns:
+        One mark per place; alternatives of a cause are marked, too.
+    """
+    marks: dict[tuple[str, str, str], PlaceMark] = {}
+    for cause in report.verdict.causes:
+        is_certain = not cause.alternatives
+        for name in (cause.effect, *cause.alternatives):
+            noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
+            for place in _list_places(report, name, cause):
+                # The coefficients are those of the cause, not of its alternatives.
+                size = _format_coefficient(cause, name, place) if name == cause.effect else ""
+                # A family and one of its places give the same mark, which is kept once.
+                marks.setdefault(
+                    (kind, place, noun), PlaceMark(kind, place, f"{noun}{size}", is_certain)
+                )
+    return list(marks.values())
+
+
+def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
+    """List the places at which an effect acts, for marks on the drawing of the robot.
+
+    An effect at all places (``@*``) has those of its coefficients; if these name none, it has all
+    joints, actuators or bodies of the robot.
+
+    Args:
+        report: content of the report, with the robot.
+        effect: name of the effect, with its place.
+        cause: the cause, whose coefficients may be named by places.
+    """
+    _, place = split_effect_name(effect)
+    if place != ALL_PLACES:
+        return [place] if place else []
+    coefficient_places = [
+        split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect
+    ]
+    robot = report.robot
+    if any(coefficient_places) or robot is None:
+        return list(dict.fromkeys(name for name in coefficient_places if name))
+    tables = {
+        "joint": [joint.name for joint in robot.joints],
+        "actuator": [actuator.name for actuator in robot.actuators],
+        "body": [body.name for body in robot.bodies],
+    }
+    return tables.get(get_place_kind(effect), [])
+
+
+def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
+    """Format the coefficient of a cause at a place for a label; empty for several coefficients.
+
+    Args:
+        cause: the cause with its coefficients.
+        effect: name of the effect, with its place.
+        place: place of the label, such as a joint.
+    """
+    at_place = [
+        n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
+    ]
+    if len(at_place) != 1:
+        return ""
+    fitted = at_place[0]
+    if split_effect_name(effect)[0] in MODEL_FILE_ERRORS and fitted.unit == "1":
+        sign = "+" if fitted.value > 0 else ""
+        return f": {sign}{format_percent(fitted.value)}"
+    return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
+
+
+def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
+    """Return the joint that a place belongs to; empty without a joint or a robot.
+
+    Args:
+        report: Report data.
+        kind: Kind of the place: joint, channel, actuator or body.
+        place: Name of the place.
+    """
+    robot = report.robot
+    if kind == "joint":
+        return "" if place == ALL_PLACES else sanitise(place, 40)
+    if kind == "channel":
+        quantity, _, name = place.partition(".")
+        # A sensor has its own row.
+        return sanitise(name if quantity in QUANTITY_LABELS and name else place, 40)
+    if robot is None:
+        return ""
+    if kind == "actuator":
+        return next((sanitise(a.joint or "", 40) for a in robot.actuators if a.name == place), "")
+    if kind == "body":
+        body_ids = {body.id for body in robot.bodies if body.name == place}
+        joints = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in body_ids]
+        return sanitise(joints[0], 40) if joints else ""
+    return ""
+
+
+def list_marked_joints(report: DiagnosisReportData) -> set[str]:
+    """Return the joints of the channels, actuators and bodies in the diagnosis."""
+    return {find_joint(report, mark.kind, mark.name) for mark in list_place_marks(report)}
