@@ -560,7 +560,7 @@ def find_copied_commands(
         measured_values = np.concatenate([run.channels[channel] for run in runs])
         is_recorded = np.isfinite(measured_values)
         command_values, measured_values = command_values[is_recorded], measured_values[is_recorded]
-        # A joint that hardly moves may equal its command by chance.
+        # The readings of a joint that hardly moves may equal its command anyway.
         if len(np.unique(measured_values)) >= MIN_SAMPLES and np.array_equal(
             command_values, measured_values
         ):

@@ -153,7 +153,8 @@ class _Rows:
                 step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
                 stepped_values = {**values_by_name, name: values_by_name[name] + step}
                 gradient[i] = (quantity.of(stepped_values) - value) / step
-            half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+            variance = float(gradient @ covariance @ gradient)
+            half_width = Z95 * float(np.sqrt(max(variance, 0.0)))
             fitted_value = FittedValue(value, quantity.unit, value - half_width, value + half_width)
             row = SheetRow(
                 quantity.name, quantity.says, "system", "derived", quantity.unit, fitted_value

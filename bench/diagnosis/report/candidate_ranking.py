@@ -45,8 +45,8 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     """List all candidates as entries, the highest score first.
 
     If effects act at places, such as joints, an effect would appear once for each of them. So it is
-    one entry: its best place, with the others in `elsewhere`. Each diagnosed cause has its own
-    entry.
+    one entry: the place that represents it, with the others in `elsewhere`. Each diagnosed cause
+    has its own entry, and represents its effect even if another place has a higher score.
 
     Args:
         report: Data of the report.
@@ -55,29 +55,32 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     if not has_placed_causes(report):
         return [RankedCandidate(candidate) for candidate in ordered_candidates]
     causes = {cause.effect for cause in report.verdict.causes}
-    groups: dict[str, list[Candidate]] = {}
+    candidates_by_effect: dict[str, list[Candidate]] = {}
     for candidate in ordered_candidates:
-        groups.setdefault(split_effect_name(candidate.effect)[0], []).append(candidate)
+        base, _ = split_effect_name(candidate.effect)
+        candidates_by_effect.setdefault(base, []).append(candidate)
     entries = []
-    for group in groups.values():
-        # A diagnosed cause represents its effect even if another place has a higher score.
-        heads = [c for c in group if c.effect in causes] or [_choose_representative(group)]
-        other_members = tuple(c for c in group if c not in heads)
-        entries += [
-            RankedCandidate(heads[0], other_members),
-            *(RankedCandidate(head) for head in heads[1:]),
-        ]
+    for group in candidates_by_effect.values():
+        diagnosed = [candidate for candidate in group if candidate.effect in causes]
+        first, *others = diagnosed or [_choose_representative(group)]
+        elsewhere = tuple(c for c in group if c not in (first, *others))
+        entries += [RankedCandidate(first, elsewhere), *map(RankedCandidate, others)]
     return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
 
 
 def _choose_representative(group: list[Candidate]) -> Candidate:
-    """Return the best place, unless the family explains much more; it explains at least as much."""
-    best_place = next((c for c in group if split_effect_name(c.effect)[1] != ALL_PLACES), group[0])
-    return (
-        best_place
-        if group[0].score < MIN_FAMILY_SCORE_RATIO * max(best_place.score, 1.0)
-        else group[0]
-    )
+    """Return the candidate that represents an effect without a diagnosed cause.
+
+    It is the best single place. But if the effect at all places (the family), which explains at
+    least as much, has a much higher score, it is the family.
+
+    Args:
+        group: candidates of one effect at several places, the highest score first.
+    """
+    best = group[0]
+    best_place = next((c for c in group if not c.effect.endswith(f"@{ALL_PLACES}")), best)
+    is_much_better = best.score >= MIN_FAMILY_SCORE_RATIO * max(best_place.score, 1.0)
+    return best if is_much_better else best_place
 
 
 def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
@@ -87,11 +90,10 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     needed are left out, those with the lowest scores first.
     """
     ordered_candidates = [entry.best for entry in rank_candidates(report)]
-    # A diagnosed cause is shown even with a low score.
     unneeded_candidates = [
         c for c in ordered_candidates if get_candidate_status(report, c.effect) == "not needed"
     ]
-    hidden_candidates = unneeded_candidates[
-        max(0, MAX_SHOWN_CANDIDATES - len(ordered_candidates) + len(unneeded_candidates)) :
-    ]
+    # Diagnosed causes and their alternatives are shown even with a low score.
+    needed_count = len(ordered_candidates) - len(unneeded_candidates)
+    hidden_candidates = unneeded_candidates[max(0, MAX_SHOWN_CANDIDATES - needed_count) :]
     return [c for c in ordered_candidates if c not in hidden_candidates]

@@ -99,7 +99,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     simulated_count = sum(candidate.heldout_gain is not None for candidate in candidates)
     has_shares = simulated_count >= MIN_SIMULATED_SHARE * len(candidates) > 0
 
-    # Names of causes are bold, which is a little wider.
+    # Layout in inches. Names of causes are bold, which is a little wider.
     left_margin = _EDGE + 0.12 + measure_text_width(names, _NAME_SIZE, "bold")
     shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
     texts = [_format_score(report, candidate, not has_shares) for candidate in candidates]
@@ -115,16 +115,17 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     figure, axes = make_panel_grid(
         1, 2 if has_shares else 1, (width, height), layout=None, sharey=True
     )
-    bottom, size = _BOTTOM / height, row_height * len(candidates) / height
-    scores = axes[0, -1]
-    scores.set_position(((left_margin + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
+    # Positions of panels are left, bottom, width and height as shares of the figure.
+    bottom, panel_height = _BOTTOM / height, row_height * len(candidates) / height
+    left_panel, scores = axes[0, 0], axes[0, -1]
+    scores_left = (left_margin + shares_width) / width
+    scores.set_position((scores_left, bottom, _SCORES_WIDTH / width, panel_height))
     _draw_scores(scores, report, candidates, texts, _BAR / row_height)
     if has_shares:
-        shares = axes[0, 0]
-        shares.set_position((left_margin / width, bottom, _SHARES_WIDTH / width, size))
-        _draw_shares(shares, report, candidates)
+        left_panel.set_position((left_margin / width, bottom, _SHARES_WIDTH / width, panel_height))
+        _draw_shares(left_panel, report, candidates)
         scores.tick_params(axis="y", left=False, labelleft=False)
-    _label_rows(axes[0, 0], report, candidates, names)
+    _label_rows(left_panel, report, candidates, names)
 
     total = len(rank_candidates(report))
     selection = f", the best {len(candidates)} of {total}" if len(candidates) < total else ""
@@ -164,11 +165,12 @@ def _format_candidate_name(report: DiagnosisReportData, candidate: Candidate) ->
         return "\n".join(textwrap.wrap(text, LINE_LENGTH))
     lines = textwrap.wrap(effect, LINE_LENGTH)
     place = f"at {place}"
-    # The place is not broken, and has its own line unless it follows a short last one.
+    # The place follows the last of several lines if it fits there, and else has its own line.
     if len(lines) > 1 and len(lines[-1]) + 1 + len(place) <= LINE_LENGTH:
         lines[-1] += f" {place}"
-        return "\n".join(lines)
-    return "\n".join([*lines, break_name(place, LONGEST_LINE)])
+    else:
+        lines.append(break_name(place, LONGEST_LINE))
+    return "\n".join(lines)
 
 
 def _label_rows(
@@ -184,6 +186,7 @@ def _label_rows(
         candidates: candidate effects in the order of the report.
         names: names of the candidates, the first at the top.
     """
+    # Rows are one apart; the vertical axis points downwards.
     axis.set_yticks(np.arange(len(candidates)), names, fontsize=_NAME_SIZE, linespacing=1.15)
     axis.set_ylim(len(candidates) - 0.5, -0.5)
     axis.tick_params(axis="y", length=0)
@@ -195,7 +198,8 @@ def _label_rows(
 def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate]) -> None:
     """Draw which share of the held-out gap each candidate closes, with its 95 % interval.
 
-    Each candidate is a row, in the given order. One that was not simulated has no mark.
+    Each candidate is a row, in the given order. One that was not simulated has no mark. A share of
+    1 closes the gap fully; a negative one means that the candidate makes the prediction worse.
 
     Args:
         axis: axes to draw on.
@@ -250,7 +254,9 @@ def _format_interval(report: DiagnosisReportData, candidate: Candidate, prefix: 
     interval = report.share_intervals.get(candidate.effect)
     if interval is None:
         return ""
-    return f" ({prefix}{' to '.join(format_percent(end)[:-2] for end in interval)})"
+    # Both ends without " %".
+    ends = [format_percent(end).removesuffix(" %") for end in interval]
+    return f" ({prefix}{' to '.join(ends)})"
 
 
 def _format_score(report: DiagnosisReportData, candidate: Candidate, with_share: bool) -> str:
@@ -289,14 +295,14 @@ def _draw_scores(
         thickness: height of a bar in rows.
     """
     other_places = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
-    longest_bar = 1e-9
+    longest_bar = 1e-9  # Positive, so that the axis has a length.
     for row, (candidate, text) in enumerate(zip(candidates, texts, strict=True)):
         size = max(candidate.score, 0.0)
         bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
         if _is_insignificant(report, candidate):
             bar_style["facecolor"] = "white"
         axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **bar_style)
-        other_scores = [max(member.score, 0.0) for member in other_places.get(candidate.effect, ())]
+        other_scores = [max(other.score, 0.0) for other in other_places.get(candidate.effect, ())]
         axis.plot(
             other_scores,
             [row] * len(other_scores),
@@ -340,10 +346,10 @@ def _format_p_value(p_value: float) -> str:
 
 
 def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
-    """Format the notes below the figure: numbers of runs and samples, meaning of p-values.
+    """Format the two notes below the figure: numbers of runs and samples, and p-values.
 
-    P-values are printed next to bars only if they are neither tiny nor insignificant; the notes
-    give the bound for the others.
+    P-values are printed next to bars only if they are neither tiny nor insignificant; the second
+    note gives the bound for the others, and says which candidates were not simulated.
 
     Args:
         report: content of the report.
@@ -354,27 +360,22 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
         counts += "; each run left out in turn"
     elif report.held_out is not None:
         counts += f"; held out: {_format_split_size(report.held_out)}"
-    notes = [f"{counts}."]
     p_value_note = "p: p-value of the score"
     tiny_p_values = [c.p_value for c in candidates if c.p_value <= MAX_UNPRINTED_P_VALUE]
-    insignificant_p_values = [c.p_value for c in candidates if _is_insignificant(report, c)]
     if tiny_p_values:
-        bars = (
-            "for all shown"
-            if len(tiny_p_values) == len(candidates)
-            else "for grey or coloured bars"
-        )
+        is_all = len(tiny_p_values) == len(candidates)
+        bars = "for all shown" if is_all else "for grey or coloured bars"
         p_value_note += f"; {_format_p_value(max(tiny_p_values)).replace('=', '≤')} {bars}"
+    insignificant_p_values = [c.p_value for c in candidates if _is_insignificant(report, c)]
     if insignificant_p_values:
-        bars = (
-            "for all shown" if len(insignificant_p_values) == len(candidates) else "for white bars"
-        )
+        is_all = len(insignificant_p_values) == len(candidates)
+        bars = "for all shown" if is_all else "for white bars"
         p_value_note += f"; {_format_p_value(min(insignificant_p_values)).replace('=', '≥')} {bars}"
-    notes.append(f"{p_value_note}.")
+    p_value_note += "."
     unsimulated_count = sum(candidate.heldout_gain is None for candidate in candidates)
     if 0 < unsimulated_count < len(candidates):
-        notes[1] += f" Without a share of the gap: not simulated on {report.validation_runs}."
-    return notes
+        p_value_note += f" Without a share of the gap: not simulated on {report.validation_runs}."
+    return [f"{counts}.", p_value_note]
 
 
 def _format_split_size(split: DataSplit) -> str:
@@ -388,7 +389,8 @@ def _format_split_size(split: DataSplit) -> str:
 def _make_legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
     """Return handles and labels of the legend, for the styles that are drawn.
 
-    It explains the styles of bars: a candidate may be a cause, explained by it, or not needed.
+    It explains the styles of bars: a candidate may be a cause, one of several indistinguishable
+    causes, or not needed. The marks of other places are explained too.
 
     Args:
         report: Data of the report.

@@ -50,10 +50,9 @@ def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
         return joined([format_effect(name) for name in names], conjunction)
     parts = _group_effects(names, conjunction)
     if len(parts) > MAX_NAMED_MEMBERS:
-        parts = [
-            *parts[: MAX_NAMED_MEMBERS - 1],
-            f"one of {len(parts) - MAX_NAMED_MEMBERS + 1} others",
-        ]
+        # The last text counts the remaining parts.
+        first_parts, other_parts = parts[: MAX_NAMED_MEMBERS - 1], parts[MAX_NAMED_MEMBERS - 1 :]
+        parts = [*first_parts, f"one of {len(other_parts)} others"]
     is_nested = len(parts) > 1 and any(f" {conjunction} " in part for part in parts)
     return f", {conjunction} ".join(parts) if is_nested else joined(parts, conjunction)
 
@@ -70,15 +69,19 @@ def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
     """
     by_effect: dict[str, list[str]] = {}
     for name in names:
-        base, place = split_effect_name(name)
-        by_effect.setdefault(base if place else name, []).append(name)
+        base, _ = split_effect_name(name)
+        by_effect.setdefault(base, []).append(name)
     by_place: dict[str, list[str]] = {}
     for group in by_effect.values():
-        _, place = split_effect_name(group[0])
-        is_single_place = len(group) == 1 and place not in ("", ALL_PLACES)
-        # A family comes last, after the single places.
-        group.sort(key=lambda name: split_effect_name(name)[1] == ALL_PLACES)
-        key = f"{get_place_kind(group[0])} {place}" if is_single_place else group[0]
+        # An effect at all places (a family) comes last, after the single places.
+        group.sort(key=lambda name: name.endswith(f"@{ALL_PLACES}"))
+        first_name = group[0]
+        _, place = split_effect_name(first_name)
+        if len(group) == 1 and place not in ("", ALL_PLACES):
+            # It shares a text with other effects at this place.
+            key = f"{get_place_kind(first_name)} {place}"
+        else:
+            key = first_name
         by_place.setdefault(key, []).extend(group)
     return [_format_effect_group(group, conjunction) for group in by_place.values()]
 
@@ -95,26 +98,25 @@ def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     """
     if len(group) == 1:
         return format_effect(group[0])
-    bases = list(dict.fromkeys(split_effect_name(name)[0] for name in group))
-    places = list(dict.fromkeys(split_effect_name(name)[1] for name in group))
-    nouns = [format_effect(base) for base in bases]
-    is_parameter = all(is_parameter_error(base) for base in bases)
+    bases, places = zip(*map(split_effect_name, group), strict=True)
+    effect_bases = dict.fromkeys(bases)
+    nouns = [format_effect(base) for base in effect_bases]
+    # A wrong value is one "of" a place; a missing effect is "at" a place.
+    is_parameter = all(is_parameter_error(base) for base in effect_bases)
     kind = get_place_kind(group[0])
-    named_places = [place for place in places if place != ALL_PLACES]
+    named_places = [place for place in dict.fromkeys(places) if place != ALL_PLACES]
     text = joined(nouns, conjunction) + format_places(kind, named_places, conjunction, is_parameter)
-    return (
-        text
-        if named_places == places
-        else f"{text} {conjunction}{format_places(kind, [ALL_PLACES], conjunction, is_parameter)}"
-    )
+    if ALL_PLACES in places:
+        text += f" {conjunction}{format_places(kind, [ALL_PLACES], conjunction, is_parameter)}"
+    return text
 
 
 def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = True) -> str:
     """Format what a simulation lacks and has wrong; causes with alternatives come last.
 
-    For example ``lacks wind, and linear drag or Coulomb friction``. Some causes are missing
-    effects, others are wrong values of the model file; if the alternatives of a cause are of both
-    kinds, the text is ``either lacks ... or has ...``.
+    For example ``lacks wind, and linear drag or Coulomb friction``. A missing effect is what a
+    simulation "lacks", and a wrong value of the model file is what it "has". If a cause and its
+    alternatives are of both kinds, the text is ``either lacks ... or has ...``.
 
     Args:
         causes: Causes.
@@ -122,22 +124,27 @@ def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = Tru
     """
     if not with_alternatives:
         causes = [replace(cause, alternatives=()) for cause in causes]
-    texts: dict[str, list[str]] = {"lacks": [], "has": [], "either": []}
-    certain = [cause.effect for cause in causes if not cause.alternatives]
+    lacks, has, either = [], [], []
     # Causes without alternatives share one list; each other cause has its own "or" list.
-    for verb, is_wrong in (("lacks", False), ("has", True)):
-        if names := [name for name in certain if is_parameter_error(name) == is_wrong]:
-            texts[verb].append(joined([format_effect(name) for name in names]))
+    certain = [cause.effect for cause in causes if not cause.alternatives]
+    if missing_names := [name for name in certain if not is_parameter_error(name)]:
+        lacks.append(joined([format_effect(name) for name in missing_names]))
+    if wrong_names := [name for name in certain if is_parameter_error(name)]:
+        has.append(joined([format_effect(name) for name in wrong_names]))
     for cause in causes:
-        names = [cause.effect, *cause.alternatives] if cause.alternatives else []
-        wrong = format_effect_set([name for name in names if is_parameter_error(name)])
+        if not cause.alternatives:
+            continue
+        names = [cause.effect, *cause.alternatives]
         missing = format_effect_set([name for name in names if not is_parameter_error(name)])
+        wrong = format_effect_set([name for name in names if is_parameter_error(name)])
         if wrong and missing:
-            texts["either"].append(f"either lacks {missing} or has {wrong}")
-        elif names:
-            texts["has" if wrong else "lacks"].append(wrong or missing)
-    parts = [f"{verb} {', and '.join(texts[verb])}" for verb in ("lacks", "has") if texts[verb]]
-    return ", and ".join([*parts, *texts["either"]])
+            either.append(f"either lacks {missing} or has {wrong}")
+        elif wrong:
+            has.append(wrong)
+        else:
+            lacks.append(missing)
+    parts = [f"{verb} {', and '.join(t)}" for verb, t in (("lacks", lacks), ("has", has)) if t]
+    return ", and ".join([*parts, *either])
 
 
 def names_parameter_error(causes: Sequence[Cause]) -> bool:
@@ -159,20 +166,26 @@ def format_causes(causes: Sequence[Cause]) -> str:
 
 
 def format_number_error(cause: Cause) -> str:
-    """Format how wrong a value of the model file is, as a clause; empty for other causes.
+    """Format how wrong the model file is, as a clause; empty for causes that are no such error.
 
-    For example ``the mass of body forearm is 12 % larger than the model file states``. A clause
-    about the time step, or gravity compensation, is returned too.
+    There are three cases:
+
+    1. A robot that compensates for gravity: the description of the cause.
+    2. A numerical setting such as the time step: what is wrong, and the correction.
+    3. A value at a place, by its effect: for example ``the mass of body forearm is 12 % larger
+       than the model file states``.
     """
     base, place = split_effect_name(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:
         return sanitise(cause.says)
     if base in _STEP_ERROR_TEXTS:
         return f"{_STEP_ERROR_TEXTS[base]}: {sanitise(cause.says).rstrip('.')}"
-    values = list(cause.coefficients.values())
-    if base not in MODEL_FILE_ERRORS or not place or place == ALL_PLACES or not values:
+    coefficients = list(cause.coefficients.values())
+    if base not in MODEL_FILE_ERRORS or place in ("", ALL_PLACES) or not coefficients:
         return ""
-    first, norm = values[0], float(np.linalg.norm([n.value for n in values]))
+    first = coefficients[0]
+    # Length of a displacement, or angle of a rotation vector in rad.
+    norm = float(np.linalg.norm([coefficient.value for coefficient in coefficients]))
     return MODEL_FILE_ERRORS[base].format(
         place=format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(),
         percent=format_percent(abs(first.value)),
@@ -227,11 +240,11 @@ _STEP_ERROR_TEXTS = {
 
 
 def list_values(cause: Cause) -> list[tuple[str, str]]:
-    """List the coefficients of a cause by name, with their intervals and units.
+    """List the coefficients of a cause as pairs of its name and its value with interval and unit.
 
-    The list is empty for a chosen option of the integrator, which is a word and not an estimate.
+    The list is empty for an option of the simulator that is a word, such as an integrator. A
+    corrected time step was chosen and not estimated, so it has no interval.
     """
-    # The corrected step was chosen, not estimated, and some options are words.
     if cause.effect in ("numerics.integrator", "numerics.cone", "numerics.solver"):
         return []
     if cause.effect == "numerics.step":
@@ -252,7 +265,7 @@ def format_values(cause: Cause) -> str:
     texts = []
     for name, text in list_values(cause):
         coefficient, place = split_effect_name(name)
-        # If each member of a family has one coefficient, its place identifies it.
+        # The default name says nothing if the place identifies the coefficient.
         prefix = "" if place and coefficient == "coefficient" else f"{coefficient} "
         texts.append(f"{prefix}{text}" + (f" at {place}" if place else ""))
     return joined(texts)

@@ -102,15 +102,18 @@ def name_missing_physics(
         is_increasing: Whether the parameter increases with the covariate.
         known_effects: Effects in the model already, which cannot be missing.
     """
-    base_name = number.partition("@")[0]
-    family = next((law for law, prefix in LAW_PREFIXES.items() if base_name.startswith(prefix)), "")
-    explanation = MISSING_PHYSICS_NAMES.get((family, kind), "")
-    text = explanation if isinstance(explanation, str) else explanation[0 if is_increasing else 1]
-    # The text ends with the name of the effect in parentheses.
-    effect = text.partition("(")[2].rstrip(")")
-    if not text or any(known_effect.partition("@")[0] == effect for known_effect in known_effects):
-        return f"{LAW_NAMES.get(family, 'something')} that depends on {name}"
-    return text
+    base_name, _, _ = number.partition("@")
+    law = next((law for law, prefix in LAW_PREFIXES.items() if base_name.startswith(prefix)), "")
+    explanation = MISSING_PHYSICS_NAMES.get((law, kind), "")
+    if isinstance(explanation, tuple):
+        if_increasing, if_decreasing = explanation
+        explanation = if_increasing if is_increasing else if_decreasing
+    # An explanation by an effect of the library ends with its name in parentheses.
+    effect = explanation.partition("(")[2].rstrip(")")
+    known_names = {known_effect.partition("@")[0] for known_effect in known_effects}
+    if not explanation or effect in known_names:
+        return f"{LAW_NAMES.get(law, 'something')} that depends on {name}"
+    return explanation
 
 
 MAX_TABLE_ROWS = 12
@@ -124,17 +127,22 @@ AGREEMENT_COLUMNS = ("model", "number", "unit", "by", "group", "value", "low", "
 def format_consistency(report: DiagnosisReportData) -> list[str]:
     """Format sentences on whether groups of runs (runs, logs or loads) agree on each parameter.
 
-    They report which parameters are consistent with the causes only, whether another effect would
-    be less consistent than the cause, which parameters differ between groups, and which drift from
-    log to log.
+    They report:
+
+    - which parameters are consistent only once the causes are in the model (`reconciled`);
+    - whether another effect would be less consistent than the cause (`competitor`);
+    - which parameters differ between groups (`inconsistent`);
+    - which parameters drift from log to log (`drifting`).
 
     Args:
-        report: Report data, with the estimates of each parameter by group (a spread).
+        report: Report data. Its consistency has, before and after the causes are added, a
+            `ParameterConsistency` for each parameter and grouping (a spread).
     """
     before = {(spread.number, spread.by): spread for spread in report.consistency.before}
     after = report.consistency.after
     effects = [cause.effect for cause in report.verdict.causes]
-    competitors = [s for s in report.consistency.alternative_effect if not s.is_consistent]
+    alternatives = report.consistency.alternative_effect
+    competitors = _select_clearest([spread for spread in alternatives if not spread.is_consistent])
     logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
     lines = render_text(
         _TEMPLATE,
@@ -145,7 +153,7 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
             and (spread_before := before.get((spread.number, spread.by))) is not None
             and not spread_before.is_consistent
         ],
-        competitor=next(iter(_select_clearest(competitors)), None),
+        competitor=competitors[0] if competitors else None,
         inconsistent=_select_clearest([spread for spread in after if not spread.is_consistent]),
         after=after,
         logs=logs,
@@ -198,8 +206,9 @@ def build_agreement_rows(
 ) -> list[tuple[ParameterConsistency, IntervalDrawing | None]]:
     """Build the rows of the table of the page, the least consistent number first.
 
-    Each row has a parameter, and the estimates of all groups drawn on one line over the interval of
-    the joint fit.
+    Each row has a parameter, and a drawing: the 95 % intervals of all groups on one line, over that
+    of the joint fit. It is None if an
+    interval is infinite.
 
     Args:
         report: Data of the report, with the consistency of the extended model.
@@ -225,7 +234,7 @@ def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ..
         report: Data of the report, with the consistency of the base and the extended model.
     """
     models = [("base", report.consistency.before)]
-    if report.verdict.causes:
+    if report.has_extended_model:
         models.append(("extended", report.consistency.after))
     rows: list[tuple[object, ...]] = []
     for model, spreads in models:
@@ -234,9 +243,6 @@ def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ..
             estimates += [(part.group, part.value, part.error) for part in spread.group_estimates]
             estimates.append(("another", spread.value, spread.prediction_sigma))
             for group, value, error in estimates:
-                half_width = Z95 * error
-                estimate_with_interval = (value, value - half_width, value + half_width)
-                rows.append(
-                    (model, spread.number, spread.unit, spread.by, group, *estimate_with_interval)
-                )
+                low, high = value - Z95 * error, value + Z95 * error
+                rows.append((model, spread.number, spread.unit, spread.by, group, value, low, high))
     return rows

@@ -23,10 +23,10 @@ MAX_NAMED_CHANNELS = 6
 
 
 def list_detectable_gaps(report: DiagnosisReportData) -> list[tuple[ChannelInfo, float]]:
-    """List how large a gap the noise could hide in each channel.
+    """List the channels with the largest gap, in their units, that the noise could hide in each.
 
-    The gap of a channel with too few samples is unknown. With many channels, only the worst one of
-    each kind is listed.
+    A channel with too few samples is left out. With many channels, only the worst one of each kind
+    is listed.
     """
     sizes = zip(report.channels, compute_detectable_gap(report).tolist(), strict=True)
     return _select_worst_of_each_kind(
@@ -40,6 +40,7 @@ def _select_worst_of_each_kind(
     """Select, from many channels, the one of each kind that hides most, in units of its noise.
 
     The kind of a channel is the part of its name before the point, such as ``q`` for positions.
+    Up to `MAX_NAMED_CHANNELS` channels are all kept.
 
     Args:
         sizes: Channels with the smallest gap that would be detected in them, in their units.
@@ -70,22 +71,25 @@ def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     k samples. An estimated noise has itself a relative error of 1.2 / sqrt(n); d is the error of
     its square, twice as much.
 
+    The result is NaN for a channel with fewer than two samples.
+
     Args:
         report: Data of the report.
     """
     sizes = []
-    for c, channel in enumerate(report.channels):
-        residual_rows = []
+    for channel_index, channel in enumerate(report.channels):
+        residual_runs: list[Array] = []  # (T,) each, NaN where a sample is missing.
         for split in report.data_splits:
-            residual_rows += [*((split.observed - split.before)[:, :, c] / channel.sigma)]
-        residuals = np.concatenate([row[np.isfinite(row)] for row in residual_rows])
+            split_residual = (split.observed - split.before)[:, :, channel_index]
+            residual_runs += [*(split_residual / channel.sigma)]
+        residuals = np.concatenate([run[np.isfinite(run)] for run in residual_runs])
         # A single sample has no neighbour, and its square is not a variance.
         if residuals.size < 2:
             sizes.append(np.nan)
             continue
         square = float(np.mean(residuals**2))
         # Products use neighbours within a run; a product with a missing sample is NaN.
-        products = np.concatenate([row[1:] * row[:-1] for row in residual_rows])
+        products = np.concatenate([run[1:] * run[:-1] for run in residual_runs])
         phi = 0.0
         if np.isfinite(products).any() and square:
             phi = float(np.clip(np.nanmean(products) / square, 0.0, MAX_PHI))  # (1)

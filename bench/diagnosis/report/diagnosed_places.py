@@ -32,37 +32,40 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
     for cause in report.verdict.causes:
         is_certain = not cause.alternatives
         for name in (cause.effect, *cause.alternatives):
-            noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
+            base, _ = split_effect_name(name)
+            noun, kind = format_effect_name(base), get_place_kind(name)
             for place in _list_places(report, name, cause):
                 # The coefficients are those of the cause, not of its alternatives.
                 size = _format_coefficient(cause, name, place) if name == cause.effect else ""
-                # A family and one of its places give the same mark, which is kept once.
-                marks.setdefault(
-                    (kind, place, noun), PlaceMark(kind, place, f"{noun}{size}", is_certain)
-                )
+                mark = PlaceMark(kind, place, f"{noun}{size}", is_certain)
+                # An effect at all places and one of its places give the same mark.
+                marks.setdefault((kind, place, noun), mark)
     return list(marks.values())
 
 
 def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
     """List the places at which an effect acts, for marks on the drawing of the robot.
 
-    An effect at all places (``@*``) has those of its coefficients; if these name none, it has all
-    joints, actuators or bodies of the robot.
+    1. An effect at one place has this place, and an effect on the environment has none.
+    2. An effect at all places (``@*``) has those that its coefficients name.
+    3. If they name none, it has all joints, actuators or bodies of the robot.
 
     Args:
         report: content of the report, with the robot.
-        effect: name of the effect, with its place.
-        cause: the cause, whose coefficients may be named by places.
+        effect: name of the effect, with its place: the cause, or one of its alternatives.
+        cause: the cause, whose coefficients may be named ``COEFFICIENT@PLACE``.
     """
+    # 1. One place.
     _, place = split_effect_name(effect)
     if place != ALL_PLACES:
         return [place] if place else []
-    coefficient_places = [
-        split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect
-    ]
+    # 2. Places of coefficients, which an alternative does not have.
+    coefficient_names = cause.coefficients if effect == cause.effect else ()
+    places = [place for _, place in map(split_effect_name, coefficient_names) if place]
     robot = report.robot
-    if any(coefficient_places) or robot is None:
-        return list(dict.fromkeys(name for name in coefficient_places if name))
+    if places or robot is None:
+        return list(dict.fromkeys(places))
+    # 3. All places.
     tables = {
         "joint": [joint.name for joint in robot.joints],
         "actuator": [actuator.name for actuator in robot.actuators],
@@ -72,27 +75,37 @@ def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list
 
 
 def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
-    """Format the coefficient of a cause at a place for a label; empty for several coefficients.
+    """Format the coefficient of a cause at a place for a label, such as ``: +12 %``.
+
+    The text is empty if the cause has several coefficients there. A relative change of a value of
+    the model file is given in percent, others with their unit.
 
     Args:
         cause: the cause with its coefficients.
         effect: name of the effect, with its place.
         place: place of the label, such as a joint.
     """
-    at_place = [
-        n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
-    ]
+    at_place = []
+    for name, fitted_value in cause.coefficients.items():
+        _, coefficient_place = split_effect_name(name)
+        if coefficient_place in ("", place):
+            at_place.append(fitted_value)
     if len(at_place) != 1:
         return ""
-    fitted = at_place[0]
-    if split_effect_name(effect)[0] in MODEL_FILE_ERRORS and fitted.unit == "1":
+    (fitted,) = at_place
+    base, _ = split_effect_name(effect)
+    if base in MODEL_FILE_ERRORS and fitted.unit == "1":
         sign = "+" if fitted.value > 0 else ""
         return f": {sign}{format_percent(fitted.value)}"
     return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
 
 
 def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
-    """Return the joint that a place belongs to; empty without a joint or a robot.
+    """Return the joint that a place belongs to; empty if there is none.
+
+    A joint belongs to itself, a channel to the joint it measures, an actuator to the joint it
+    drives, and a body to the joint that moves it. A channel of a sensor counts as a joint, because
+    it has its own row in the figures.
 
     Args:
         report: Report data.
@@ -103,9 +116,8 @@ def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
     if kind == "joint":
         return "" if place == ALL_PLACES else sanitise(place, 40)
     if kind == "channel":
-        quantity, _, name = place.partition(".")
-        # A sensor has its own row.
-        return sanitise(name if quantity in QUANTITY_LABELS and name else place, 40)
+        quantity, _, joint = place.partition(".")
+        return sanitise(joint if quantity in QUANTITY_LABELS and joint else place, 40)
     if robot is None:
         return ""
     if kind == "actuator":

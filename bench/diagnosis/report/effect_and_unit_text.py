@@ -58,7 +58,11 @@ def format_effect(effect: str) -> str:
 
 
 def _format_effect_as_noun(name: str) -> str:
-    """Format one effect as a noun with its place, or by its name and description without a noun.
+    """Format one effect as a noun with its place, such as ``Coulomb friction at joint elbow``.
+
+    - A numerical setting has its own noun.
+    - An effect that is not registered has its name.
+    - An effect without a noun has its name, and the first clause of its description in brackets.
 
     Args:
         name: Name of an effect, such as ``friction.coulomb@elbow``.
@@ -71,15 +75,14 @@ def _format_effect_as_noun(name: str) -> str:
     except InputError:
         # A verdict may name an effect of a plugin that is not loaded.
         return sanitise(name, 60)
-    if effect.noun:
-        noun = sanitise((effect.noun_at_place if place else "") or effect.noun, 60)
-        return noun + (
-            format_places(get_place_kind(name), [place], is_parameter=is_parameter_error(name))
-            if place
-            else ""
-        )
-    clause = re.split(r"[,:;]", effect.says, maxsplit=1)[0]
-    return sanitise(f"{name} ({clause})", 60)
+    if not effect.noun:
+        clause, *_ = re.split(r"[,:;]", effect.says, maxsplit=1)
+        return sanitise(f"{name} ({clause})", 60)
+    if not place:
+        return sanitise(effect.noun, 60)
+    noun = sanitise(effect.noun_at_place or effect.noun, 60)
+    is_parameter = is_parameter_error(name)
+    return noun + format_places(get_place_kind(name), [place], is_parameter=is_parameter)
 
 
 def split_effect_name(effect: str) -> tuple[str, str]:
@@ -122,8 +125,8 @@ def format_places(
     """Format places: `` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``.
 
     Args:
-        kind: Kind of the places.
-        places: Names of the places.
+        kind: Kind of the places, such as ``joint``; empty if unknown.
+        places: Names of the places; only `ALL_PLACES` for every one.
         conjunction: Conjunction before the last name.
         is_parameter: Whether the effect is a wrong value of the place: `` of joint elbow``.
     """
@@ -133,6 +136,7 @@ def format_places(
     if names == [ALL_PLACES]:
         return f" {preposition} every {kind}" if kind else " everywhere"
     if len(names) < 3:
+        # An unknown kind leaves two spaces.
         return f" {preposition} {kind} {joined(names, conjunction)}".replace("  ", " ")
     quantifier = "any" if conjunction == "or" else "each"
     return f" {preposition} {quantifier} of the {plural} {joined(names, conjunction)}"
@@ -153,10 +157,10 @@ def format_sentence(text: object) -> str:
     if not sanitised_text:
         return sanitised_text
     # A name with digits or underscores stays unchanged.
-    is_word = sanitised_text.split()[0].rstrip(",:;.").isalpha()
-    first = sanitised_text[0].upper() if is_word else sanitised_text[0]
-    stop = "" if sanitised_text[-1] in ".!?…" else "."
-    return first + sanitised_text[1:] + stop
+    first_word, *_ = sanitised_text.split()
+    if first_word.rstrip(",:;.").isalpha():
+        sanitised_text = sanitised_text[0].upper() + sanitised_text[1:]
+    return sanitised_text if sanitised_text[-1] in ".!?…" else f"{sanitised_text}."
 
 
 def format_label(name: str, unit: str, max_length: int = 30) -> str:
@@ -167,11 +171,8 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
         unit: Unit.
         max_length: Maximum number of characters of the text.
     """
-    return (
-        f"{sanitise(name, max_length)} [{format_unit(unit)}]"
-        if format_unit(unit)
-        else sanitise(name, max_length)
-    )
+    label, unit_text = sanitise(name, max_length), format_unit(unit)
+    return f"{label} [{unit_text}]" if unit_text else label
 
 
 def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:

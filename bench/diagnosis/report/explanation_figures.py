@@ -97,8 +97,8 @@ def render_figures(report: DiagnosisReportData) -> dict[str, FigureFiles]:
     Returns:
         PNG, and PDF and SVG if requested, of each figure by name.
     """
+    # The settings must stay active, because text is laid out again when a figure is written.
     with apply_settings(_STYLE):
-        # The settings must stay active, because text is laid out again when a figure is written.
         figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
         rendered = {}
         for name, figure in figures.items():
@@ -116,25 +116,28 @@ def render_figures(report: DiagnosisReportData) -> dict[str, FigureFiles]:
 def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, float]:
     """Return recorded joint positions at the sample of a run that is farthest from its start.
 
-    In this pose the drawing of the robot shows more than at rest. Only joints with recorded
-    positions are returned; the result is empty without positions.
+    In this pose the drawing of the robot shows more than at rest. The distance is the sum of the
+    squared changes of all joint positions. Only joints with recorded positions are returned; the
+    result is empty without positions.
 
     Args:
         report: Report data.
         view: Run to use.
     """
-    joints, columns = [], []
-    for c, channel in enumerate(report.channels):
-        kind, _, joint = channel.name.partition(".")
-        values = view.get_samples("observed", c)
-        if kind == "q" and np.isfinite(values).any():
-            joints.append(joint)
-            columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
-    if not joints:
+    positions = {}
+    for channel_index, channel in enumerate(report.channels):
+        quantity, _, joint = channel.name.partition(".")
+        values = view.get_samples("observed", channel_index)
+        recorded_values = values[np.isfinite(values)]
+        if quantity == "q" and recorded_values.size:
+            # A missing sample counts as no motion.
+            positions[joint] = np.nan_to_num(values, nan=float(recorded_values[0]))
+    if not positions:
         return {}
-    motion = np.stack(columns)
+    motion = np.stack(list(positions.values()))  # (joints, T)
     distances = np.square(motion - motion[:, :1]).sum(axis=0)
-    return dict(zip(joints, motion[:, int(np.argmax(distances))].tolist(), strict=True))
+    extreme_pose = motion[:, int(np.argmax(distances))]
+    return dict(zip(positions, extreme_pose.tolist(), strict=True))
 
 
 def _draw_robot(report: DiagnosisReportData) -> Figure:

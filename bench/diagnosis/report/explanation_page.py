@@ -66,38 +66,39 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 def build_candidate_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per candidate, the highest score first.
 
-    `set` numbers the candidates that the data cannot distinguish; `shown` says which rows are
-    visible at first: of an effect that acts at several places, only the best one.
+    `set` names the candidates that the data cannot distinguish from it. `shown` says which rows are
+    visible at first: of an effect that acts at several places, only the best one. Columns that
+    would be empty are left out.
 
     Args:
         report: Data of the report.
     """
     sets = _map_indistinguishable_sets(report)
-    heads = {entry.best.effect for entry in rank_candidates(report)}
-    has_causes = bool(report.verdict.causes)
+    representatives = {entry.best.effect for entry in rank_candidates(report)}
     rows = []
     for candidate in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
-        _, place = split_effect_name(candidate.effect)
+        effect = candidate.effect
+        base, place = split_effect_name(effect)
+        place_kind = get_place_kind(effect)
+        # Without a diagnosed cause, the status would be "not needed", which would be wrong.
+        status = "not convincing"
+        if report.has_extended_model:
+            status = get_candidate_status(report, effect)
         rows.append(
             {
                 # A place has its own column.
-                "candidate": sanitise(
-                    format_effect_name(split_effect_name(candidate.effect)[0]), 120
-                ),
-                "effect": sanitise(candidate.effect, 120),
+                "candidate": sanitise(format_effect_name(base), 120),
+                "effect": sanitise(effect, 120),
                 "score": candidate.score,
                 "p_value": candidate.p_value,
                 "heldout_gain": candidate.heldout_gain,
-                # Without a diagnosed cause, "not needed" would be wrong.
-                "standing": get_candidate_status(report, candidate.effect)
-                if has_causes
-                else "not convincing",
-                "set": sets.get(candidate.effect, ""),
-                "kind": get_place_kind(candidate.effect),
+                "standing": status,
+                "set": sets.get(effect, ""),
+                "kind": place_kind,
                 "place": "all" if place == ALL_PLACES else sanitise(place, 80),
-                "joint": find_joint(report, get_place_kind(candidate.effect), place),
-                "shown": BEST if candidate.effect in heads else ELSEWHERE,
-                "says": _get_effect_description(report, candidate.effect),
+                "joint": find_joint(report, place_kind, place),
+                "shown": BEST if effect in representatives else ELSEWHERE,
+                "says": _get_effect_description(report, effect),
             }
         )
     return Table.from_rows(rows).without(_list_empty_columns(report))
@@ -120,7 +121,10 @@ def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
 
 
 def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
-    """Return the description of an effect; for a cause, the one in the verdict.
+    """Return the description of an effect as a sentence; for a cause, the one in the verdict.
+
+    It is empty for an effect that is not registered: one of a plugin that is not loaded, or a
+    numerical setting such as the time step.
 
     Args:
         report: content of the report.
@@ -132,10 +136,9 @@ def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
     base, place = split_effect_name(name)
     try:
         effect = effects.get_effect(base)
-        return format_sentence((effect.says_at_place if place else "") or effect.says)
     except InputError:
-        # The effect belongs to a plugin that is not loaded, or is a time step or integrator.
         return ""
+    return format_sentence((effect.says_at_place if place else "") or effect.says)
 
 
 def build_gap_location_table(report: DiagnosisReportData) -> Table:
@@ -176,9 +179,9 @@ def build_residual_profile_table(report: DiagnosisReportData) -> Table:
             "channel": sanitise(profile.channel, 80),
             "variable": sanitise(profile.variable, 80),
         }
-        means_by_model = {"before": profile.before} | (
-            {"after": profile.after} if report.has_extended_model else {}
-        )
+        means_by_model = {"before": profile.before}
+        if report.has_extended_model:
+            means_by_model["after"] = profile.after
         for model, means in means_by_model.items():
             for centre, mean, error in zip(profile.centres, means, profile.error, strict=True):
                 values = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
@@ -198,7 +201,8 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
     """Make the panels of the residual profiles, the most informative ones first.
 
     A profile is the mean residual of a channel as a function of another variable, such as a
-    velocity.
+    velocity. The panels read their curves from the table of `build_residual_profile_table`, by
+    channel, variable and model.
     """
     units = {channel.name: channel.unit for channel in report.channels}
     styles = {
@@ -206,6 +210,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         "before": BASE_MODEL_STYLE._replace(marker="s"),
     }
     models = ("after", "before") if report.has_extended_model else ("before",)
+    # Profiles contain arrays, which cannot be compared, so they are recognised by their identity.
     shown_ids = {id(profile) for profile in select_informative_profiles(report.profiles)}
     panels = []
     for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown_ids):
@@ -282,7 +287,9 @@ def render_report(
         headline=summary_text.format_headline(report),
         next_run=summary_text.format_next_run(report),
         consistency=format_consistency(report),
-        marks=[(find_joint(report, m.kind, m.name), m) for m in list_place_marks(report)],
+        marks=[
+            (find_joint(report, mark.kind, mark.name), mark) for mark in list_place_marks(report)
+        ],
         joint_positions=figures["robot"].joint_positions if "robot" in figures else (),
         motion=motion,
         identifiability=build_identifiability_section(report),
@@ -318,9 +325,10 @@ def compute_channel_errors(split: DataSplit) -> Array:
     Args:
         split: Recorded runs with the simulation before and after the causes are added.
     """
-    errors = np.full((split.observed.shape[2], 2), np.nan)
+    channel_count = split.observed.shape[2]
+    errors = np.full((channel_count, 2), np.nan)
     for column, simulated in enumerate((split.before, split.after)):
-        for channel_index in range(len(errors)):
+        for channel_index in range(channel_count):
             residual = (split.observed - simulated)[:, :, channel_index]
             # The mean of an empty set would cause a warning.
             if np.isfinite(residual).any():

@@ -42,7 +42,7 @@ class CauseRow(NamedTuple):
 
     Attributes:
         number: Identifiability of the coefficient.
-        effect: Registered name of the effect.
+        effect: Name of the effect, with its place if it has one.
         status: One of the keys of `_LEGEND`.
     """
 
@@ -51,15 +51,25 @@ class CauseRow(NamedTuple):
     status: str
 
     @property
+    def effect_name(self) -> str:
+        """Name of the effect without its place."""
+        return split_effect_name(self.effect)[0]
+
+    @property
     def place(self) -> str:
         """Place of the effect; empty for none, and for an effect at every place."""
-        place = split_effect_name(self.effect)[1]
+        _, place = split_effect_name(self.effect)
         return "" if place == ALL_PLACES else place
 
     @property
     def legend(self) -> str:
         """Sign and meaning of the status."""
         return _LEGEND[self.status]
+
+    @property
+    def meaning(self) -> str:
+        """Meaning of the status, without its sign."""
+        return self.legend.partition(" ")[2]
 
     @property
     def rank(self) -> int:
@@ -71,28 +81,31 @@ def build_identifiability_section(report: DiagnosisReportData) -> dict[str, Any]
     """Build the content of the section; None if identifiability was not computed.
 
     Returns:
-        ``free``: free parameters with their levels. ``causes``: all causes with the meaning of
-        their statuses, the most certain first. ``legend``: signs of all causes. ``counts``: number
-        of causes by level, diagnosed ones being identifiable. ``found``: diagnosed causes.
-        ``matrices`` and ``clear_matrices``: effects that are not, and that are, identifiable at
-        every place. ``families``: names of the effects without a place, by family and status, with
-        ``family_headings``.
+        Content by the name that the template uses:
+
+        - ``free``: fitted parameters with their levels, such as "identifiable".
+        - ``causes``: possible causes with the meaning of their statuses, the most certain first.
+        - ``legend``: signs of all causes.
+        - ``counts``: number of causes by level, diagnosed ones being identifiable.
+        - ``found``: diagnosed causes.
+        - ``matrices``, ``clear_matrices``: effects at places that are not, and that are,
+          identifiable at every place.
+        - ``families``, ``family_headings``: names of the effects without a place, by family and
+          status.
     """
     if not report.identifiability:
         return None
     found = _list_supported_causes(report)
     causes = _list_cause_rows(report, found)
     placed = [row for row in causes if row.place]
-    effects = {split_effect_name(row.effect)[0] for row in placed}
-    unclear_effects = {
-        split_effect_name(row.effect)[0] for row in placed if row.status != "identifiable"
-    }
+    effects = {row.effect_name for row in placed}
+    unclear_effects = {row.effect_name for row in placed if row.status != "identifiable"}
     ordered = sorted(causes, key=lambda row: row.rank)
     without_place = [row for row in ordered if not row.place]
     statuses = list(dict.fromkeys(row.status for row in without_place))
     return {
         "free": [(number, number.word) for number in report.identifiability if number.free],
-        "causes": [(row.number, row.legend[2:]) for row in ordered],
+        "causes": [(row.number, row.meaning) for row in ordered],
         "legend": list(dict.fromkeys(row.legend for row in ordered)),
         "counts": Counter(
             "identifiable" if row.status == "found" else row.number.word for row in causes
@@ -112,9 +125,11 @@ def _list_supported_causes(report: DiagnosisReportData) -> list[Cause]:
 
 
 def _list_cause_rows(report: DiagnosisReportData, found: Sequence[Cause]) -> list[CauseRow]:
-    """List the causes in the order of the registry, each with its status.
+    """List the possible causes in the order of the registry, each with its status.
 
-    Diagnosed causes and members of indistinguishable sets are marked at every place where they act.
+    The status of a diagnosed cause is ``found``; that of a cause with alternatives, and of the
+    alternatives, is ``set``. They are marked at every place where they act. The status of other
+    causes is their identifiability.
 
     Args:
         report: data of the report.
@@ -122,17 +137,20 @@ def _list_cause_rows(report: DiagnosisReportData, found: Sequence[Cause]) -> lis
     """
     status_by_effect: dict[str, str] = {}
     for cause in found:
+        status = "set" if cause.alternatives else "found"
         for name in (cause.effect, *cause.alternatives):
-            status = "set" if cause.alternatives else "found"
             status_by_effect.setdefault(name, status)
-            # A cause at several joints has a coefficient for each, such as coefficient@elbow.
-            for key in cause.coefficients if name == cause.effect else ():
-                if place := split_effect_name(key)[1]:
-                    status_by_effect.setdefault(f"{split_effect_name(name)[0]}@{place}", status)
+        # A cause at several joints has a coefficient for each, such as coefficient@elbow.
+        base, _ = split_effect_name(cause.effect)
+        for coefficient in cause.coefficients:
+            _, place = split_effect_name(coefficient)
+            if place:
+                status_by_effect.setdefault(f"{base}@{place}", status)
     rows = []
     for number in report.identifiability:
         if not number.free:
-            effect = number.name.partition(" ")[0]
+            # The name of a coefficient follows that of its effect.
+            effect, _, _ = number.name.partition(" ")
             rows.append(CauseRow(number, effect, status_by_effect.get(effect, number.word)))
     return rows
 
@@ -152,28 +170,43 @@ def _build_matrices(placed: Sequence[CauseRow], effects: set[str]) -> list[dict[
     """
     matrices: dict[str, dict[str, Any]] = {}
     for row in placed:
-        effect, kind = split_effect_name(row.effect)[0], get_place_kind(row.effect)
-        if effect in effects:
+        kind = get_place_kind(row.effect)
+        if row.effect_name in effects:
             matrix = matrices.setdefault(kind, {"kind": kind, "places": {}, "effects": {}})
+            # The keys are an ordered set.
             matrix["places"][row.place] = True
-            by_place = matrix["effects"].setdefault(effect, {})
+            by_place = matrix["effects"].setdefault(row.effect_name, {})
             by_place[row.place] = min(by_place.get(row.place, row), row, key=lambda row: row.rank)
+
+    def list_ranks(effect_rows: tuple[str, dict[str, CauseRow]]) -> list[int]:
+        _, by_place = effect_rows
+        return sorted(row.rank for row in by_place.values())
+
     for matrix in matrices.values():
-        matrix["effects"] = sorted(
-            matrix["effects"].items(), key=lambda item: sorted(row.rank for row in item[1].values())
-        )
+        matrix["effects"] = sorted(matrix["effects"].items(), key=list_ranks)
     return list(matrices.values())
 
 
 def _build_family_table(
     rows: Sequence[CauseRow], statuses: Sequence[str]
 ) -> dict[str, dict[str, str]]:
-    """Join the names of effects by family and status; the family is the name before its dot."""
+    """Join the names of effects in a table with a row for each family, a column for each status.
+
+    The family of ``friction.coulomb`` is ``friction``. A cell names at most `MAX_NAMED_CAUSES`.
+
+    Args:
+        rows: causes without a place.
+        statuses: their statuses, in the order of the columns.
+    """
     names: dict[str, dict[str, list[str]]] = {}
     for row in rows:
-        by_status = names.setdefault(row.effect.partition(".")[0], {s: [] for s in statuses})
+        family, _, _ = row.effect.partition(".")
+        by_status = names.setdefault(family, {status: [] for status in statuses})
         by_status[row.status].append(format_effect_name(row.effect))
     return {
-        family: {s: join_first_names(effects, MAX_NAMED_CAUSES) for s, effects in parts.items()}
-        for family, parts in names.items()
+        family: {
+            status: join_first_names(effects, MAX_NAMED_CAUSES)
+            for status, effects in by_status.items()
+        }
+        for family, by_status in names.items()
     }

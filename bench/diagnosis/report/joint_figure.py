@@ -29,6 +29,7 @@ from bench.figures.style import (
     EXTENDED_MODEL_LINE,
     NEUTRAL_MARK,
     NOISE_BAND_GREY,
+    POINTS,
     ZERO_LINE_GREY,
     break_name,
     make_panel_grid,
@@ -107,14 +108,13 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
         if quantity in QUANTITY_LABELS and name:
             joints.setdefault(name, {})[quantity] = channel_index
         else:
-            sensors.append(
-                JointRow(channel.name, channel_index, {_get_first_quantity(report): channel_index})
-            )
+            # The residual of a sensor is in the first column.
+            channels = {_get_first_quantity(report): channel_index}
+            sensors.append(JointRow(channel.name, channel_index, channels))
     rows = []
     for name, channels in joints.items():
-        # The position is shown if it was recorded, otherwise the velocity or the torque.
-        shown_channel = next(channels[q] for q in QUANTITY_LABELS if q in channels)
-        rows.append(JointRow(name, shown_channel, channels))
+        motion_channel = next(channels[q] for q in QUANTITY_LABELS if q in channels)
+        rows.append(JointRow(name, motion_channel, channels))
     return rows + sensors
 
 
@@ -132,10 +132,10 @@ def _list_quantities(report: DiagnosisReportData) -> list[str]:
 def draw_run_figure(report: DiagnosisReportData) -> Figure:
     """Draw the run with the largest residual: motion and residuals of each joint in a row.
 
-    A system that is not a robot has a row for each channel.
-
-    Joints with the largest residuals are selected if there are many. Residuals of one quantity,
-    such as position, have a common scale. Names of joints that the diagnosis names are highlighted.
+    A system that is not a robot has a row for each channel. Of many rows, those with the largest
+    residuals are selected. The first column of panels shows the motion, and each further one the
+    residuals of one quantity, such as position, in a common scale. Names of joints that the
+    diagnosis names are highlighted.
 
     Args:
         report: Report data.
@@ -143,21 +143,21 @@ def draw_run_figure(report: DiagnosisReportData) -> Figure:
     view = select_worst_run(report)
     rows = _select_worst_rows(report, view)
     quantities = [name for name in QUANTITY_LABELS if any(name in row.channels for row in rows)]
-    height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
+    row_height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
     # Widths in inches: names, panels of motion and legend, and each panel of residuals.
     names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_GAP_INCHES)
     width = names_width + 5.15 + 2.6 * len(quantities)
-    size = (width, _TOP_MARGIN_INCHES + _BOTTOM_MARGIN_INCHES + height * len(rows))
+    height = _TOP_MARGIN_INCHES + _BOTTOM_MARGIN_INCHES + row_height * len(rows)
     # A panel of motion is 1.4 times as wide as one of residuals.
     ratios = (4.2, *[3.0] * len(quantities))
     figure, axes = make_panel_grid(
-        len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
+        len(rows), len(ratios), (width, height), layout=None, sharex=True, width_ratios=ratios
     )
-    for row, panels in zip(rows, axes, strict=True):
-        _draw_motion(panels[0], report, view, row, row.name in named_joints)
-        for panel, quantity in zip(panels[1:], quantities, strict=True):
+    for row, (motion_panel, *residual_panels) in zip(rows, axes, strict=True):
+        _draw_motion(motion_panel, report, view, row, row.name in named_joints)
+        for panel, quantity in zip(residual_panels, quantities, strict=True):
             if quantity in row.channels:
                 _draw_residual(panel, report, view, row.channels[quantity])
             else:
@@ -185,21 +185,24 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
     rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
-        return max(_compute_residual_rms(view, c, "before") for c in row.channels.values())
+        return max(
+            _compute_residual_rms(view, channel_index, "before")
+            for channel_index in row.channels.values()
+        )
 
     worst_rows = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
     return [row for row in rows if row in worst_rows]
 
 
-def _compute_residual_rms(view: RunView, c: int, model: str) -> float:
+def _compute_residual_rms(view: RunView, channel_index: int, model: str) -> float:
     """Return the RMS residual of a channel in this run in noise units; 0 without samples.
 
     Args:
         view: run to show.
-        c: index of the channel.
+        channel_index: index of the channel.
         model: ``before`` for the base model, ``after`` for the extended one.
     """
-    residual = view.compute_residual(model, c)
+    residual = view.compute_residual(model, channel_index)
     finite = residual[np.isfinite(residual)]
     return compute_rms(finite) if finite.size else 0.0
 
@@ -219,11 +222,11 @@ def _draw_motion(
         is_named: whether the diagnosis names the joint; its name is then highlighted.
     """
     channel = report.channels[row.motion_channel]
-    signals = [
-        view.get_samples(name, row.motion_channel) for name in ("observed", "before", "after")
-    ]
-    shown_samples = thin_signal(signals[0], MAX_SAMPLES)
-    measured, before, after = (signal[shown_samples] for signal in signals)
+    shown_samples = thin_signal(view.get_samples("observed", row.motion_channel), MAX_SAMPLES)
+    measured, before, after = (
+        view.get_samples(name, row.motion_channel)[shown_samples]
+        for name in ("observed", "before", "after")
+    )
     shown_times = view.times[shown_samples]
     size = 4.0 if shown_samples.size < 250 else 3.4  # points: smaller dots for many samples
     panel.plot(
@@ -248,7 +251,7 @@ def _draw_motion(
     panel.annotate(
         _format_row_name(row, is_named),
         (0, 0.5),
-        (-0.72 * 72, 0),
+        (-0.72 * POINTS, 0),  # 0.72 inches to the left of the panel
         xycoords="axes fraction",
         textcoords="offset points",
         ha="right",
@@ -277,9 +280,10 @@ def _format_row_name(row: JointRow, is_named: bool) -> str:
 def _draw_residual(
     panel: Axes, report: DiagnosisReportData, view: RunView, channel_index: int
 ) -> None:
-    """Draw the residuals of a channel in units of its noise, with the RMS above.
+    """Draw the residuals of a channel in units of its noise, with the RMS of each model above.
 
-    A band marks two standard deviations of the noise.
+    The models are the base model and, if there are causes, the extended one. A band marks two
+    standard deviations of the noise.
 
     Args:
         panel: axes to draw on.
@@ -294,12 +298,12 @@ def _draw_residual(
     models = ("before", "after") if report.has_extended_model else ("before",)
     for model in models:
         residual = view.compute_residual(model, channel_index)
-        rows = thin_signal(residual, MAX_SAMPLES)
+        shown_samples = thin_signal(residual, MAX_SAMPLES)
         line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
         if model == "after":
             line_style = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
-        line_style["rasterized"] = rows.size > MAX_OUTLINED_DOTS
-        panel.plot(view.times[rows], residual[rows], **line_style)
+        line_style["rasterized"] = shown_samples.size > MAX_OUTLINED_DOTS
+        panel.plot(view.times[shown_samples], residual[shown_samples], **line_style)
     rms_texts = [
         format_number(_compute_residual_rms(view, channel_index, model), 2) for model in models
     ]
@@ -378,7 +382,10 @@ def _add_title_and_legend(
         # A residual column may have no panel in its first row.
         warnings.simplefilter("ignore", UserWarning)
         residual_legends = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
-    band_handles, band_labels = next(((h, name) for h, name in residual_legends if h), ([], []))
+    # The band of the noise is the only entry, and the same in all rows.
+    band_handles, band_labels = next(
+        (legend for legend in residual_legends if any(legend)), ([], [])
+    )
     figure.legend(
         [*handles, *band_handles],
         [*labels, *band_labels],
@@ -388,8 +395,8 @@ def _add_title_and_legend(
         ncols=4,
         fontsize=9,
     )
-    before = "before → after" if report.has_extended_model else "its size"
-    note = f"residual: measured − simulated; above each its RMS in σ, {before}"
+    rms_text = "before → after" if report.has_extended_model else "its size"
+    note = f"residual: measured − simulated; above each its RMS in σ, {rms_text}"
     figure.text(0.5, 0.14 / height, note, fontsize=8, ha="center", va="center", color=CAPTION_GREY)
     figure.subplots_adjust(
         left=names_width / width,

@@ -75,21 +75,22 @@ def build_motion_table(report: DiagnosisReportData) -> MotionTable:
     shown.
     """
     runs = rank_runs(report)
-    count = len(report.channels)
-    shown_runs = runs[: max(1, MAX_ROWS // (MIN_ROWS_PER_CHANNEL * count))]
-    samples_per_run = max(MIN_ROWS_PER_CHANNEL, MAX_ROWS // (len(shown_runs) * count))
-    parts = [
-        _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
-    ]
-    names = ["run", "channel", "t", "measured", "before", "residual_before"]
-    if report.has_extended_model:
-        names = [*names[:5], "after", "residual_before", "residual_after"]
-    columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
-    frame = Table(dict(zip(names, columns, strict=True)))
+    channel_count = len(report.channels)
+    shown_runs = runs[: max(1, MAX_ROWS // (MIN_ROWS_PER_CHANNEL * channel_count))]
+    samples_per_run = max(MIN_ROWS_PER_CHANNEL, MAX_ROWS // (len(shown_runs) * channel_count))
+    columns: dict[str, list[str]] = {}
+    for run in shown_runs:
+        for channel_index in range(channel_count):
+            for name, cells in _format_rows(report, run, channel_index, samples_per_run).items():
+                columns.setdefault(name, []).extend(cells)
     longest_run = max(len(run.times) for run in shown_runs)
     part_count = _count_parts(report, samples_per_run) if longest_run > samples_per_run else 0
     return MotionTable(
-        frame, tuple(shown_runs), part_count, longest_run, len(runs) - len(shown_runs)
+        frame=Table(columns),
+        runs=tuple(shown_runs),
+        part_count=part_count,
+        longest=longest_run,
+        absent=len(runs) - len(shown_runs),
     )
 
 
@@ -111,19 +112,21 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
             two.
         max_rows: maximum number of samples of a run in the chart.
     """
-    return max(1, max_rows // (6 if report.has_extended_model else 4))
+    signal_count = 3 if report.has_extended_model else 2
+    return max(1, max_rows // (2 * signal_count))
 
 
 def _format_rows(
     report: DiagnosisReportData, run: RunView, channel_index: int, max_rows: int
-) -> list[list[str]]:
-    """Format the samples of a channel of a run as columns of text for the chart's table.
+) -> dict[str, list[str]]:
+    """Format the samples of a channel of a run as columns of text, by name, for the chart's table.
 
-    If there are more than `max_rows` samples, only the extremes of short parts are kept.
+    If there are more than `max_rows` samples, only the extremes of short parts are kept. Residuals
+    are in units of the noise.
 
     Args:
         report: content of the report.
-        run: run of the page: its label, and its place in the data.
+        run: the run with its data.
         channel_index: index of the channel.
         max_rows: maximum number of samples.
     """
@@ -132,24 +135,30 @@ def _format_rows(
     observed = run.get_samples("observed", channel_index)
     simulated = [run.get_samples(model, channel_index) for model in models]
     residuals = [run.compute_residual(model, channel_index) for model in models]
-    rows = np.arange(len(times))
+    shown = np.arange(len(times))
     if len(times) > max_rows:
-        rows = select_extreme_samples([observed, *residuals], _count_parts(report, max_rows))
-    # Decimals, so that the noise has at least a few digits.
-    digits = (
-        int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
-        if channel.sigma > 0
-        else 9
-    )
+        shown = select_extreme_samples([observed, *residuals], _count_parts(report, max_rows))
+    # As many decimals as the noise divided by `NOISE_RESOLUTION` needs; 9 if it is unknown.
+    value_decimals = 9
+    if channel.sigma > 0:
+        value_decimals = int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     # A thousandth of a step shows whether time stamps have jitter.
-    decimals = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
-    count = len(rows)
-    # Columns: run, channel, time, signals, and residuals in units of the noise.
-    texts = [[sanitise(run.name, 80)] * count, [sanitise(channel.name, 80)] * count]
-    texts.append(_format_numbers(times[rows], decimals))
-    texts += [_format_numbers(values[rows], digits) for values in (observed, *simulated)]
-    return texts + [_format_numbers(values[rows], 2) for values in residuals]
+    time_decimals = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
+    return {
+        "run": [sanitise(run.name, 80)] * len(shown),
+        "channel": [sanitise(channel.name, 80)] * len(shown),
+        "t": _format_numbers(times[shown], time_decimals),
+        "measured": _format_numbers(observed[shown], value_decimals),
+        **{
+            model: _format_numbers(values[shown], value_decimals)
+            for model, values in zip(models, simulated, strict=True)
+        },
+        **{
+            f"residual_{model}": _format_numbers(values[shown], 2)
+            for model, values in zip(models, residuals, strict=True)
+        },
+    }
 
 
 def _format_numbers(values: Array, digits: int) -> list[str]:
@@ -187,7 +196,7 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     """Make the chart with its table.
 
     The chart shows measured and simulated channels over time, and their residual; readers select
-    the run and the channels.
+    the run and the channels. With several channels, motion and residual are placed side by side.
 
     Args:
         report: Data of the report.
@@ -196,9 +205,9 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     is_wide = len(places) > 2 or is_robot(report)
     panels: list[Panel] = []
     for run in table.runs:
-        for facets, c in places:
-            run_title = _format_run_title(report, run)
-            panels += _make_panels(report, run, c, {"run": run_title, **facets}, is_wide)
+        for facets, channel_index in places:
+            all_facets = {"run": _format_run_title(report, run), **facets}
+            panels += _make_panels(report, run, channel_index, all_facets, is_wide)
     toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
     return MotionChart(
         table=table,
@@ -226,10 +235,11 @@ def _list_switches(report: DiagnosisReportData) -> list[tuple[dict[str, str], in
         return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(report.channels)]
     places = []
     for row in list_joint_rows(report):
-        for quantity, c in row.channels.items():
-            is_joint = report.channels[c].name.partition(".")[0] in QUANTITY_LABELS
-            quantity_label = QUANTITY_LABELS[quantity] if is_joint else "sensor"
-            places.append(({"joint": sanitise(row.name, 40), "quantity": quantity_label}, c))
+        for quantity, channel_index in row.channels.items():
+            prefix, _, _ = report.channels[channel_index].name.partition(".")
+            label = QUANTITY_LABELS[quantity] if prefix in QUANTITY_LABELS else "sensor"
+            facets = {"joint": sanitise(row.name, 40), "quantity": label}
+            places.append((facets, channel_index))
     return places
 
 
@@ -238,34 +248,33 @@ def _list_hidden(
 ) -> tuple[str, ...]:
     """Return the channels or joints that are hidden at first, if there are many.
 
-    Those with the largest residuals stay visible, until `MAX_INITIAL_CHANNELS` panels are visible;
-    at least one does.
+    Those with the largest residuals stay visible, until `MAX_INITIAL_CHANNELS` channels are
+    visible; at least one joint stays visible, however many channels it has.
 
     Args:
         report: content of the report, with the residual of each channel.
-        places: facets of each panel, and the index of its channel.
-        toggle: facet whose values are hidden.
+        places: facets of each channel (labels by which it is switched on), and its index.
+        toggle: facet whose values are hidden, such as ``joint``.
     """
     if len(places) <= MAX_INITIAL_CHANNELS:
         return ()
-    gaps: dict[str, float] = {}
-    counts: dict[str, int] = {}
     gap_by_channel = {
         location.label: location.before
         for location in report.gap_locations
         if location.kind == "channel"
     }
-    for facets, c in places:
-        name = facets[toggle]
-        gaps[name] = max(gaps.get(name, 0.0), gap_by_channel.get(report.channels[c].name, 0.0))
-        counts[name] = counts.get(name, 0) + 1
+    gaps_by_name: dict[str, list[float]] = {}
+    for facets, channel_index in places:
+        gap = gap_by_channel.get(report.channels[channel_index].name, 0.0)
+        gaps_by_name.setdefault(facets[toggle], []).append(gap)
     remaining = MAX_INITIAL_CHANNELS
     visible_names: set[str] = set()
-    for name in sorted(gaps, key=lambda candidate_name: -gaps[candidate_name]):
-        if not visible_names or counts[name] <= remaining:
+    for name in sorted(gaps_by_name, key=lambda name: max(gaps_by_name[name]), reverse=True):
+        channel_count = len(gaps_by_name[name])
+        if not visible_names or channel_count <= remaining:
             visible_names.add(name)
-            remaining -= counts[name]
-    return tuple(name for name in gaps if name not in visible_names)
+            remaining -= channel_count
+    return tuple(name for name in gaps_by_name if name not in visible_names)
 
 
 def _make_panels(
@@ -283,10 +292,10 @@ def _make_panels(
 
     Args:
         report: content of the report.
-        run: run of the page: its label, and its place in the data.
-        channel_index: number of the channel.
+        run: the run with its data.
+        channel_index: index of the channel.
         facets: values of the switches that show these panels.
-        is_wide: place the panels side by side.
+        is_wide: whether the panels are side by side.
     """
     channel = report.channels[channel_index]
     selection = {
@@ -306,7 +315,7 @@ def _make_panels(
     name = sanitise(channel.name, 40)
     # For the joints of a robot, a common scale makes residuals comparable.
     quantity = facets.get("quantity", name)
-    residual = Axis(
+    residual_axis = Axis(
         f"residual of {quantity} [σ]",
         scales=("linear",),
         holds=(-_MIN_HALF_HEIGHT, _MIN_HALF_HEIGHT),
@@ -316,11 +325,9 @@ def _make_panels(
     )
     noise_band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tooltip_lines = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
-    heights = (
-        (_SIDE_BY_SIDE_HEIGHT, _SIDE_BY_SIDE_HEIGHT)
-        if is_wide
-        else (_MOTION_HEIGHT, _RESIDUAL_HEIGHT)
-    )
+    motion_height, residual_height = _MOTION_HEIGHT, _RESIDUAL_HEIGHT
+    if is_wide:
+        motion_height = residual_height = _SIDE_BY_SIDE_HEIGHT
     motion_panel = Panel(
         title=name,
         table=MOTION_TABLE_NAME,
@@ -330,15 +337,15 @@ def _make_panels(
         up=value_axis,
         facets=facets,
         tells=tooltip_lines,
-        height=heights[0],
+        height=motion_height,
     )
     residual_panel = replace(
         motion_panel,
         title=f"{name}: residual",
         series=tuple(residuals),
-        up=residual,
+        up=residual_axis,
         spans=noise_band,
-        height=heights[1],
+        height=residual_height,
     )
     return motion_panel, residual_panel
 

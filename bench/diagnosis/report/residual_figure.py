@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -82,21 +83,20 @@ def draw_residual_figure(report: DiagnosisReportData) -> Figure:
     """
     locations = select_gap_locations(report.gap_locations)
     profiles = select_informative_profiles(report.profiles)
+    # At most two rows of profiles, filled row by row.
     rows = min(2, len(profiles))
-    columns = -(-len(profiles) // 2)
+    columns = ceil(len(profiles) / 2)
     names = place_names(locations)
     left_margin = max(_MIN_NAMES_WIDTH, 0.25 + measure_text_width(names, FONT_SIZE))
     profiles_from = left_margin + _PROFILES_AFTER
-    # A single column of profiles is wider than one of several columns.
-    # Widths in inches: panel of the gaps, and each column of profiles.
-    width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
-    # Height of a row in inches, and of each further line of a name.
+    # Panel of the gaps, and columns of profiles; a single column is wider than one of several.
+    width = left_margin + 3.3 + (4.4 if columns == 1 else 3.1 * columns)
+    # Height of a row, and of each further line of a name.
     row_height = 0.27 + 0.13 * (count_max_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
-    label_height = 0.15 * (
-        count_max_lines([format_profile_label(profile) for profile in profiles]) - 1
-    )
-    # Height in inches of title, axis and rows; or of titles and panels of the profiles.
+    profile_labels = [format_profile_label(profile) for profile in profiles]
+    label_height = 0.15 * (count_max_lines(profile_labels) - 1)
+    # Title, axis and rows of the gaps; or titles and panels of the profiles.
     height = max(2.6 + row_height * len(locations), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
@@ -130,7 +130,8 @@ def draw_residual_figure(report: DiagnosisReportData) -> Figure:
     )
     units = {c.name: c.unit for c in report.channels}
     for i, profile in enumerate(profiles):
-        axis = figure.add_subplot(grid[i // columns, i % columns])
+        row, column = divmod(i, columns)
+        axis = figure.add_subplot(grid[row, column])
         unit = units.get(profile.channel, "1")
         draw_profile_panel(
             axis, profile, unit, report.has_extended_model, one_channel=len(channels) == 1
@@ -176,14 +177,14 @@ class _FigureLayout(NamedTuple):
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     """Select the runs, channels and phases with the largest gaps, in their original order.
 
-    A gap location is such a part of the data with its RMS residual. Those without samples are left
-    out.
+    A gap location is such a part of the data with its RMS residual. Those without samples, which
+    have no RMS, are left out. The original order is kept, because readers look for run 3 after run
+    2.
 
     Args:
         places: Gap locations with their RMS residual before the causes are added.
     """
     selected: list[GapLocation] = []
-    # A part without samples has no RMS.
     measured_locations = [p for p in places if np.isfinite(p.before) and p.samples > 0]
     for kind, max_count in (
         ("run", MAX_RUNS),
@@ -192,7 +193,6 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     ):
         locations_of_kind = [p for p in measured_locations if p.kind == kind]
         worst_locations = sorted(locations_of_kind, key=lambda p: -p.before)[:max_count]
-        # The original order is kept, because readers look for run 3 after run 2.
         selected += [p for p in locations_of_kind if p in worst_locations]
     return selected
 
@@ -200,7 +200,10 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
 def draw_gap_location_panel(
     axis: Axes, places: Sequence[GapLocation], report: DiagnosisReportData
 ) -> None:
-    """Draw the RMS by run, channel and phase, with the range for white noise.
+    """Draw the RMS residual of each run, channel and phase of the motion in units of the noise.
+
+    Each is a row with a mark before and after the causes are added, joined by a line. A dotted line
+    at 1 is the noise floor, and a bar the range in which the RMS of white noise lies.
 
     Args:
         axis: Axes to draw on.
@@ -209,26 +212,27 @@ def draw_gap_location_panel(
     """
     row_positions = _place_rows(axis, places)
     # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
-    noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
-    floor = np.ones(len(row_positions))
+    noise_ranges = [min(2 / (2 * place.samples) ** 0.5, _WIDEST) for place in places]
     axis.errorbar(
-        floor,
+        np.ones(len(places)),
         row_positions,
-        xerr=noise,
+        xerr=noise_ranges,
         fmt="none",
         ecolor=NULL_LEVEL_GREY,
         elinewidth=7,
         label=_WHITE_NOISE,
     )
     axis.axvline(1.0, color=NEUTRAL_MARK, linewidth=1.0, linestyle=":", label=_FLOOR)
-    before_values = [p.before for p in places]
-    after_values = [p.after for p in places]
+    before_values = [place.before for place in places]
+    after_values = [place.after for place in places]
+    shown_values = before_values
+    base_label = "simulated (tuned)"
     if report.has_extended_model:
         axis.hlines(row_positions, after_values, before_values, color=CONNECTOR_GREY, linewidth=0.9)
         axis.plot(after_values, row_positions, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
-    name = "before" if report.has_extended_model else "simulated (tuned)"
-    axis.plot(before_values, row_positions, linestyle="", label=name, **BASE_MODEL_MARKER)
-    shown_values = [*before_values, *after_values] if report.has_extended_model else before_values
+        shown_values = [*before_values, *after_values]
+        base_label = "before"
+    axis.plot(before_values, row_positions, linestyle="", label=base_label, **BASE_MODEL_MARKER)
     # The noise floor must be visible, whatever the sizes.
     _use_log_axis_if_needed(axis, [*shown_values, 1.0])
     axis.set_yticks(row_positions, place_names(places), linespacing=1.05)
@@ -251,16 +255,18 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
         places: places of the gap, sorted by kind.
     """
     row_positions: list[float] = []
-    for i, place in enumerate(places):
-        is_new_kind = i == 0 or places[i - 1].kind != place.kind
-        if not row_positions:
-            row_positions.append(_FIRST)
-        else:
-            row_positions.append(row_positions[-1] + (_NEXT_KIND if is_new_kind else _NEXT))
+    previous_kind = ""
+    for place in places:
+        is_new_kind = place.kind != previous_kind
+        previous_kind = place.kind
+        position = _FIRST
+        if row_positions:
+            position = row_positions[-1] + (_NEXT_KIND if is_new_kind else _NEXT)
+        row_positions.append(position)
         if is_new_kind:
             axis.text(
                 -0.035,
-                row_positions[-1] - 0.85,
+                position - 0.85,
                 f"by {place.kind} (samples)",
                 transform=axis.get_yaxis_transform(),
                 ha="right",
@@ -272,22 +278,24 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
 
 
 def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
-    """Return handles and labels of a legend in reading order."""
+    """Return handles and labels of the legend: models first, then the noise floor and its range."""
     handles, labels = axis.get_legend_handles_labels()
-    by_label = dict(zip(labels, handles, strict=True))
+    handle_by_label = dict(zip(labels, handles, strict=True))
     order = ("before", "simulated (tuned)", "after", _FLOOR, _WHITE_NOISE)
-    present = [name for name in order if name in by_label]
-    return [by_label[name] for name in present], present
+    drawn_labels = [label for label in order if label in handle_by_label]
+    return [handle_by_label[label] for label in drawn_labels], drawn_labels
 
 
 def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
     """Use a logarithmic axis with plain numbers if the values differ by a large factor.
 
+    Otherwise the axis is linear and begins at 0.
+
     Args:
         axis: Axes whose horizontal scale is set.
         values: Values to be shown; only positive ones can be on a logarithmic axis.
     """
-    positive = np.array([v for v in values if np.isfinite(v) and v > 0])
+    positive = np.array([value for value in values if np.isfinite(value) and value > 0])
     if not positive.size or positive.max() / positive.min() < _SPAN_FOR_LOG:
         axis.set_xlim(left=0)
         return
@@ -303,7 +311,7 @@ def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
 
 
 def _compute_log_ticks(low: float, high: float) -> list[float]:
-    """Return round ticks of a logarithmic axis; per decade 1, 2, 5 or fewer.
+    """Return round ticks of a logarithmic axis: 1, 2 and 5 in each decade, or fewer.
 
     Args:
         low: lower end of the axis, positive.
@@ -320,17 +328,19 @@ def _compute_log_ticks(low: float, high: float) -> list[float]:
 
 
 def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[ResidualProfile]:
-    """Select the profiles with the most significant residuals before the extension.
+    """Select the profiles in which the base model has the most significant residuals.
 
-    Each variable comes once before any comes a second time.
+    At most `MAX_PROFILES` are selected. The best profile of each variable precedes further profiles
+    of the same variable.
     """
     measured_profiles = [p for p in profiles if np.isfinite(_compute_profile_significance(p))]
-    strongest_first = sorted(measured_profiles, key=lambda p: -_compute_profile_significance(p))
-    variables = [p.variable for p in strongest_first]
-    is_repeated = [name in variables[:i] for i, name in enumerate(variables)]
-    # The sort is stable: first profiles of each variable come first, each group by significance.
-    order = np.argsort(is_repeated, kind="stable")
-    return [strongest_first[i] for i in order[:MAX_PROFILES]]
+    first_of_variable: list[ResidualProfile] = []
+    further: list[ResidualProfile] = []
+    known_variables: set[str] = set()
+    for profile in sorted(measured_profiles, key=_compute_profile_significance, reverse=True):
+        (further if profile.variable in known_variables else first_of_variable).append(profile)
+        known_variables.add(profile.variable)
+    return [*first_of_variable, *further][:MAX_PROFILES]
 
 
 def _compute_profile_significance(profile: ResidualProfile) -> float:
@@ -355,13 +365,14 @@ def draw_profile_panel(
     """Draw the mean residual of a channel against a variable, without and with the causes.
 
     A perfect model has means near zero; a trend shows on which variable the missing force depends.
-    Bars are two standard errors of the mean to either side.
+    Bars are two standard errors of the mean to either side; they follow from the noise, and so are
+    equal for both models.
 
     Args:
         axis: Axes to draw on.
         profile: Residual in bins.
         unit: Unit of the channel.
-        extended: Whether there is an extended model to draw.
+        extended: Whether there is an extended model (with the causes) to draw.
         one_channel: Whether all panels show the same channel, which their heading names.
     """
     # Bins without samples have no mean.
@@ -369,31 +380,17 @@ def draw_profile_panel(
     centres = profile.centres[is_measured]
     bars = 2 * profile.error[is_measured]
     axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6)
-    curves = [
-        (
-            profile.before,
-            {**BASE_MODEL_LINE, **BASE_MODEL_MARKER, "markersize": 4.5, "linewidth": 1.0},
-        )
-    ]
+    base_style = {**BASE_MODEL_LINE, **BASE_MODEL_MARKER, "markersize": 4.5, "linewidth": 1.0}
+    curves = [(profile.before, base_style)]
     if extended:
-        curves.append(
-            (
-                profile.after,
-                {
-                    **EXTENDED_MODEL_LINE,
-                    **EXTENDED_MODEL_MARKER,
-                    "markersize": 3.5,
-                    "linewidth": 1.2,
-                },
-            )
-        )
-    for values, curve_style in curves:
-        axis.errorbar(centres, values[is_measured], yerr=bars, elinewidth=1.0, **curve_style)
+        extended_style = {**EXTENDED_MODEL_LINE, **EXTENDED_MODEL_MARKER}
+        curves.append((profile.after, {**extended_style, "markersize": 3.5, "linewidth": 1.2}))
+    for means, curve_style in curves:
+        axis.errorbar(centres, means[is_measured], yerr=bars, elinewidth=1.0, **curve_style)
     axis.set_xlabel(format_profile_label(profile))
-    label = (
-        "residual" if one_channel else f"residual of {sanitise(profile.channel, MAX_LABEL_LENGTH)}"
-    )
-    axis.set_ylabel(
-        break_name(format_label(label, sanitise(unit, SHORT_LABEL_LENGTH)), MAX_LABEL_LENGTH)
-    )
+    label = "residual"
+    if not one_channel:
+        label = f"residual of {sanitise(profile.channel, MAX_LABEL_LENGTH)}"
+    label_with_unit = format_label(label, sanitise(unit, SHORT_LABEL_LENGTH))
+    axis.set_ylabel(break_name(label_with_unit, MAX_LABEL_LENGTH))
     axis.locator_params(nbins=5)

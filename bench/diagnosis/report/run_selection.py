@@ -72,7 +72,10 @@ class RunView(NamedTuple):
 
 
 def rank_runs(report: DiagnosisReportData) -> list[RunView]:
-    """List all runs by descending gap, but the worst held-out run first, if there is any."""
+    """List all runs by descending gap, but the worst held-out run first, if there is any.
+
+    The gap of a run is the RMS residual of the base model in units of the noise; 0 without samples.
+    """
     sigma = np.array([c.sigma for c in report.channels])
     runs = []
     for split in report.data_splits:
@@ -81,10 +84,10 @@ def rank_runs(report: DiagnosisReportData) -> list[RunView]:
             finite = run_squares[np.isfinite(run_squares)]
             gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
             runs.append(RunView(split, row, split is report.held_out, sigma, gap))
-    last_split = runs[-1].data_split
     runs.sort(key=lambda run: -run.gap)
-    worst = next(run for run in runs if run.data_split is last_split)
-    return [worst, *(run for run in runs if run is not worst)]
+    has_held_out = any(run.held_out for run in runs)
+    first = next(run for run in runs if run.held_out == has_held_out)
+    return [first, *(run for run in runs if run is not first)]
 
 
 def select_worst_run(report: DiagnosisReportData) -> RunView:

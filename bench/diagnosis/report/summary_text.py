@@ -174,12 +174,16 @@ def list_largest_gaps(report: DiagnosisReportData) -> list[GapLocation]:
 
 
 def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
-    """List the parameters that the recording cannot identify.
+    """List the parameters that the recording cannot identify; at least one is named.
 
-    They are those reported by the search, else those without interval, else insensitive ones, else
-    all.
+    The first of these lists that is not empty is returned:
+
+    1. those that the search reported,
+    2. those without an interval, although the data are sensitive to them,
+    3. those to which the data are not sensitive,
+    4. all parameters,
+    5. a phrase for all of them.
     """
-    # Each list is the fallback of the previous one, because at least one parameter must be named.
     without_interval = [
         p.name for p in report.parameters if p.is_sensitive and not np.isfinite(p.before).all()
     ]
@@ -202,12 +206,12 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     """Return the unit of the held-out errors.
 
     It is the stored unit. For a result without one, it is found by comparison: the noise floor is
-    the RMS noise of all channels with one unit.
+    the RMS noise of all channels with one unit. If this fits no unit, the result is the only unit
+    of the channels, or ``1``.
     """
     held_out = report.verdict.heldout
     if held_out is not None and held_out.unit:
         return held_out.unit
-    # If the unit is not specified: the noise floor is the RMS noise of the channels of one unit.
     floor = held_out.noise_floor if held_out is not None else None
     units = list(dict.fromkeys(c.unit for c in report.channels))
     for unit in units:
@@ -234,52 +238,58 @@ def compute_normalised_rms(report: DiagnosisReportData, split: DataSplit, model:
 def format_tuned_value(p: ParameterChange, model_index: int) -> str:
     """Format a parameter's estimate with its interval, or the bound that it is at.
 
+    The estimate after is followed by the change of the number in the model file, if there is one.
+
     Args:
-        p: Parameter before and after.
+        p: Parameter before and after the causes are added.
         model_index: 0 for the estimate before, 1 for the one after.
     """
-    value, bound = (p.before, p.after)[model_index], p.bounds[model_index]
-    total = p.in_file if model_index else ""
+    value, low, high = (p.before, p.after)[model_index]
+    bound = p.bounds[model_index]
+    file_change = p.in_file if model_index == 1 else ""
     if bound is not None:
-        return at_bound(value[0], p.unit, bound) + total
-    return append_unit(format_estimate(*value), p.unit) + total
+        return at_bound(value, p.unit, bound) + file_change
+    return append_unit(format_estimate(value, low, high), p.unit) + file_change
 
 
 def format_shift(p: ParameterChange) -> str:
     """Format the change of a parameter in percent, or as a number if it was zero before.
 
+    A very large change is a number too, as it is clearer than a percentage.
+
     Args:
         p: Parameter with its estimates before and after the causes are added.
     """
-    change = p.after[0] - p.before[0]
+    (before, _, _), (after, _, _) = p.before, p.after
+    change = after - before
     if not change:
         return "unchanged"
-    if abs(change) < MIN_REPORTED_CHANGE * abs(p.before[0]):
+    if abs(change) < MIN_REPORTED_CHANGE * abs(before):
         return f"changes by less than {format_percent(MIN_REPORTED_CHANGE)}"
     sign = "+" if change > 0 else ""
-    # For zero a percentage is undefined, and a very large one is less clear than the number.
-    if not p.before[0] or abs(change / p.before[0]) > MAX_PERCENT_SHIFT:
+    if not before or abs(change / before) > MAX_PERCENT_SHIFT:
         return sign + append_unit(format_number(change, 2), p.unit)
-    return sign + format_percent(change / abs(p.before[0]))
+    return sign + format_percent(change / abs(before))
 
 
 def has_absorbed_gap(p: ParameterChange) -> bool:
-    """Return whether a parameter changes significantly.
+    """Return whether a parameter had absorbed a part of the gap: whether it changes significantly.
 
-    The change must exceed the combined 95 % intervals, and be at least `MIN_REPORTED_CHANGE` of the
-    value.
+    The change must exceed the root sum square of the half-widths of both 95 % intervals, and be at
+    least `MIN_REPORTED_CHANGE` of the value. Without intervals, a minimum relative change is
+    required instead.
 
     Args:
         p: Parameter with value and interval before and after the causes are added.
     """
-    change = abs(p.after[0] - p.before[0])
-    # Without intervals, a minimum relative change is required instead.
+    (before, low_before, high_before), (after, low_after, high_after) = p.before, p.after
+    change = abs(after - before)
     if not np.isfinite([*p.before, *p.after]).all():
-        return change > MIN_REPORTED_SHIFT * abs(p.before[0])
-    before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
-    return bool(
-        change > np.hypot(before, after) and change >= MIN_REPORTED_CHANGE * abs(p.before[0])
+        return change > MIN_REPORTED_SHIFT * abs(before)
+    min_significant_change = np.hypot(
+        (high_before - low_before) / 2.0, (high_after - low_after) / 2.0
     )
+    return bool(change > min_significant_change and change >= MIN_REPORTED_CHANGE * abs(before))
 
 
 def format_next_run(report: DiagnosisReportData) -> str:
