@@ -34,7 +34,7 @@ from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.gain_and_intervals import Z95, invert_scaled
+from bench.diagnosis.validation.confidence_intervals import Z95, invert_scaled
 from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import format_unit, join_first_names
 from sims.core.simulator import Array, Parameter

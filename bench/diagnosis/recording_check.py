@@ -14,7 +14,7 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
-from bench.diagnosis.validation.gain_and_intervals import compute_central_jacobian
+from bench.diagnosis.validation.confidence_intervals import compute_central_jacobian
 from bench.logs.filter_settling import leave_out_settling
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording

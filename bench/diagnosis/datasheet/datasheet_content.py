@@ -27,7 +27,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     joined,
     sanitise,
 )
-from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.diagnosis.verdict import Cause, Verdict
 from sims import effects as library
 from sims.core.effect import ALL_PLACES

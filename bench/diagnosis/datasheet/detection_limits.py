@@ -2,8 +2,8 @@
 
 The limits are computed at a fitted model. A are the whitened derivatives by the parameters of the
 model, and d the derivatives by one more coefficient; the initial states of each run are projected
-out of both (`validation.gain_and_intervals`). The remaining information on the coefficient, after A
-is projected out too, is
+out of both (`validation.confidence_intervals`). The remaining information on the coefficient, after
+A is projected out too, is
 
     power = d'd - d'A (A'A)^-1 A'd                                                              (1)
 
@@ -44,7 +44,7 @@ from bench.diagnosis.search.candidate_directions import (
     compute_directions,
     compute_responses,
 )
-from bench.diagnosis.validation.gain_and_intervals import (
+from bench.diagnosis.validation.confidence_intervals import (
     MAX_INTERVAL_WIDTH,
     Z95,
     compute_fisher_blocks_from_jacobian,

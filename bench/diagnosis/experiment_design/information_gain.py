@@ -31,7 +31,10 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
 from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
-from bench.diagnosis.validation.gain_and_intervals import compute_covariance, compute_fisher_blocks
+from bench.diagnosis.validation.confidence_intervals import (
+    compute_covariance,
+    compute_fisher_blocks,
+)
 from sims.core.simulator import Array
 
 DISCRIMINATION_THRESHOLD = 25.0

@@ -11,7 +11,7 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import EffectNames
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.validation.gain_and_intervals import (
+from bench.diagnosis.validation.gap_closed import (
     MIN_REPORTED_GAIN,
     HeldOutGain,
     compute_closed_share,

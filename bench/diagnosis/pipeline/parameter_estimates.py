@@ -15,7 +15,7 @@ from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.gain_and_intervals import compute_intervals
+from bench.diagnosis.validation.confidence_intervals import compute_intervals
 from bench.diagnosis.verdict import Cause
 from sims.core.effect import Effect, members_of
 from sims.extended_simulator import FittedValue

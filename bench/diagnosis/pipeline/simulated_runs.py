@@ -22,7 +22,8 @@ from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.pipeline.contact_conditions import ContactConditions
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
-from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns, Validation
+from bench.diagnosis.validation.cross_validation import CrossValidation
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns, Validation
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator

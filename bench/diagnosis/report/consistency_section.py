@@ -15,7 +15,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     sanitise,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.diagnosis.validation.run_consistency import (
     SIGNIFICANCE_LEVEL,
     CovariateKind,

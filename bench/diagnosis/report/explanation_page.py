@@ -47,7 +47,7 @@ from bench.diagnosis.report.report_data import (
     ResidualProfile,
 )
 from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
-from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.figures.figure_output import FigureFiles
 from bench.figures.style import shorten_name
 from bench.pages.chart import Axis, Panel, Series

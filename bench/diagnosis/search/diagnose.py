@@ -39,7 +39,7 @@ from bench.diagnosis.search.verdict_rules import (
     decide_early_stop_verdict,
     decide_verdict,
 )
-from bench.diagnosis.validation.gain_and_intervals import compute_covariance
+from bench.diagnosis.validation.confidence_intervals import compute_covariance
 from bench.diagnosis.validation.held_out_runs import HeldOutFit, Validation
 from sims.core.simulator import Array
 

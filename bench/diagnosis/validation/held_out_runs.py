@@ -1,29 +1,23 @@
-"""Prediction of held-out runs by fitted models, and cross-validation over few runs.
+"""Prediction of held-out runs by fitted models, of which only the initial states are fitted.
 
 For n samples with f effective initial states, the penalised log-likelihood of a model with
 log-likelihood L is that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
 
     M = 2 log L - f log n                                                                      (1)
-
-Leave-one-out cross-validation with a run as the unit (M. Stone, J. R. Stat. Soc. B 36(2), 111,
-1974, doi:10.1111/j.2517-6161.1974.tb00994.x), because samples of one run depend on each other. It
-replaces held-out runs where a recording has too few runs to spare one: the reported model is fitted
-to all runs, and its error is measured on predictions of runs that were not used in the fit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, maximise_likelihood
-from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import count_identified_states
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.plain_values import format_count
 from sims.core.root_mean_square import compute_rms
@@ -136,14 +130,16 @@ class HeldOutRuns:
     ) -> list[HeldOutFit]:
         """Simulate the runs with each parameter vector (P,) and fit their initial states.
 
+        The nearest fit is the one with the lowest cost.
+
         1. Fit the initial states of all models, over ever longer parts of the runs. For filtered
-           runs, whose initial states are known well, one stage is tried first. A robot on the
-           ground, whose contacts a fit of states would lift or press in, starts from settled ones.
-        2. If the motion has left the range of its linearisation, continue with derivatives at the
-           best fit.
-        3. Least squares may converge to a different minimum for similar models, and chance would
-           then decide between them. Models far from the nearest one (the one with the lowest cost)
-           are therefore fitted again from its initial states, and the better fit counts.
+           runs, whose initial states are known well, one stage with whole runs is tried first.
+        2. If even the nearest of these is far from the noise, fit them in another way.
+        3. If the motion has left the range of its linearisation, continue with derivatives at the
+           nearest fit.
+        4. Least squares may converge to a different minimum for similar models, and chance would
+           then decide between them. Models far from the nearest one are therefore fitted again from
+           its initial states, and the better fit counts.
 
         Shapes: P parameters.
 
@@ -155,31 +151,67 @@ class HeldOutRuns:
         Returns:
             The prediction of the runs by each model.
         """
+        # 1. All models.
         guess = self.evaluator.initial_state_guesses
-        initial_starts = [FitStart((), theta, guess) for theta in thetas]
+        starts = [FitStart((), theta, guess) for theta in thetas]
         is_filtered = self.evaluator.filtered_runs is not None and not is_staged
         fits = self._fit_initial_states(
-            initial_starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
+            starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
         )
-        count = max(int(self.seen.sum()), 1)
-        has_poor_fit = (
-            is_filtered and not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count
-        )
-        followed = self.evaluator.filtered_runs
-        if has_poor_fit and followed is not None and followed.is_on_ground:
-            settled_states = [followed.estimate_settled_states(theta) for theta in thetas]
-            starts = [FitStart((), *pair) for pair in zip(thetas, settled_states, strict=True)]
-            fits = _select_nearer_fits(
-                fits, self._fit_initial_states(starts, FILTERED_HORIZON_STAGES)
-            )
-        elif has_poor_fit:
-            # Runs that amplify differences of the initial state need a fit in stages.
-            fits = _select_nearer_fits(
-                fits, self._fit_initial_states(initial_starts, HORIZON_STAGES)
-            )
-            is_filtered = False
+        # 2. Poor fits.
+        if is_filtered and self._are_poor(fits):
+            fits, is_filtered = self._improve_poor_fits(starts, fits)
+        # 3. Derivatives.
         if not is_filtered and self._leaves_linear_range(_find_lowest_cost_fit(fits)):
-            fits = self._continue_from_nearest(initial_starts, fits)
+            fits = self._continue_from_nearest(starts, fits)
+        # 4. Far models. These initial states are good over the first fraction of the runs already.
+        fits = self._refit_far_models(
+            fits, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES[1:]
+        )
+        return [self._predict_runs(fit) for fit in fits]
+
+    def _are_poor(self, fits: Sequence[TrajectoryFit]) -> bool:
+        """Return whether even the nearest fit is far from the noise, or has failed."""
+        count = max(int(self.seen.sum()), 1)
+        # The comparison is negated because the cost of a failed fit may be NaN.
+        return not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count
+
+    def _improve_poor_fits(
+        self, starts: Sequence[FitStart], fits: Sequence[TrajectoryFit]
+    ) -> tuple[list[TrajectoryFit], bool]:
+        """Fit filtered runs in another way, and keep the better fit of each model.
+
+        - A robot on the ground, whose contacts a fit of states would lift or press in, starts from
+          states with settled contacts.
+        - Other motions may amplify differences of the initial state, so they are fitted in stages.
+
+        Args:
+            starts: model, parameters and first initial states of each fit.
+            fits: poor fit of each model.
+
+        Returns:
+            The better fits, and whether they were made in the way of filtered runs, in one stage.
+        """
+        filtered_runs = self.evaluator.filtered_runs
+        if filtered_runs is not None and filtered_runs.is_on_ground:
+            settled_starts = [
+                replace(start, initial_states=filtered_runs.estimate_settled_states(start.theta))
+                for start in starts
+            ]
+            other_fits = self._fit_initial_states(settled_starts, FILTERED_HORIZON_STAGES)
+            return _select_nearer_fits(fits, other_fits), True
+        other_fits = self._fit_initial_states(starts, HORIZON_STAGES)
+        return _select_nearer_fits(fits, other_fits), False
+
+    def _refit_far_models(
+        self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
+    ) -> list[TrajectoryFit]:
+        """Refit models far from the nearest one from its initial states; keep the better fits.
+
+        Args:
+            fits: fit of each model.
+            stages: share of the runs and maximum number of iterations, one stage after another.
+        """
         nearest_fit = _find_lowest_cost_fit(fits)
         # The comparison is negated because the cost of a failed fit may be NaN.
         limit = REFIT_SQUARES_RATIO * nearest_fit.cost
@@ -188,13 +220,10 @@ class HeldOutRuns:
             replace(fits[i].make_start(), initial_states=nearest_fit.initial_states)
             for i in far_indices
         ]
-        # These initial states are good over the first fraction of the runs already.
-        refits = self._fit_initial_states(
-            starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES[1:]
-        )
-        for i, fit in zip(far_indices, refits, strict=True):
-            fits[i] = _find_lowest_cost_fit([fits[i], fit])
-        return [self._predict_runs(fit) for fit in fits]
+        better_fits = list(fits)
+        for i, fit in zip(far_indices, self._fit_initial_states(starts, stages), strict=True):
+            better_fits[i] = _find_lowest_cost_fit([fits[i], fit])
+        return better_fits
 
     def _fit_initial_states(
         self, starts: Sequence[FitStart], stages: Sequence[tuple[float, int]]
@@ -229,7 +258,8 @@ class HeldOutRuns:
         For a robot this linearisation is computed once for all models, which is faster than
         differences. It is tested by a prediction: a simulation from the first guess should differ
         from that of the fit as the linearisation says. A chaotic motion leaves its range even if
-        the guess is off by no more than the noise.
+        the guess is off by no more than the noise. The result is False for a system, whose
+        derivatives are differences, and for a failed fit.
         """
         evaluator = self.evaluator
         if not evaluator.has_linearisation or not np.isfinite(fit.cost):
@@ -258,18 +288,23 @@ class HeldOutRuns:
         """Continue the fits with derivatives at the nearest of them.
 
         If that reduces the nearest sum of squares enough, the fits are repeated from the starts
-        with derivatives that are computed again before each stage.
+        with derivatives that are computed again before each stage. The best fit of each model is
+        returned.
+
+        Args:
+            starts: model, parameters and first initial states of each fit.
+            fits: fit of each model.
         """
-        continued_fits = _select_nearer_fits(
-            fits, self._continue_about_best(fits, HORIZON_STAGES[-1:])
+        first_stage, *later_stages = HORIZON_STAGES
+        whole_runs = HORIZON_STAGES[-1]
+        continued_fits = _select_nearer_fits(fits, self._continue_about_best(fits, [whole_runs]))
+        lowest_cost, continued_cost = (
+            _find_lowest_cost_fit(some_fits).cost for some_fits in (fits, continued_fits)
         )
-        if (
-            _find_lowest_cost_fit(fits).cost - _find_lowest_cost_fit(continued_fits).cost
-            < MIN_SQUARES_DECREASE
-        ):
+        if lowest_cost - continued_cost < MIN_SQUARES_DECREASE:
             return continued_fits
-        staged_fits = self._fit_initial_states(starts, HORIZON_STAGES[:1])
-        for stage in (*HORIZON_STAGES[1:], HORIZON_STAGES[-1]):
+        staged_fits = self._fit_initial_states(starts, [first_stage])
+        for stage in (*later_stages, whole_runs):
             staged_fits = self._continue_about_best(staged_fits, [stage])
         return _select_nearer_fits(continued_fits, staged_fits)
 
@@ -277,6 +312,8 @@ class HeldOutRuns:
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
         """Continue the fits with derivatives by initial states about the best of them.
+
+        The derivatives are stored in the run evaluator, from which the fits take them.
 
         Args:
             fits: fit of each model.
@@ -311,35 +348,38 @@ class HeldOutRuns:
 def find_first_states(
     evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
 ) -> FitStart | None:
-    """Return a start with better first states of fitted runs; None without better ones.
+    """Return a start with better initial states of the fitted runs; None without better ones.
 
-    They are fitted to ever longer parts of the runs, as those of held-out runs, with the parameters
-    of the fit, and must reduce the sum of squares. A robot on the ground keeps its first states,
-    those with settled contacts.
+    A fit may have stopped in a local minimum of the initial states. So these are fitted again with
+    the parameters of the fit, to ever longer parts of the runs, like those of held-out runs. They
+    must reduce the sum of squares by at least `MIN_SQUARES_DECREASE`. A robot on the ground keeps
+    its initial states, those with settled contacts.
 
     Args:
         evaluator: the fitted runs.
         noise: noise that weights the channels.
         fit: fit of these runs.
     """
-    followed = evaluator.filtered_runs
-    if followed is not None and followed.is_on_ground:
+    filtered_runs = evaluator.filtered_runs
+    if filtered_runs is not None and filtered_runs.is_on_ground:
         return None
+    # The fit may replace these derivatives, which other fits of the runs use.
     derivatives_before = evaluator.state_derivatives
     runs = HeldOutRuns(evaluator, noise)
     (prediction,) = runs.fit_initial_states([fit.theta], is_staged=True)
-    squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
     evaluator.state_derivatives = derivatives_before
+    squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
+    # The comparison is negated because a failed prediction is NaN.
     if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
         return None
     return replace(fit.make_start(), initial_states=prediction.states)
 
 
 def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:
-    """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
+    """Compute the penalised log-likelihood of predictions (Bayesian information criterion).
 
-    It is M = 2 log L - f log n (1), with the likelihood L of n samples and f effective initial
-    states.
+    It is M = 2 log L - f log n (1), with the likelihood L of n samples, maximised by the parameters
+    of the noise, and f effective initial states.
 
     Shapes: R runs, T samples, C channels.
 
@@ -369,227 +409,3 @@ def _select_nearer_fits(
         other_fits: another fit of each model, in the same order.
     """
     return [_find_lowest_cost_fit(pair) for pair in zip(fits, other_fits, strict=True)]
-
-
-MAX_STEPS = 8
-"""Maximum number of Levenberg-Marquardt steps of a refit, which starts from the fit to all runs."""
-MIN_SUPPORTED_CHANGE = 1.0
-"""Minimum change of a fold's runs, as the norm over all samples in noise standard deviations, for
-an effect to be supported by these runs.
-"""
-
-
-class CrossValidation:
-    """Validation that predicts each run with models that are refitted to the other runs.
-
-    Args:
-        evaluator: Run evaluator of all runs; each run has the number of its fold.
-        noise: Noise that weights the channels.
-
-    Attributes:
-        evaluator: Run evaluator of all runs.
-        noise: Noise that weights the channels.
-        seen: (R, T, C) mask of the available samples.
-    """
-
-    is_cross_validation = True
-
-    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
-        self.evaluator = evaluator
-        self.noise = noise
-        self.seen: Mask = np.isfinite(evaluator.observed)
-
-    @property
-    def simulations(self) -> int:
-        """Number of simulations made for the folds alone."""
-        if "_run_folds" not in self.__dict__:
-            return 0
-        return sum(
-            fold.fitting.simulation_count + fold.left_out.simulation_count
-            for fold in self._run_folds
-        )
-
-    def close(self) -> None:
-        """Close the simulators of the folds; the run evaluator of all runs stays open."""
-        if "_run_folds" in self.__dict__:
-            for fold in self._run_folds:
-                fold.fitting.close()
-                fold.left_out.close()
-
-    def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
-        """Predict each run with every model, refitted to the other runs.
-
-        Only the initial states of the predicted run are estimated from it. An effect that the other
-        runs do not support is switched off for the prediction.
-
-        Args:
-            fits: models as fitted to all runs, from which the refits start.
-
-        Returns:
-            Predictions of all runs by each model.
-        """
-        shape = self.evaluator.observed.shape
-        simulated = np.full((len(fits), *shape), np.nan)
-        initial_states = np.stack([fit.initial_states for fit in fits])
-        free_state_counts = np.zeros(len(fits))
-        for number, fold in enumerate(self._run_folds):
-            self.evaluator.search_control.begin_stage(
-                f"cross-validation, fold {number + 1} of {len(self._run_folds)}"
-            )
-            thetas = self._refit_fold(fold, fits)
-            predictions = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
-            for model_index, prediction in enumerate(predictions):
-                simulated[model_index, fold.rows, : prediction.simulated.shape[1]] = (
-                    prediction.simulated
-                )
-                initial_states[model_index, fold.rows] = prediction.states
-                free_state_counts[model_index] += prediction.freedom
-        return [
-            self._predict_all_runs(*result)
-            for result in zip(simulated, initial_states, free_state_counts.tolist(), strict=True)
-        ]
-
-    def _predict_all_runs(
-        self, simulated: Array, states: Array, free_state_count: float
-    ) -> HeldOutFit:
-        """Return a model's prediction of all runs with its merit, the penalised log-likelihood.
-
-        A failed simulation has the merit -infinity, so that any other model is preferred.
-
-        Shapes: R runs, T samples, C channels.
-
-        Args:
-            simulated: (R, T, C) prediction of each run by the model refitted without it.
-            states: (R, s) initial states.
-            free_state_count: Effective number of fitted initial states, for the penalty.
-        """
-        if not np.isfinite(simulated[self.seen]).all():
-            return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = compute_penalised_likelihood(
-            self.evaluator.observed, simulated, free_state_count
-        )
-        return HeldOutFit(simulated, penalised_likelihood, states, free_state_count)
-
-    @cached_property
-    def _run_folds(self) -> list[_Fold]:
-        """The folds; each has run evaluators for its own runs, with the parameters of the whole.
-
-        Runs of one fold are left out together and predicted by a fit to all other runs.
-        """
-        fold_numbers = np.array([run.fold for run in self.evaluator.runs])
-        folds = []
-        for fold_number in sorted(set(fold_numbers.tolist())):
-            run_indices = np.flatnonzero(fold_numbers == fold_number)
-            fitted_run_indices = np.flatnonzero(fold_numbers != fold_number)
-            folds.append(
-                _Fold(
-                    run_indices,
-                    fitted_run_indices,
-                    self._make_evaluator(fitted_run_indices),
-                    self._make_evaluator(run_indices),
-                )
-            )
-        return folds
-
-    def _make_evaluator(self, rows: Indices) -> RunEvaluator:
-        """Make a run evaluator of some runs, which are the fitted or the left-out ones of a fold.
-
-        It takes over what was computed for all runs: the correction of the discretisation error,
-        and the derivatives by initial states.
-
-        Args:
-            rows: Indices of the runs.
-        """
-        evaluator = self.evaluator.with_runs([self.evaluator.runs[row] for row in rows])
-        length = evaluator.observed.shape[1]
-        if self.evaluator.discretisation_correction is not None:
-            evaluator.discretisation_correction = self.evaluator.discretisation_correction[
-                rows, :length
-            ]
-        if self.evaluator.state_derivatives is not None:
-            evaluator.state_derivatives = self.evaluator.state_derivatives[rows, :length]
-        # Workers that are started for one fold also know the other folds.
-        evaluator.worker_pool.register(evaluator)
-        return evaluator
-
-    def _refit_fold(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
-        """Refit each model to the runs of a fold that are not left out.
-
-        The refit starts from the fit to all runs, with its derivatives, so it needs few steps.
-
-        Shapes: P parameters.
-
-        Args:
-            fold: Fold whose left-out runs will be predicted.
-            fits: Models fitted to all runs, from which the refits start.
-
-        Returns:
-            Parameters (P,) of each model; an effect that these runs do not show is switched off.
-        """
-        base = set(self.evaluator.base_indices.tolist())
-        # All models of a search keep the same parameters fixed at their nominal values.
-        fixed_parameters = frozenset(base - set(fits[0].free_indices.tolist()))
-        length = fold.fitting.observed.shape[1]
-        starts = []
-        for fit in fits:
-            jacobian = fit.parameter_jacobian[fold.fitted_rows, :length]
-            known_jacobian = KnownJacobian(fit.free_indices, jacobian)
-            starts.append(
-                FitStart(
-                    fit.effects, fit.theta, fit.initial_states[fold.fitted_rows], known_jacobian
-                )
-            )
-        refits = TrajectoryFitter(fold.fitting, self.noise, fixed_parameters).fit_models(
-            starts, MAX_STEPS
-        )
-        return self._remove_unsupported(fold.fitting, refits)
-
-    def _remove_unsupported(
-        self, evaluator: RunEvaluator, fits: Sequence[TrajectoryFit]
-    ) -> list[Array]:
-        """Return parameters (P,) of each model; effects that the runs do not show are off.
-
-        An effect is not shown if switching it off changes the simulated samples by less than
-        `MIN_SUPPORTED_CHANGE`, in units of the noise. Its coefficients are then arbitrary and would
-        spoil the prediction.
-
-        Shapes: P parameters.
-
-        Args:
-            evaluator: run evaluator of the runs to which models are fitted.
-            fits: fits of all models to these runs.
-        """
-        thetas = [fit.theta.copy() for fit in fits]
-        removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
-        if not removals:
-            return thetas
-        thetas_without = np.stack([fits[i].theta for i, _ in removals])
-        for theta_without, (_, name) in zip(thetas_without, removals, strict=True):
-            theta_without[evaluator.get_coefficient_indices(name)] = 0.0
-        simulated_without = evaluator.simulate_all_runs(
-            thetas_without, np.stack([fits[i].initial_states for i, _ in removals])
-        )
-        observed_mask = np.isfinite(evaluator.observed)
-        for (i, name), simulated in zip(removals, simulated_without, strict=True):
-            change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]
-            # If the simulation fails without the effect, the change is NaN and the effect is kept.
-            if np.linalg.norm(change) < MIN_SUPPORTED_CHANGE:
-                thetas[i][evaluator.get_coefficient_indices(name)] = 0.0
-        return thetas
-
-
-@dataclass(frozen=True)
-class _Fold:
-    """Fold: the runs that are left out of the fits and predicted, and the runs that are fitted.
-
-    Attributes:
-        rows: Indices of the runs that are left out.
-        fitted_rows: Indices of the runs that are fitted.
-        fitting: Run evaluator of the fitted runs.
-        left_out: Run evaluator of the runs that are left out.
-    """
-
-    rows: Indices
-    fitted_rows: Indices
-    fitting: RunEvaluator
-    left_out: RunEvaluator

@@ -41,17 +41,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import atan, cos, erfc, pi, sin, sqrt
+from math import erfc, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from bench.benchmark.statistics.chi_squared import chi_squared_tail
+from bench.benchmark.statistics.student_t import student_p_value
 from bench.diagnosis.evaluation.noise_model import whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
-from bench.diagnosis.validation.gain_and_intervals import (
+from bench.diagnosis.validation.confidence_intervals import (
     Z95,
     compute_fisher_blocks,
     invert_scaled,
@@ -132,8 +133,10 @@ def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariat
         sizes = [compute_rms(run.inputs[name]) for run in evaluator.runs]
         yield RunCovariate("command", f"the size of {name}", np.array(sizes))
     for name in evaluator.runs[0].extra:
-        columns = [run.extra.get(name, np.empty(0)) for run in evaluator.runs]
-        means = [float(np.nanmean(v)) if np.isfinite(v).any() else np.nan for v in columns]
+        signals = [run.extra.get(name, np.empty(0)) for run in evaluator.runs]
+        means = [
+            float(np.nanmean(signal)) if np.isfinite(signal).any() else np.nan for signal in signals
+        ]
         yield RunCovariate("other", name, np.array(means))
 
 
@@ -144,7 +147,8 @@ def _compute_motion_covariates(
 
     A covariate is a quantity that may explain why a parameter differs between runs. They are the
     amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1), and the mean
-    position. Nothing is yielded if the position is not recorded.
+    position. A parameter that does not belong to a joint has those of the primary coordinate.
+    Nothing is yielded if the position is not recorded.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -154,34 +158,26 @@ def _compute_motion_covariates(
     system = evaluator.simulator.system
     if not system.coordinates:
         return
-    joint_coordinate = f"q.{number.partition('@')[2]}"
-    name = (
-        joint_coordinate
-        if joint_coordinate in system.coordinates
-        else system.coordinates[system.primary]
-    )
-    if name not in evaluator.channels:
+    _, _, joint = number.partition("@")
+    coordinate = f"q.{joint}"
+    if coordinate not in system.coordinates:
+        coordinate = system.coordinates[system.primary]
+    if coordinate not in evaluator.channels:
         return
-    column = evaluator.channels.index(name)
-    run_covariates = []
+    channel_index = evaluator.channels.index(coordinate)
+    amplitudes, speeds, directions, mean_positions = [], [], [], []
     for run_data, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
         times = run_data.scenario.times
-        positions = simulated[: times.size, column]
+        positions = simulated[: times.size, channel_index]
         velocities = np.gradient(positions, times)
-        mean_direction = float(velocities.sum() / max(np.abs(velocities).sum(), 1e-300))
-        run_covariates.append(
-            (
-                float(positions.std()),
-                compute_rms(velocities),
-                mean_direction,
-                positions.mean(),
-            )
-        )
-    amplitude, speed, direction, position = np.array(run_covariates).T
-    yield RunCovariate("amplitude", "the amplitude", amplitude)
-    yield RunCovariate("speed", "the speed", speed)
-    yield RunCovariate("direction", "the direction of motion", direction)
-    yield RunCovariate("position", "the position", position)
+        amplitudes.append(positions.std())
+        speeds.append(compute_rms(velocities))
+        directions.append(velocities.sum() / max(np.abs(velocities).sum(), 1e-300))
+        mean_positions.append(positions.mean())
+    yield RunCovariate("amplitude", "the amplitude", np.array(amplitudes))
+    yield RunCovariate("speed", "the speed", np.array(speeds))
+    yield RunCovariate("direction", "the direction of motion", np.array(directions))
+    yield RunCovariate("position", "the position", np.array(mean_positions))
 
 
 def _varies_between_runs(values: Array) -> bool:
@@ -337,24 +333,20 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
     if not groupings or not model.fit.free_indices.size:
         return ()
     curvatures, gradients = _compute_run_normal_equations(models, model)
-    consistencies = [
+    tested = [
         (grouping, consistency)
         for grouping in groupings
         for consistency in _test_parameters(evaluator, model, grouping, curvatures, gradients)
     ]
-    level = SIGNIFICANCE_LEVEL / max(len(consistencies), 1)
-    assessed = [
-        (grouping, _assess_parameter(consistency, level)) for grouping, consistency in consistencies
-    ]
-    return tuple(
-        consistency
-        if consistency.is_consistent
-        else replace(
-            consistency,
-            trend_covariate=_find_trend_covariate(evaluator, model, grouping, consistency),
-        )
-        for grouping, consistency in assessed
-    )
+    level = SIGNIFICANCE_LEVEL / max(len(tested), 1)
+    assessed = []
+    for grouping, consistency in tested:
+        consistency = _assess_parameter(consistency, level)
+        if not consistency.is_consistent:
+            covariate = _find_trend_covariate(evaluator, model, grouping, consistency)
+            consistency = replace(consistency, trend_covariate=covariate)
+        assessed.append(consistency)
+    return tuple(assessed)
 
 
 def _find_trend_covariate(
@@ -365,9 +357,12 @@ def _find_trend_covariate(
 ) -> TrendCovariate | None:
     """Find the covariate, such as load or temperature, with which a parameter changes.
 
-    Groups by a constant have this constant as their covariate. For runs and logs, a line is fitted
-    for every covariate; the one with a significant trend and the smallest scatter about the line is
-    returned, with others that fit about as well. Return None if no trend is significant.
+    1. Groups by a constant have this constant as their covariate.
+    2. For runs and logs, a line is fitted for every covariate, if there are enough groups. Of those
+       with a significant trend, the one with the smallest scatter about the line is returned, with
+       others that fit about as well.
+
+    Return None if no trend is significant.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -375,45 +370,48 @@ def _find_trend_covariate(
         grouping: the groups of runs, such as logs.
         consistency: estimates of the parameter from each group.
     """
-    # Groups by a constant.
+    # 1. Groups by a constant.
     if grouping.by not in ("run", "log"):
-        if consistency.trend is None or consistency.trend.p_value >= SIGNIFICANCE_LEVEL:
+        trend = consistency.trend
+        if trend is None or trend.p_value >= SIGNIFICANCE_LEVEL:
             return None
-        return TrendCovariate(
-            classify_constant(evaluator, grouping.by), grouping.by, consistency.trend
-        )
+        return TrendCovariate(classify_constant(evaluator, grouping.by), grouping.by, trend)
+    # 2. Runs or logs.
+    estimates = consistency.group_estimates
+    if len(estimates) < MIN_GROUPS_FOR_TREND:
+        return None
     runs_by_group = {
         name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)
     }
-    trends = []
+    trends: list[tuple[RunCovariate, Trend]] = []
     for covariate in compute_run_covariates(evaluator, model, consistency.number):
-        values = np.array(
-            [
-                covariate.values[runs_by_group[part.group]].mean()
-                for part in consistency.group_estimates
-            ]
-        )
-        trend = (
-            _fit_trend(consistency.group_estimates, values)
-            if len(consistency.group_estimates) >= MIN_GROUPS_FOR_TREND
-            else None
-        )
+        values = [covariate.values[runs_by_group[part.group]].mean() for part in estimates]
+        trend = _fit_trend(estimates, np.array(values))
         if trend is not None:
-            # The mean square about the line is at least that of the errors, 1.
-            trends.append((max(trend.mean_square, 1.0), covariate, trend))
+            trends.append((covariate, trend))
+    # The level is corrected for the number of covariates.
     significant_trends = [
-        entry for entry in trends if entry[2].p_value < SIGNIFICANCE_LEVEL / len(trends)
+        (covariate, trend)
+        for covariate, trend in trends
+        if trend.p_value < SIGNIFICANCE_LEVEL / len(trends)
     ]
     if not significant_trends:
         return None
-    lowest_scatter, best, trend = min(significant_trends, key=lambda entry: entry[0])
+
+    def get_scatter(candidate: tuple[RunCovariate, Trend]) -> float:
+        _, trend = candidate
+        # The mean square about the line is at least that of the errors, 1.
+        return max(trend.mean_square, 1.0)
+
+    best = min(significant_trends, key=get_scatter)
+    covariate, trend = best
     # A covariate that fits about as well cannot be distinguished from the best one.
     similar_covariates = [
-        covariate.name
-        for residual_scatter, covariate, _ in significant_trends
-        if covariate is not best and residual_scatter < COVARIATE_TIE_FACTOR * lowest_scatter
+        other[0].name
+        for other in significant_trends
+        if other is not best and get_scatter(other) < COVARIATE_TIE_FACTOR * get_scatter(best)
     ]
-    return TrendCovariate(best.kind, best.name, trend, tuple(similar_covariates))
+    return TrendCovariate(covariate.kind, covariate.name, trend, tuple(similar_covariates))
 
 
 def _assess_parameter(consistency: ParameterConsistency, level: float) -> ParameterConsistency:
@@ -426,33 +424,30 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
     """Yield the ways to group the runs: by log, by each differing constant, by single run.
 
     Each grouping has the labels of its groups, the indices of the runs in each, and, where they
-    have an order, the values by which a trend can be tested.
+    have an order, the values by which a trend can be tested. A grouping has at least two groups.
     """
+    # Logs, in their order.
     logs = tuple(dict.fromkeys(run.log for run in runs))
     if len(logs) > 1:
         run_indices = tuple(
             tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs
         )
         yield _RunGrouping("log", logs, run_indices, tuple(map(float, range(len(logs)))))
+    # Runs with an equal value of a constant, such as a load, form a group.
     for name in dict.fromkeys(name for run in runs for name in run.constants):
         values = [run.constants.get(name, np.nan) for run in runs]
-        unique_values = sorted(set(values))
-        if len(unique_values) > 1 and np.isfinite(unique_values).all():
+        group_values = tuple(sorted(set(values)))
+        if len(group_values) > 1 and np.isfinite(group_values).all():
+            labels = tuple(f"{group_value:g}" for group_value in group_values)
             run_indices = tuple(
-                tuple(i for i, v in enumerate(values) if v == unique_value)
-                for unique_value in unique_values
+                tuple(i for i, value in enumerate(values) if value == group_value)
+                for group_value in group_values
             )
-            # Runs with an equal value of the constant, such as a load, form a group.
-            yield _RunGrouping(
-                name,
-                tuple(f"{unique_value:g}" for unique_value in unique_values),
-                run_indices,
-                tuple(unique_values),
-            )
+            yield _RunGrouping(name, labels, run_indices, group_values)
+    # Single runs.
     if len(runs) > 1:
-        yield _RunGrouping(
-            "run", tuple(run.name for run in runs), tuple((i,) for i in range(len(runs)))
-        )
+        run_indices = tuple((i,) for i in range(len(runs)))
+        yield _RunGrouping("run", tuple(run.name for run in runs), run_indices)
 
 
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
@@ -460,8 +455,12 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
 
     They show by how much each run alone would change the joint fit, without fitting it again. They
     are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the run
-    are eliminated: eq. (1) of the module docstring, where the derivatives of the parameters, A, and
-    of the initial states, B, are defined.
+    are eliminated (1):
+
+        H = A'A - A'B S^-1 B'A,    g = A'e - A'B S^-1 (B'e + prior),    S = B'B + diag sigma_0^-2
+
+    with the whitened derivatives A by parameters and B by initial states, the whitened residual e,
+    and the prior standard deviation sigma_0 of the initial states.
 
     Shapes: R runs.
 
@@ -473,24 +472,23 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     q = fit.free_indices.size
     fisher_blocks = compute_fisher_blocks(models, model)
     residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
-    gradients_by_unknown = np.einsum(
+    all_gradients = np.einsum(
         "rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1)
     )
-    gradients_by_unknown[:, q:] += compute_state_prior(evaluator) ** -2.0 * (
+    parameter_gradients, state_gradients = all_gradients[:, :q], all_gradients[:, q:]
+    state_gradients += compute_state_prior(evaluator) ** -2.0 * (
         evaluator.initial_state_guesses - fit.initial_states
     )
-    gradients_by_unknown[:, q:] *= ~evaluator.known_state_mask
+    # A known initial state is not fitted.
+    state_gradients *= ~evaluator.known_state_mask
+    # One solution for S^-1 B'A and S^-1 (B'e + prior), which is the last column.
     right_hand_sides = np.concatenate(
-        [fisher_blocks.cross.transpose(0, 2, 1), gradients_by_unknown[:, q:, None]], 2
+        [fisher_blocks.cross.transpose(0, 2, 1), state_gradients[..., None]], axis=2
     )
-    state_solutions = np.linalg.solve(fisher_blocks.states, right_hand_sides)
-    curvatures = fisher_blocks.parameters - np.matmul(
-        fisher_blocks.cross, state_solutions[..., :-1]
-    )
-    gradients = (
-        gradients_by_unknown[:, :q]
-        - np.matmul(fisher_blocks.cross, state_solutions[..., -1:])[..., 0]
-    )  # (1)
+    solutions = np.linalg.solve(fisher_blocks.states, right_hand_sides)
+    cross = fisher_blocks.cross
+    curvatures = fisher_blocks.parameters - np.matmul(cross, solutions[..., :-1])
+    gradients = parameter_gradients - np.matmul(cross, solutions[..., -1:])[..., 0]  # (1)
     return curvatures, gradients
 
 
@@ -503,11 +501,10 @@ def _test_parameters(
 ) -> Iterator[ParameterConsistency]:
     """Test for each parameter whether the groups of runs agree on it.
 
-    Each group G alone would change the joint fit by the Gauss-Newton step d_G of eq. (2). A group
-    whose interval is too wide is left out, and a parameter needs at least two groups.
-
-    The step of group G is d_G = H_G^-1 g_G with covariance H_G^-1, where H_G and g_G are sums over
-    its runs (2).
+    Each group G alone would change the joint fit by the Gauss-Newton step d_G = H_G^-1 g_G, with
+    the covariance H_G^-1, where H_G and g_G are sums over its runs (2). A group whose interval is
+    too wide is left out, and a parameter needs at least two groups. The results are not yet marked
+    as inconsistent, because the significance level depends on the number of all tests.
 
     Shapes: R runs, q fitted parameters.
 
@@ -518,41 +515,41 @@ def _test_parameters(
         curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
         gradients: (R, q) g_r of eq. (1).
     """
-    joint_covariance = _invert(curvatures)
-    steps, group_errors = [], []
+    joint_errors = _compute_errors(_invert(curvatures))
+    steps, errors = [], []
     for runs in grouping.runs:
         group_covariance = _invert(curvatures[list(runs)])
-        steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
-        group_errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
+        steps.append((group_covariance @ gradients[list(runs)].sum(axis=0)).tolist())  # (2)
+        errors.append(_compute_errors(group_covariance))
+    # Without an order of the groups, there is no trend.
+    covariate_of_group = grouping.numbers or (0.0,) * len(grouping.names)
     for column, index in enumerate(model.fit.free_indices.tolist()):
         parameter, value = evaluator.parameters[index], float(model.fit.theta[index])
         low, high = parameter.bounds
         size = max(high - low, abs(value))
         group_estimates, covariate_values = [], []
-        for group, name in enumerate(grouping.names):
-            error = float(group_errors[group][column])
+        for name, group_steps, group_errors, covariate_value in zip(
+            grouping.names, steps, errors, covariate_of_group, strict=True
+        ):
+            error = group_errors[column]
             if error > 0 and 2.0 * Z95 * error < MAX_INTERVAL_WIDTH * size:
-                group_estimates.append(
-                    GroupEstimate(name, value + float(steps[group][column]), error)
-                )
-                covariate_values.append(grouping.numbers[group] if grouping.numbers else 0.0)
+                group_estimates.append(GroupEstimate(name, value + group_steps[column], error))
+                covariate_values.append(covariate_value)
         if len(group_estimates) < 2:
             continue
-        error = float(np.sqrt(max(joint_covariance[column, column], 0.0)))
         scatter, p_value = _estimate_heterogeneity(group_estimates)
-        trend = (
-            _fit_trend(group_estimates, np.array(covariate_values)) if grouping.numbers else None
-        )
+        trend = None
+        if grouping.numbers:
+            trend = _fit_trend(group_estimates, np.array(covariate_values))
         yield ParameterConsistency(
             number=parameter.name,
             unit=parameter.unit,
             by=grouping.by,
             value=value,
-            error=error,
+            error=joint_errors[column],
             group_estimates=tuple(group_estimates),
             scatter=scatter,
             p_value=p_value,
-            # The level depends on the number of all tests, so the caller decides.
             is_consistent=True,
             trend=trend,
         )
@@ -564,6 +561,12 @@ def _invert(curvatures: Array) -> Array:
     return invert_scaled(curvature, curvature)
 
 
+def _compute_errors(covariance: Array) -> list[float]:
+    """Return the standard errors of the parameters; rounding may make a variance negative."""
+    errors: list[float] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).tolist()
+    return errors
+
+
 def _weigh(group_estimates: Sequence[GroupEstimate]) -> tuple[Array, Array]:
     """Return the values of the groups, and their weights: the squares of the inverse errors."""
     values = np.array([part.value for part in group_estimates])
@@ -571,15 +574,20 @@ def _weigh(group_estimates: Sequence[GroupEstimate]) -> tuple[Array, Array]:
 
 
 def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[float, float]:
-    """Estimate by how much groups differ beyond their errors: tau of eq. (4), and the p-value.
+    """Estimate by how much groups differ beyond their errors, and the p-value of no difference.
 
-    The method is that of DerSimonian and Laird, with Cochran's Q.
+    For n groups with the estimates x and the weights w = 1 / var, Cochran's Q is compared with a
+    chi-squared distribution with n - 1 degrees of freedom, and tau is the standard deviation
+    between groups (DerSimonian and Laird):
 
-    Q = sum w (x - mean)^2 with w = 1 / var (3), and tau^2 = (Q - (n - 1)) / (sum w - sum w^2 / sum
-    w) for n groups (4).
+        Q = sum w (x - mean)^2                                          (3)
+        tau^2 = max(Q - (n - 1), 0) / (sum w - sum w^2 / sum w)         (4)
 
     Args:
         group_estimates: Estimate and standard error of each group.
+
+    Returns:
+        tau and the p-value.
     """
     values, weights = _weigh(group_estimates)
     weighted_mean = float(weights @ values / weights.sum())
@@ -595,8 +603,10 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
 
     Return None for fewer than three groups, or if the covariate is the same in all.
 
-    The error of the slope is multiplied by the square root of the reduced chi-squared, if this is
-    above 1 (Birge ratio).
+    - If the scatter about the line agrees with the errors of the groups, these are taken as known,
+      and the p-value of the slope is that of a normal distribution.
+    - If it is larger, the error of the slope is multiplied by the square root of the reduced
+      chi-squared (Birge ratio). It is then estimated, so the p-value is that of Student's t.
 
     Args:
         group_estimates: Estimate and standard error of each group.
@@ -612,36 +622,9 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     degrees_of_freedom = len(group_estimates) - 2
     mean_square = float(weights @ residual**2) / degrees_of_freedom
     error = float(np.sqrt(max(mean_square, 1.0) / spread))
-    # If the scatter agrees with the errors, these are known; otherwise they are estimated.
-    t_statistic = abs(slope) / error
-    return Trend(
-        slope,
-        error,
-        erfc(t_statistic / sqrt(2.0))
-        if mean_square <= 1.0
-        else _compute_student_p_value(t_statistic, degrees_of_freedom),
-        mean_square,
-    )
-
-
-def _compute_student_p_value(size: float, freedom: int) -> float:
-    """Return the two-sided p-value of Student's t distribution, to an absolute error of 1e-15.
-
-    The finite series for whole degrees of freedom is used (M. Abramowitz, I. A. Stegun, Handbook of
-    Mathematical Functions, 1964, equations 26.7.3 and 26.7.4), because importing scipy.special
-    takes 0.1 s.
-
-    Args:
-        size: absolute value of the statistic t.
-        freedom: degrees of freedom.
-    """
-    angle = atan(size / sqrt(freedom))
-    is_odd = freedom % 2
-    term = sin(angle) * (cos(angle) if is_odd else 1.0)
-    inside = 0.0
-    for power in range(1 + is_odd, freedom, 2):
-        inside += term
-        term *= cos(angle) ** 2 * power / (power + 1.0)
-    if is_odd:
-        inside = 2.0 / pi * (angle + inside)
-    return max(1.0 - inside, 0.0)
+    statistic = abs(slope) / error
+    if mean_square <= 1.0:
+        p_value = erfc(statistic / sqrt(2.0))
+    else:
+        p_value = student_p_value(statistic, degrees_of_freedom)
+    return Trend(slope, error, p_value, mean_square)

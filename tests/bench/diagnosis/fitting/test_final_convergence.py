@@ -8,7 +8,7 @@ import pytest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.gain_and_intervals import compute_intervals
+from bench.diagnosis.validation.confidence_intervals import compute_intervals
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,

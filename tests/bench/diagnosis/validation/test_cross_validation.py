@@ -13,7 +13,8 @@ from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.report.summary_text import format_summary
-from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns
+from bench.diagnosis.validation.cross_validation import CrossValidation
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.recording_joining import load_joined
 from sims.core.simulator import Scenario
 from sims.recording.recording import split_held_out

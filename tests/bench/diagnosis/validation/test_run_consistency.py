@@ -5,7 +5,6 @@ import csv
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.special import stdtr
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis.report.consistency_section import (
@@ -13,7 +12,6 @@ from bench.diagnosis.report.consistency_section import (
     format_consistency,
     name_missing_physics,
 )
-from bench.diagnosis.validation.run_consistency import _compute_student_p_value
 from bench.logs.recording_joining import load_joined
 from sims import effects
 from sims.core.simulator import InputError
@@ -236,10 +234,3 @@ def test_effects_that_may_be_missing_are_in_the_library():
     there = {*effects.list_effects_for(Pendulum.system), *effects.list_effects_for(Ball.system)}
     assert named <= there
     assert len(named) >= 9
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 9, 30])
-@pytest.mark.parametrize("size", [0.0, 0.3, 1.0, 2.5, 8.0])
-def test_the_p_value_of_students_distribution_is_that_of_scipy(size, freedom):
-    expected = 2.0 * stdtr(freedom, -size)
-    assert _compute_student_p_value(size, freedom) == pytest.approx(expected, rel=1e-9, abs=1e-15)

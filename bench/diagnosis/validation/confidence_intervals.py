@@ -1,21 +1,17 @@
-"""Gain of an extended model on held-out runs, and confidence intervals of fitted parameters.
-
-The share of the gap closed is, for the RMS errors b before and a after and the noise floor n,
-
-    closed = (b - max(a, n)) / (b - n)                                                         (1)
+"""Covariance and confidence intervals of fitted parameters.
 
 The covariance of the fitted parameters is the inverse of the curvature of the sum of squares after
 the initial states of every run r are eliminated (W. H. Greene, Econometric Analysis, chapter 9;
 generalised least squares). With the whitened Jacobian J_r = [A_r B_r] by parameters and initial
 states, and the prior standard deviation sigma_0 of the initial states,
 
-    covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (2)
+    covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (1)
 
 Simulated contacts jump, so that the sum of squares of a run has several minima, and the estimates
 of single runs scatter more than noise explains. With the gradient g_r of run r and the covariance C
-of (2), the scatter of R runs gives the variances
+of (1), the scatter of R runs gives the variances
 
-    diag(C sum_r g_r g_r' C) R / (R - 1)                                                       (3)
+    diag(C sum_r g_r g_r' C) R / (R - 1)                                                       (2)
     g_r = A_r' e_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' e_r
 
 for whitened residuals e_r, which replace smaller ones of C (H. White, Econometrica 50, 1, 1982,
@@ -25,14 +21,11 @@ doi:10.1093/biomet/73.1.13).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
 from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
@@ -47,10 +40,6 @@ from sims.core.simulator import Array
 
 Z95 = 1.959964
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
-BOOTSTRAP_RESAMPLES = 2000
-"""Number of bootstrap samples."""
-SINGLE_RUN_SEGMENTS = 10
-"""Number of segments into which a run is divided for resampling if there are too few runs."""
 MAX_INTERVAL_WIDTH = 4.0
 """Maximum width of an interval, as a multiple of the parameter's range or value; a wider interval
 means that the data do not bound the parameter.
@@ -62,10 +51,6 @@ but division by it does not overflow.
 STATE_REGULARISATION = 1e-12
 """Ridge added to the curvature of each initial state, as a fraction of it, so that collinear
 initial states remain solvable.
-"""
-MIN_REPORTED_GAIN = -9.0
-"""Lower limit of the reported share of the gap closed; for a failed model the exact value has no
-meaning.
 """
 MIN_EIGENVALUE = 1e-12
 """Minimum eigenvalue of the scaled curvature; a direction with a smaller one is unidentified."""
@@ -91,7 +76,7 @@ def compute_central_jacobian(
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
-    # Derivatives by initial states from a linearisation are not one-sided differences.
+    # Derivatives by initial states from a linearisation are no differences, so they are kept.
     if evaluator.has_linearisation:
         steps = steps[:parameter_count]
     theta, states = _displace_both_sides(fit, steps, bounds)
@@ -102,21 +87,17 @@ def compute_central_jacobian(
     )
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
-    # Row j has changed parameter j, so the widths are on the diagonal.
+    # A parameter at a bound moves by less than its step. Row j has changed parameter j, so the
+    # actual widths are on the diagonal.
     lower, upper = theta[:, :parameter_count, fit.free_indices]
     parameter_widths = np.diagonal(upper - lower)
     widths = np.concatenate([parameter_widths, 2.0 * steps[parameter_count:]])
     jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
     # A simulation that failed on one side gives no slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    state_jacobian = (
-        fit.jacobian[..., parameter_count:]
-        if evaluator.has_linearisation
-        else jacobian[..., parameter_count:]
-    )
-    return replace(
-        fit, jacobian=np.concatenate([jacobian[..., :parameter_count], state_jacobian], axis=3)
-    )
+    if evaluator.has_linearisation:
+        jacobian = np.concatenate([jacobian, fit.jacobian[..., parameter_count:]], axis=3)
+    return replace(fit, jacobian=jacobian)
 
 
 def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
@@ -126,28 +107,26 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
         models: Models with the run evaluator, the noise and the cache.
         fit: Fit with a one-sided Jacobian.
     """
-    cached_entry = models.refined_jacobians.get(id(fit))
+    cached_fit, refined_fit = models.refined_jacobians.get(id(fit), (None, fit))
     # An id can be reused after an object is deleted, so the object itself is compared.
-    if cached_entry is None or cached_entry[0] is not fit:
-        cached_entry = models.refined_jacobians[id(fit)] = (
-            fit,
-            compute_central_jacobian(models.evaluator, fit, models.noise),
-        )
-    return cached_entry[1]
+    if cached_fit is not fit:
+        refined_fit = compute_central_jacobian(models.evaluator, fit, models.noise)
+        models.refined_jacobians[id(fit)] = fit, refined_fit
+    return refined_fit
 
 
 def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
     """Build the parameters (2, n, P) and initial states (2, n, R, s) of the central differences.
 
-    The first axis is the lower and the upper side. Row j has number j of the n parameters and
-    initial states moved by its step, and all others unchanged. A row is simulated to get one column
-    of the Jacobian.
+    The first axis is the lower and the upper side. Row j of the second axis has number j of the n
+    parameters and initial states moved by its step (the initial state in all runs), and all others
+    unchanged. A row is simulated to get one column of the Jacobian.
 
-    Shapes: R runs, P parameters.
+    Shapes: R runs, P parameters, s states of a run.
 
     Args:
         fit: the fit, with q free parameters.
-        steps: (n,) steps of the q parameters, then of the s initial states.
+        steps: (n,) steps of the q parameters, then of the s initial states if they are moved too.
         bounds: (q, 2) bounds of the parameters.
     """
     parameter_count = fit.free_indices.size
@@ -156,11 +135,10 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
         for j, index in enumerate(fit.free_indices):
-            displaced_value = fit.theta[index] + shifts[j]
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
-            theta[side, j, index] = np.clip(displaced_value, *bounds[j])
-        for j, shift in enumerate(shifts[parameter_count:]):
-            initial_states[side, parameter_count + j, :, j] += shift
+            theta[side, j, index] = np.clip(fit.theta[index] + shifts[j], *bounds[j])
+        for state_index, shift in enumerate(shifts[parameter_count:]):
+            initial_states[side, parameter_count + state_index, :, state_index] += shift
     return theta, initial_states
 
 
@@ -176,26 +154,23 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     values = fit.theta[fit.free_indices]
     bounds = [evaluator.parameters[i].bounds for i in fit.free_indices]
     # The shape is set explicitly because there may be no parameters.
-    table = np.array(bounds).reshape(-1, 2)
-    low, high = table.T
-    lowest = np.minimum(low, values)
-    highest = np.maximum(high, values)
-    return np.stack([lowest, highest], 1)
+    low, high = np.array(bounds).reshape(-1, 2).T
+    return np.stack([np.minimum(low, values), np.maximum(high, values)], axis=1)
 
 
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     """Compute the covariance (q, q) of the fitted parameters with AR(1) noise.
 
     It is the inverse of the curvature of the whitened sum of squares, from which the initial states
-    of each run are eliminated: eq. (2) of the module docstring.
+    of each run are eliminated:
 
-    It is (sum_r A_r'A_r - A_r'B_r (B_r'B_r + diag sigma_0^-2)^-1 B_r'A_r)^-1 (2), with the whitened
-    derivatives A_r of run r by parameters and B_r by its initial state, whose prior has the
-    standard deviation sigma_0.
+        (sum_r A_r'A_r - A_r'B_r (B_r'B_r + diag sigma_0^-2)^-1 B_r'A_r)^-1                     (1)
 
-    If simulated contacts jump, larger variances by the scatter of the runs (3) replace those of
-    (2). They are scaled so that the quantile of a normal distribution gives the interval by
-    Student's t.
+    with the whitened derivatives A_r of run r by parameters and B_r by its initial state, whose
+    prior has the standard deviation sigma_0. If simulated contacts jump, a variance of (1) that is
+    smaller than that by the scatter of the runs, eq. (2) of the module docstring, is replaced by
+    it. Correlations are kept. The latter is scaled so that the quantile of a normal distribution
+    gives the interval by Student's t.
 
     Shapes: q fitted parameters.
 
@@ -215,19 +190,26 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     # Only robots on the ground need this import, which takes long.
     from scipy.special import stdtrit
 
-    scores = _compute_run_scores(models, model, fisher_blocks)
-    count = len(scores)
-    scattered = np.square(scores @ covariance).sum(axis=0) * count / (count - 1)  # (3)
+    gradients = _compute_run_scores(models, model, fisher_blocks)
+    count = len(gradients)
+    scatter_variances = np.square(gradients @ covariance).sum(axis=0) * count / (count - 1)  # (2)
     # Few runs estimate their scatter poorly.
-    scattered *= np.square(stdtrit(count - 1, 0.975) / Z95)
+    scatter_variances *= np.square(stdtrit(count - 1, 0.975) / Z95)
     variances = np.maximum(np.diagonal(covariance), np.finfo(float).tiny)
-    factors = np.sqrt(np.maximum(scattered / variances, 1.0))
+    factors = np.sqrt(np.maximum(scatter_variances / variances, 1.0))
     widened: Array = covariance * np.outer(factors, factors)
     return widened
 
 
 def _compute_run_scores(models: ModelSet, model: FittedModel, blocks: FisherBlocks) -> Array:
-    """Compute the gradients g_r of (3) by the q parameters, (R, q), one row for each run.
+    """Compute the gradient of the likelihood of each run by the q parameters, (R, q).
+
+    Its initial states are eliminated, with the whitened residual e_r of run r, its derivatives A_r
+    by parameters and B_r by initial states, and their prior: g_r of eq. (2), which is
+
+        A_r'e_r - A_r'B_r (B_r'B_r + diag sigma_0^-2)^-1 B_r'e_r
+
+    Shapes: R runs.
 
     Args:
         models: the models, with the runs to which they are fitted.
@@ -236,40 +218,41 @@ def _compute_run_scores(models: ModelSet, model: FittedModel, blocks: FisherBloc
     """
     residual = models.compute_residual(model.fit)[..., None]
     whitened = whiten(residual, models.observed_mask, blocks.noise).reshape(len(residual), -1, 1)
-    products = np.matmul(blocks.jacobian.transpose(0, 2, 1), whitened)
+    gradients = np.matmul(blocks.jacobian.transpose(0, 2, 1), whitened)
     q = blocks.parameters.shape[1]
-    by_states = np.linalg.solve(blocks.states, products[:, q:])
-    scores: Array = (products[:, :q] - blocks.cross @ by_states)[..., 0]
+    parameter_gradients, state_gradients = gradients[:, :q], gradients[:, q:]
+    state_steps = np.linalg.solve(blocks.states, state_gradients)
+    scores: Array = (parameter_gradients - blocks.cross @ state_steps)[..., 0]
     return scores
 
 
 def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     """Invert the curvature after elimination of the initial states, which gives the covariance.
 
-    Directions that the data do not identify get a huge variance. Parameters are scaled by their own
-    curvature before, so that the threshold for this does not depend on units.
+    Directions that the data do not identify get a huge variance instead of a division by zero: the
+    eigenvalues have the lower limit `MIN_EIGENVALUE`. Parameters are scaled by their own curvature
+    before, so that this limit does not depend on units.
 
     Shapes: q fitted parameters.
 
     Args:
-        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of eq. (2); it
+        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of eq. (1); it
             scales the inversion.
         schur_complement: (q, q) curvature after elimination of the initial states.
     """
-    # Parameters of any unit are scaled alike, so that the cut-off below means the same for each.
     diagonal = np.diagonal(parameter_curvature)
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
     unit_products = np.outer(scale, scale)
     scaled = schur_complement / unit_products
     values, vectors = np.linalg.eigh(scaled)
-    # An unidentified direction would look certain if its inverse were zero.
+    # A pseudo-inverse would give an unidentified direction no variance at all.
     inverse = (vectors / np.maximum(values, MIN_EIGENVALUE)) @ vectors.T
-    result: Array = inverse / unit_products  # (2)
+    result: Array = inverse / unit_products  # (1)
     return result
 
 
 class FisherBlocks(NamedTuple):
-    """Blocks of the covariance, eq. (2) of the module docstring, for each run.
+    """Blocks of the covariance, eq. (1) of the module docstring, for each run.
 
     Attributes:
         noise: Noise used for whitening: the residual of the model.
@@ -287,7 +270,7 @@ class FisherBlocks(NamedTuple):
 
 
 def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
-    """Compute the curvature blocks of a fitted model, run by run.
+    """Compute the curvature blocks of a fitted model, run by run, with central differences.
 
     Args:
         models: Models with the run evaluator.
@@ -305,7 +288,7 @@ def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
 def compute_fisher_blocks_from_jacobian(
     evaluator: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
 ) -> FisherBlocks:
-    """Compute the curvature blocks of eq. (2) of the module docstring from a Jacobian.
+    """Compute the curvature blocks of eq. (1) of the module docstring from a Jacobian.
 
     The derivatives are whitened, so that their products are information in units of the noise. The
     prior of the initial states is added to their block.
@@ -323,17 +306,16 @@ def compute_fisher_blocks_from_jacobian(
     runs, *_, size = jacobian.shape
     flat_jacobian = jacobian.reshape(runs, -1, size)
     normal = np.matmul(flat_jacobian.transpose(0, 2, 1), flat_jacobian)
+    parameter_block, cross, state_block = normal[:, :q, :q], normal[:, :q, q:], normal[:, q:, q:]
     precision = 1.0 / compute_state_prior(evaluator) ** 2
     # In an unstable motion the derivatives by all initial states may be collinear.
-    powers = np.einsum("rii->ri", normal[:, q:, q:])
+    powers = np.einsum("rii->ri", state_block)  # (R, s) diagonals
     ridge = STATE_REGULARISATION * powers[:, :, None] * np.eye(powers.shape[1])
     # A known initial state is not fitted, so it is not eliminated.
     state_block, cross = hold_known_states(
-        normal[:, q:, q:] + np.diag(precision) + ridge,
-        normal[:, :q, q:],
-        evaluator.known_state_mask,
+        state_block + np.diag(precision) + ridge, cross, evaluator.known_state_mask
     )
-    return FisherBlocks(noise, flat_jacobian, normal[:, :q, :q], cross, state_block)
+    return FisherBlocks(noise, flat_jacobian, parameter_block, cross, state_block)
 
 
 def compute_intervals(
@@ -341,8 +323,8 @@ def compute_intervals(
 ) -> dict[int, tuple[float, float, float]]:
     """Compute the 95 % interval of each fitted parameter from the covariance of the fit.
 
-    An interval that is wider than a share of the plausible range says nothing, and is replaced by
-    NaN.
+    An interval that is wider than a multiple of the plausible range says nothing, and its ends are
+    replaced by NaN.
 
     Args:
         models: Models with the run evaluator.
@@ -366,163 +348,5 @@ def compute_intervals(
             np.isfinite(standard_error) and 2.0 * Z95 * standard_error < MAX_INTERVAL_WIDTH * size
         )
         half_width = Z95 * standard_error if is_bounded else np.nan
-        intervals[index] = (
-            value,
-            value - half_width,
-            value + half_width,
-        )
+        intervals[index] = value, value - half_width, value + half_width
     return intervals
-
-
-@dataclass(frozen=True)
-class HeldOutGain:
-    """Held-out errors and the share of the gap closed.
-
-    Attributes:
-        base: RMS error of the base model, in the unit of the channels.
-        extended: RMS error of the extended model.
-        floor: RMS of the noise.
-        gap_closed: Share of the gap closed, eq. (1) of the module docstring.
-        low: Lower end of its 95 % interval; NaN if there is none.
-        high: Upper end of its 95 % interval; NaN if there is none.
-    """
-
-    base: float
-    extended: float
-    floor: float
-    gap_closed: float
-    low: float
-    high: float
-
-
-def compute_held_out_gain(
-    evaluator: RunEvaluator,
-    before: Array,
-    after: Array,
-    channels: Sequence[int],
-    floor: float,
-    rng: np.random.Generator,
-    resamples_segments: bool = False,
-) -> HeldOutGain:
-    """Compute the share of the gap closed, eq. (1), with a bootstrap interval over runs.
-
-    With a single run, or on request, segments of the runs are resampled (D. N. Politis, J. P.
-    Romano 1992).
-
-    For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: Run evaluator of the held-out runs.
-        before: (R, T, C) simulated by the base model.
-        after: (R, T, C) simulated by the extended model.
-        channels: Indices of the channels that count; they share a unit.
-        floor: RMS of the noise over these channels.
-        rng: Random generator of the resampling.
-        resamples_segments: Whether the bootstrap draws segments of the runs instead of whole runs;
-            two or three runs are too few to draw from.
-    """
-    sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
-    rms_before, rms_after = _compute_rms_errors(sums.sum(axis=0))
-    # Whole runs are drawn, because samples of one run depend on each other.
-    part_count = len(sums)
-    drawn_parts = rng.integers(part_count, size=(BOOTSTRAP_RESAMPLES, part_count))
-    resampled = sums[drawn_parts].sum(axis=1)
-    shares = compute_closed_share(*_compute_rms_errors(resampled), floor)
-    low = high = np.nan
-    # All resamples of a single part are equal, and would look certain.
-    if part_count > 1:
-        low, high = np.quantile(shares, INTERVAL_QUANTILES).tolist()
-    gap_closed = float(compute_closed_share(rms_before, rms_after, floor))
-    return HeldOutGain(float(rms_before), float(rms_after), floor, gap_closed, low, high)
-
-
-def _sum_squared_errors(
-    evaluator: RunEvaluator,
-    before: Array,
-    after: Array,
-    channels: Sequence[int],
-    resamples_segments: bool,
-) -> Array:
-    """Sum up the squared errors of two models over each run or segment, for the bootstrap.
-
-    The bootstrap draws rows and adds them, so that no error is computed again. Each row (n, 3) has
-    the sum of squares of the base model, that of the extended model, and the number of samples.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: the predicted runs.
-        before: (R, T, C) prediction of the base model.
-        after: (R, T, C) prediction of the extended model.
-        channels: indices of the channels that count.
-        resamples_segments: whether the rows are segments of runs, because there are too few runs to
-            resample.
-    """
-    part_sums = []
-    for run, part in _list_resampled_parts(evaluator, resamples_segments):
-        observed = evaluator.observed[run, part][:, channels]
-        observed_mask = np.isfinite(observed)
-        # A part without samples would be a row of zeros with an undefined error.
-        if not observed_mask.any():
-            continue
-        sums = []
-        for simulated in (before, after):
-            simulated_part = simulated[run, part][:, channels]
-            error = (observed - simulated_part)[observed_mask]
-            sums.append(float(error @ error))
-        sums.append(float(observed_mask.sum()))
-        part_sums.append(sums)
-    return np.array(part_sums)
-
-
-def _list_resampled_parts(
-    evaluator: RunEvaluator, resamples_segments: bool
-) -> list[tuple[int, slice]]:
-    """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
-
-    Whole runs are better, because neighbouring segments depend on each other.
-
-    Args:
-        evaluator: the predicted runs.
-        resamples_segments: whether the parts are segments even if there are several runs.
-
-    Returns:
-        Index of the run and slice of its samples, for each part.
-    """
-    count = len(evaluator.prepared_runs)
-    if count > 1 and not resamples_segments:
-        return [(run, slice(None)) for run in range(count)]
-    parts = []
-    for run, length in enumerate(evaluator.lengths.tolist()):
-        samples = np.linspace(0, length, SINGLE_RUN_SEGMENTS + 1).astype(int).tolist()
-        # A run of few samples has empty segments.
-        parts += [(run, slice(begin, end)) for begin, end in pairwise(samples) if end > begin]
-    return parts
-
-
-def _compute_rms_errors(sums: Array) -> tuple[Array, Array]:
-    """Compute RMS errors before and after from sums (..., 3) of squares, and numbers of samples."""
-    before, after, counts = np.moveaxis(sums, -1, 0)
-    return np.sqrt(before / counts), np.sqrt(after / counts)
-
-
-def compute_closed_share(base: Array | float, extended: Array | float, floor: float) -> Array:
-    """Compute the share of the gap closed, eq. (1), of any number of models; 0 without a gap.
-
-    For RMS errors b before and a after and the noise floor n, it is (b - max(a, n)) / (b - n) (1).
-
-    Args:
-        base: RMS errors before.
-        extended: RMS errors after.
-        floor: RMS of the noise.
-    """
-    gap = base - floor
-    # A model cannot reduce the error below the noise floor.
-    reached_error = np.maximum(extended, floor)
-    with np.errstate(all="ignore"):
-        share = (base - reached_error) / np.asarray(gap)  # (1)
-    # A gap below rounding errors would give an arbitrary share, and a resample may have no gap.
-    shares = np.where(gap > 1e-3 * floor, share, 0.0)
-    return np.clip(shares, MIN_REPORTED_GAIN, 1.0)
