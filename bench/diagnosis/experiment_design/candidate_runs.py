@@ -17,7 +17,7 @@ import numpy as np
 
 from bench.core.input_signals import evaluate_signal
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.experiment_design.safety_limits import (
+from bench.diagnosis.experiment_design.model_file_limits import (
     UNLIMITED,
     Interval,
     StatedLimits,

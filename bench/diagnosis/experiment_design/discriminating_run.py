@@ -7,8 +7,8 @@ models differ by
 
     apart(x) = sqrt(mean over t, c of ((y_model - y_other) / sigma_c)^2)                       (1)
 
-For a robot no run is proposed that exceeds a limit of the model file (`safety_limits`): commands
-and initial states are limited, and the motion is simulated with both models.
+For a robot no run is proposed that exceeds a limit of the model file (`model_file_limits`):
+commands and initial states are limited, and the motion is simulated with both models.
 """
 
 from __future__ import annotations

@@ -14,11 +14,8 @@ from bench.diagnosis.experiment_design.candidate_runs import (
     _compute_largest_factor,
     iterate_changed_runs,
 )
-from bench.diagnosis.experiment_design.safety_limits import (
-    UNLIMITED,
-    RigLimits,
-    read_model_file_limits,
-)
+from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, read_model_file_limits
+from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from tests.bench.diagnosis.simulated_logs import describe, write_log
