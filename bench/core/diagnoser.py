@@ -98,7 +98,7 @@ class Answer:
         Raises:
             InputError: it is not a valid answer.
         """
-        if isinstance(given, Answer):
+        if isinstance(given, Answer):  # a plugin may have filled it with invalid values
             return cls.of(given.document())
         if isinstance(given, str):
             given = {"verdict": given}
@@ -109,8 +109,9 @@ class Answer:
             raise InputError(f"verdict: expected one of {', '.join(VERDICTS)}, found {verdict!r}")
         causes = _check_list("causes", given.get("causes") or [], _MAX_CAUSES)
         parameters = _read_intervals("parameters", given.get("parameters") or {})
-        p = _convert_p_value(given.get("p_value"))
-        return cls(str(verdict), tuple(_convert_cause(cause) for cause in causes), parameters, p)
+        p_value = _convert_p_value(given.get("p_value"))
+        named_causes = tuple(_convert_cause(cause) for cause in causes)
+        return cls(str(verdict), named_causes, parameters, p_value)
 
     def document(self) -> dict[str, Any]:
         """Convert to a JSON document with the keys of verdict.json that a diagnoser provides."""
@@ -173,15 +174,16 @@ class DiagnosisCase:
             run: its times, inputs and initial states are used.
             parameters: parameters of the system by name; nominal values for the others.
             effects: coefficients by name of the effects that act.
-            initial: initial states; if neither this nor the run has one, the default of the system
-                is used.
+            initial: initial states by name. They replace those of the run, and these the defaults
+                of the system.
 
         Returns:
             Recorded channels (T,) by name.
         """
-        recorded = [c.name for c in self.kind.channels if c.name in run.channels]
-        fixed = {name: list(c) for name, c in (effects or {}).items()}
+        recorded = [channel.name for channel in self.kind.channels if channel.name in run.channels]
+        fixed = {name: list(coefficients) for name, coefficients in (effects or {}).items()}
         constants = {**self.recording.constants, **run.constants}
+        # A robot's simulator, for example, has its own engine; others use the batch engine.
         engine = None if self.kind.own_engine else "batch"
         simulator = self.kind(constants, recorded, engine=engine, fixed=fixed)
         values = parameters or {}
@@ -251,7 +253,9 @@ class Diagnoser(ABC):
 def list_observable_effects(
     kind: type[SystemSimulator], recording: Recording
 ) -> dict[str, type[Effect]]:
-    """Return the effects whose signals are recorded, by name.
+    """Return the effects of the library that a recording can show, by name.
+
+    An effect that changes one signal only, as the gain of a sensor, needs this channel or input.
 
     Args:
         kind: class of the simulator.
@@ -259,7 +263,11 @@ def list_observable_effects(
     """
     signals = {*recording.runs[0].channels, *(channel.name for channel in kind.inputs)}
     usable = effects_library.list_effects_for(kind.system)
-    return {n: e for n, e in usable.items() if not e.signal or e.signal in signals}
+    return {
+        name: effect
+        for name, effect in usable.items()
+        if not effect.signal or effect.signal in signals
+    }
 
 
 def list_named_sets(answer: Answer) -> list[tuple[str, ...]]:

@@ -121,7 +121,7 @@ def evaluate_case(
             "wanted": diagnoser.code.describe(),
             "table": recording_text.table,
             "description": recording_text.description,
-            "beside": recording_text.extra_files,
+            "beside": recording_text.extra_files,  # model file of a robot, in the same folder
             "system": case.system,
             "budget": limits.simulations,
             "seconds": limits.seconds,
@@ -170,8 +170,10 @@ def _ask_diagnoser(
         outcome = {"status": "skipped" if skipped else "done", "reason": skipped, **answer}
     except RunEndedError as ended:
         outcome = {"status": ended.status, "reason": _format_failure_reason(ended.reason)}
-    empty_answer = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
-    return {**row, **empty_answer, "seconds": perf_counter() - started_at, **outcome}
+    # An isolated answer has measured its time without the start of the process; it replaces this.
+    seconds = perf_counter() - started_at
+    empty_answer = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": seconds}
+    return {**row, **empty_answer, **outcome}
 
 
 def _format_failure_reason(text: str) -> str:

@@ -72,15 +72,16 @@ def draw_case(
     size: float | None = None,
     requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
-    """Draw a case; see `bench.diagnosis_benchmark.case_generation.case_sampling.draw_case`.
+    """Draw a case, a recording with known hidden causes, from the generator of its system.
 
     Args:
-        kind: one of `KINDS`.
+        kind: number and origin of the hidden causes: clean (none), single, double, or foreign (one
+            that no effect of the library describes).
         system: one of `ALL_SYSTEMS`.
         seed: seed of the case.
         effect: hidden effect; None to draw it.
         size: size in units of the noise; None to draw it.
-        requested: recording conditions that are not drawn.
+        requested: recording conditions that are given; those that are None are drawn.
 
     Returns:
         The case, or None if the hidden cause is not observable.
@@ -120,7 +121,7 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
 
     Args:
         system: name of the system, such as ``pendulum``.
-        name: name of the effect, with or without a place.
+        name: name of the effect, with or without a place, as ``friction.coulomb@elbow``.
     """
     effect = library.get_effect(name.partition("@")[0])
     if system == "arm2":
@@ -339,8 +340,7 @@ class CaseSpec(Document):
         Args:
             seed: seed of the public case set; unused with a secret salt.
             salt: secret salt, or `PUBLIC_SALT`. With a secret salt the seed is a part of the
-                SHA-256 hash
-                of salt and name, so that the case cannot be computed without the salt.
+                SHA-256 hash of salt and name, so that the case cannot be computed without the salt.
         """
         if salt in ("", PUBLIC_SALT):
             return _SEED_STRIDE * seed + 10 * self.index
@@ -373,6 +373,7 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
         return questions
     rng = make_rng("diagnosis", "sample", settings.seed)
     chosen_indices = rng.choice(len(questions), settings.sample, replace=False)
+    # Sorted, so that a sample keeps the order of the experiment.
     return [questions[i] for i in sorted(chosen_indices.tolist())]
 
 
@@ -404,7 +405,8 @@ def _list_hidden_effects(request: CaseRequest, system: str) -> list[str | None]:
     """List the effects that cases of one system hide; None stands for an effect that is drawn.
 
     Args:
-        request: kind and number of cases, and effects that are named.
+        request: kind and number of cases, and the effects that the experiment names; if it names
+            none, all that can be hidden in the system are listed.
         system: name of the system, such as ``pendulum``.
 
     Raises:

@@ -68,7 +68,11 @@ class DiagnoserReportData:
 
     @property
     def counts(self) -> dict[str, int | str]:
-        """Numbers of recordings behind the charts, for their captions."""
+        """Numbers of recordings behind the charts, for their captions.
+
+        ``power_counts`` is a text, as "40 of 1 noises, 40 of 3 noises": number of recordings with a
+        hidden effect of each size.
+        """
         table, power, calibration = (
             self.tables[name] for name in ("table", "power", "calibration")
         )
@@ -133,15 +137,20 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     """Build the tables of the charts that are not tables of the comparison.
 
     A chart of the page reads a table with one column per coordinate. Category axes need a column
-    ``place`` with the number of the category. The tables: diagnosed single causes with false alarms
-    (``board``, in per cent), all shares by metric, frequencies of p-values with the ideal line of
-    diagnoser "", answers by size of their sets, and diagnosed single causes with costs.
+    ``place`` with the number of the category.
 
     Args:
         data: graded answers and result tables of all diagnosers.
 
     Returns:
         Tables by name; those without data are empty.
+
+        * ``board``: share of named single causes with the false alarms, both in per cent.
+        * ``shares``: shares of all metrics, with the category of each metric.
+        * ``calibration``: share of clean recordings by the level of the p-value; the rows of
+          diagnoser "" are the ideal line, on which the share equals the level.
+        * ``sets``: answers by the size of their largest set, with the category of each size.
+        * ``cost``: share of named single causes with the costs of an answer.
     """
     table = data.tables["table"]
     alarms = table[table["metric"] == "false alarms"].set_index("diagnoser")["share"]
@@ -188,7 +197,10 @@ def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
 
 
 def _make_board(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against false alarms."""
+    """Make the leaderboard chart: share of named single causes against share of false alarms.
+
+    A line marks the largest acceptable share of false alarms.
+    """
     x_axis = Axis(
         "false alarms if nothing is hidden [%]",
         "symlog",
@@ -307,10 +319,12 @@ def find_leader(data: DiagnoserReportData) -> dict[str, Any] | None:
     false alarms cannot lead, because a diagnoser that always alarms finds every cause.
 
     Returns:
-        ``name`` of the best one; ``candidates``, the diagnosers with few false alarms; ``alarms``
-        and ``named`` causes, the rows of the best one. If it is simgap, ``similar`` are the
-        diagnosers that do not differ significantly from it, and ``p_value`` is the largest one.
-        None if there are no clean cases, in which false alarms could be counted.
+        * Without clean cases, in which false alarms could be counted: None.
+        * If no diagnoser has few false alarms: a dictionary whose ``candidates`` are empty.
+        * Otherwise ``name`` of the best one; ``candidates``, the diagnosers with few false alarms;
+          ``alarms`` and ``named``, the rows of the best one in table.csv for false alarms and named
+          causes. If the best one is simgap, ``similar`` are the candidates that do not differ
+          significantly from it, and ``p_value`` is the largest p-value of these comparisons.
     """
     alarms = index_by_diagnoser(data.tables["table"], "false alarms")
     named = index_by_diagnoser(data.tables["table"], PRIMARY_METRIC)
@@ -355,7 +369,8 @@ def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
     """
     groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
     return [
-        (str(n), str(reason), int(count)) for n, reason, count in groups.itertuples(index=False)
+        (str(diagnoser), str(reason), int(count))
+        for diagnoser, reason, count in groups.itertuples(index=False)
     ]
 
 

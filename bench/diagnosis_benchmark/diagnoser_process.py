@@ -89,8 +89,8 @@ def serve_requests(
                 return
             except BaseException:
                 error_text = traceback.format_exc().encode("utf-8", "replace")
-                # BaseException includes SystemExit: the diagnoser caused it. Of a long text, only
-                # the end is sent.
+                # BaseException includes SystemExit: the diagnoser caused it. Of a long traceback,
+                # only the end is sent: half of the limit for a text leaves room for its encoding.
                 channel.send(b"D", error_text[-MAX_TEXT_BYTES // 2 :])
 
 
@@ -145,20 +145,20 @@ def diagnose_case(
     path.with_suffix(".toml").write_text(question["description"], encoding="utf-8")
     for name, text in question.get("beside", {}).items():
         (folder / name).write_text(text, encoding="utf-8")
-    kind = get_simulator_class(path)
-    assert issubclass(kind, SystemSimulator)
-    if reason := diagnoser.cannot(kind):
+    simulator_class = get_simulator_class(path)
+    assert issubclass(simulator_class, SystemSimulator)
+    if reason := diagnoser.cannot(simulator_class):
         return {"answer": None, "simulations": 0, "processor_seconds": 0.0, "skipped": str(reason)}
-    recording = read_recording(path, kind)
+    recording = read_recording(path, simulator_class)
     case = DiagnosisCase(
         path,
         recording,
-        kind,
-        list_observable_effects(kind, recording),
-        np.random.default_rng(question["seed"]),
-        int(question["budget"]),
-        float(question["seconds"]),
-        learned,
+        simulator_class,
+        library=list_observable_effects(simulator_class, recording),
+        rng=np.random.default_rng(question["seed"]),
+        budget=int(question["budget"]),
+        seconds=float(question["seconds"]),
+        learned=learned,
     )
     SIMULATION_COUNTER.reset(case.budget)
     started_at = time.process_time()
@@ -184,17 +184,16 @@ def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], in
     Returns:
         The trained arrays by name, and the number of simulations used.
     """
-    kind = get_simulator(request["system"])
-    SIMULATION_COUNTER.reset(int(request["budget"]))
+    simulator_class = get_simulator(request["system"])
+    task = DiagnoserTrainingTask(
+        simulator_class,
+        library=effects.list_effects_for(simulator_class.system),
+        rng=np.random.default_rng(request["seed"]),
+        budget=int(request["budget"]),
+    )
+    SIMULATION_COUNTER.reset(task.budget)
     try:
-        arrays = load_diagnoser(request["wanted"]).train(
-            DiagnoserTrainingTask(
-                kind,
-                effects.list_effects_for(kind.system),
-                np.random.default_rng(request["seed"]),
-                int(request["budget"]),
-            )
-        )
+        arrays = load_diagnoser(request["wanted"]).train(task)
         return {name: np.asarray(array) for name, array in arrays.items()}, SIMULATION_COUNTER.used
     finally:
         SIMULATION_COUNTER.reset()

@@ -15,11 +15,7 @@ import pandas as pd
 
 from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.problem.experiment import Experiment
-from bench.diagnosis_benchmark.answer_store import (
-    SKIPPED_STATUS,
-    build_answer_rows,
-    read_answers,
-)
+from bench.diagnosis_benchmark.answer_store import read_answers
 from bench.diagnosis_benchmark.case_set import build_case_set, read_config
 from bench.diagnosis_benchmark.diagnoser_page import (
     DiagnoserReportData,
@@ -31,7 +27,9 @@ from bench.diagnosis_benchmark.diagnoser_page import (
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
 from bench.diagnosis_benchmark.result_tables import (
     PRIMARY_METRIC,
+    SKIPPED_STATUS,
     build_all_tables,
+    build_answer_rows,
     build_failure_table,
     index_by_diagnoser,
     is_correct,
@@ -114,10 +112,11 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
     # Width and height in inches, with the space for each diagnoser.
     figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
-    styles = {outcome: look for outcome, *look in OUTCOME_STYLES}
+    styles = {outcome: (colour, label) for outcome, colour, label in OUTCOME_STYLES}
     counts = pd.crosstab(rows["diagnoser"], rows["outcome"]).reindex(
         index=list(order), columns=list(styles), fill_value=0
     )
+    # Each diagnoser has answered all recordings, so the sums are equal; at least 1 for a division.
     total = max(int(counts.sum(axis=1).max()), 1)
     bar_starts = np.zeros(len(order))
     for outcome in counts.columns[counts.any()]:
@@ -176,7 +175,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     answer_labels += sorted(set(graded_rows["answer"]) - {*answer_labels, *_FAMILY_LABELS})
     answer_labels += [name for name in _FAMILY_LABELS if (graded_rows["answer"] == name).any()]
     column_count = min(_PANELS_PER_ROW, len(order))
-    row_count = -(-len(order) // column_count)
+    row_count = -(-len(order) // column_count)  # rounded up
     size = (
         # Width and height in inches, with the space for each label.
         1.6 + column_count * max(2.2, 0.16 * len(answer_labels)),
@@ -184,7 +183,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     )
     figure, axes = style.make_panel_grid(row_count, column_count, size, sharex=True, sharey=True)
     for panel_index, axis in enumerate(axes.flat):
-        if panel_index >= len(order):
+        if panel_index >= len(order):  # the last row of panels is not full
             axis.set_axis_off()
             continue
         diagnoser_rows = graded_rows[graded_rows["diagnoser"] == order[panel_index]]
@@ -239,11 +238,13 @@ def _list_answer_families(rows: pd.DataFrame) -> list[str]:
 def _get_answer_family(row: dict[Any, Any], is_right: bool) -> str:
     """Return the family that an answer names, or the label of an answer without a family.
 
-    An answer that is correct because its small set contains the cause counts as the hidden family,
-    otherwise the leading name counts.
+    The family is the part of an effect's name before the dot, as ``friction``. An answer that is
+    correct because its small set contains the cause counts as the hidden family, otherwise the
+    leading name counts.
 
     Args:
-        row: row of the answer.
+        row: row of the answer; its ``named`` has the causes separated by " + ", and the
+            alternatives of a cause separated by bars.
         is_right: whether the answer is correct.
     """
     if row["status"] != "done":
@@ -257,9 +258,10 @@ def _get_answer_family(row: dict[Any, Any], is_right: bool) -> str:
     named_effects = str(row["named"] or "")
     if not named_effects:
         return "unknown"
-    return (
-        "several" if " + " in named_effects else named_effects.partition("|")[0].partition(".")[0]
-    )
+    if " + " in named_effects:
+        return "several"
+    leading_name = named_effects.partition("|")[0]
+    return leading_name.partition(".")[0]
 
 
 def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
@@ -341,17 +343,18 @@ def write_report(
     for name, frame in {**tables, "failures": build_failure_table(rows, order)}.items():
         write_atomically(folder / f"{name}.csv", format_csv(frame))
     report_data = DiagnoserReportData(
-        experiment,
-        str(folder),
-        order,
-        rows,
-        tables,
-        training,
-        {},
-        skipped_diagnosers,
-        len(build_case_set(config)),
-        left_out,
+        experiment=experiment,
+        folder=str(folder),
+        order=order,
+        rows=rows,
+        tables=tables,
+        training=training,
+        pictures={},
+        skipped=skipped_diagnosers,
+        planned=len(build_case_set(config)),
+        left_out=left_out,
     )
+    # The figures are drawn from the data of the report, which then include them.
     report_data = replace(report_data, pictures=draw_figures(report_data))
     write_figures(folder, report_data.pictures)
     write_atomically(folder / REPORT_FILE, render_page(report_data))

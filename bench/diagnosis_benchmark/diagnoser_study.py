@@ -253,7 +253,7 @@ class _EvaluationRun:
         """Return the cases in a fixed random order, so that a partial result is a fair sample."""
         questions = self._study.cases
         order = make_rng("diagnosis", "order", len(questions)).permutation(len(questions))
-        return [questions[place] for place in order.tolist()]
+        return [questions[index] for index in order.tolist()]
 
     def _list_unanswered(self, question: CaseSpec) -> list[str]:
         """Return the names of the usable diagnosers that have not answered a case.
@@ -339,16 +339,15 @@ class _EvaluationRun:
             evaluated: diagnosers by name; each case is put only to those that have not answered it.
         """
         calls: list[Call] = []
-        for question in questions:
+        names_by_call = [self._list_unanswered(question) for question in questions]
+        for question, names in zip(questions, names_by_call, strict=True):
             answer = self._answer_store.answered.get(question.name)
-            diagnosers_to_run = [evaluated[name] for name in self._list_unanswered(question)]
-            known_case = answer["item"] if answer else None
             case_args = (
                 question.to_document(),
                 self._study.config.seed,
                 self._salt,
-                known_case,
-                diagnosers_to_run,
+                answer["item"] if answer else None,  # the case if it was already drawn
+                [evaluated[name] for name in names],
             )
             calls.append((evaluate_case, (*case_args, self._limits, self._hidden)))
         step = self._progress("asking", len(calls))
@@ -357,9 +356,7 @@ class _EvaluationRun:
         )
         for index, result in workers.iterate_results(calls, max_seconds):
             if isinstance(result, BaseException):
-                result = _make_failed_answers(
-                    questions[index], [answer.label for answer in calls[index][1][4]], result
-                )
+                result = _make_failed_answers(questions[index], names_by_call[index], result)
             self._answer_store.append(result)
             step()
 
@@ -410,7 +407,7 @@ def _check_code_isolated(experiment: Experiment) -> None:
         InputError: a diagnoser does not exist, or its code is already in this process.
     """
     if not experiment.trusted:
-        # Classes of a script could not be loaded with trust either.
+        # An isolated process imports a class by its module, which a class of a script lacks.
         check_classes_importable(experiment)
         announce_installed(list_compared_parts(experiment))
     for registry, name in list_compared_parts(experiment):

@@ -84,7 +84,7 @@ def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
         case.kind, case.effects, verdict, lambda effect: find_equivalent_effects(case, effect)
     )
     covered = (
-        _count_covered_intervals(case, verdict, sets)
+        _check_interval_coverage(case, verdict, sets)
         if outcome in ("right", "set") and case.kind != "foreign"
         else {}
     )
@@ -112,21 +112,21 @@ def grade_sets(
         Outcome, number of effects in the set that contains them, and their number with
         equivalent effects counted as one; see `Grade`.
     """
-    word, size, class_size = verdict["verdict"], 0, 0
+    verdict_name, size, class_size = verdict["verdict"], 0, 0
     if kind == "clean":
-        outcome = "right" if word == "adequate" else "alarm"
-    elif word == "adequate":
+        outcome = "right" if verdict_name == "adequate" else "alarm"
+    elif verdict_name == "adequate":
         outcome = "missed"
     elif kind == "foreign":
-        outcome = "right" if word in ("unknown", "partial") else "wrong"
+        outcome = "right" if verdict_name in ("unknown", "partial") else "wrong"
     else:
         sets = list_named_sets(verdict)
-        outcome, size, class_size = _grade_library(list(effects), word, sets, equivalents)
-    return ("undecided" if word == "unidentifiable" else outcome), size, class_size
+        outcome, size, class_size = _grade_library(list(effects), verdict_name, sets, equivalents)
+    return ("undecided" if verdict_name == "unidentifiable" else outcome), size, class_size
 
 
 def _grade_library(
-    effects: Sequence[str], word: str, sets: NamedSets, equivalents: EquivalentEffects
+    effects: Sequence[str], verdict_name: str, sets: NamedSets, equivalents: EquivalentEffects
 ) -> tuple[str, int, int]:
     """Grade an answer on one or two effects of the library.
 
@@ -136,14 +136,16 @@ def _grade_library(
 
     Args:
         effects: the hidden effects.
-        word: the verdict.
+        verdict_name: verdict of the answer, as "named".
         sets: sets of effects that an answer names; those of one set are alternatives.
         equivalents: returns an effect and all effects that are equivalent to it.
 
     Returns:
         Outcome, size of the largest matched set, and the same with equivalent effects counted once.
     """
-    if not sets or word == "unknown":  # effects listed with the verdict "unknown" are not named
+    if (
+        not sets or verdict_name == "unknown"
+    ):  # effects listed with the verdict "unknown" are not named
         return "unnamed", 0, 0
     exact_matches = _match_sets_to_effects(effects, sets, lambda effect, names: effect in names)
     equivalent_matches = _match_sets_to_effects(
@@ -160,7 +162,7 @@ def _grade_library(
     if len(exact_matches) < len(effects):
         return "class", 0, class_count  # only equivalent effects are named
     largest_set = max(len(sets[set_index]) for set_index in exact_matches.values())
-    return ("right" if largest_set == 1 else "set"), largest_set, class_count
+    return ("right" if largest_set == 1 else "set"), largest_set, class_count  # set of one: alone
 
 
 def _match_sets_to_effects(
@@ -196,16 +198,22 @@ def _match_sets_to_effects(
 
 
 def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
-    """Count the distinct names of a set, equivalent effects counted as one.
+    """Count the distinct effects of a set, equivalent effects counted as one.
 
-    The family of an effect (``effect@*``) is not counted if the set contains one of its places.
+    A name ``effect@*`` means the effect at any joint. It is not counted if the set also contains
+    the effect at one joint, as ``effect@elbow``.
     """
-    at_places = {name.partition("@")[0] for name in names if not name.endswith("@*")}
-    counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in at_places]
-    return len({min(equivalents(name)) for name in counted})
+    effects_at_joints = {name.partition("@")[0] for name in names if not name.endswith("@*")}
+    counted_names = [
+        name
+        for name in names
+        if not name.endswith("@*") or name.partition("@")[0] not in effects_at_joints
+    ]
+    # The alphabetically first equivalent effect represents its class.
+    return len({min(equivalents(name)) for name in counted_names})
 
 
-def _count_covered_intervals(
+def _check_interval_coverage(
     case: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
 ) -> dict[str, bool | None]:
     """Compare the intervals of base parameters and of leading causes with the true values.

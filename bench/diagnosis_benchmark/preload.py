@@ -41,10 +41,10 @@ def _warm_up_search(system: str) -> None:
         system=system, noise={"*": _NOISE_SIGMA}, runs=2, seconds=0.5, rate=50.0, engine="batch"
     )
     simulated = simulate_recording(specification)
-    kind = type(simulated.simulator)
-    assert issubclass(kind, SystemSimulator)
+    simulator_class = type(simulated.simulator)
+    assert issubclass(simulator_class, SystemSimulator)
     with closing(
-        RunEvaluator(kind, simulated.recording, simulated.recording.training(), "batch")
+        RunEvaluator(simulator_class, simulated.recording, simulated.recording.training(), "batch")
     ) as evaluator:
         noise = NoiseModel.make_white(compute_noise_floor(evaluator, simulated.recording).sigma)
         compute_directions(evaluator, fit_base_model(evaluator, noise).fit, evaluator.library)

@@ -1,4 +1,4 @@
-"""Tables of a comparison of diagnosers, computed from one row per answer.
+"""Tables of a comparison of diagnosers: one row per answer, and the tables computed from them.
 
 Fractions of false alarms and of missing answers have 95 % intervals of Clopper and Pearson
 (Biometrika 26, 404, 1934), which keep their level for rare events too; other fractions have 95 %
@@ -9,7 +9,7 @@ together by Holm's method (Scand. J. Stat. 6, 65, 1979).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,9 @@ from bench.benchmark.statistics.paired_tests import correct_holm
 from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
-from bench.diagnosis_benchmark.case_generation.recording_conditions import CASE_KINDS
+from bench.diagnosis_benchmark.answer_store import AnswersByCase
+from bench.diagnosis_benchmark.case_generation.recording_conditions import CASE_KINDS, BenchmarkCase
+from bench.diagnosis_benchmark.grading import grade_answer
 
 MIN_GRADED_SIZE = 1.0
 """Minimum size of an effect that must be diagnosed, in units of the noise."""
@@ -37,6 +39,98 @@ CONDITIONS = ("system", "noise", "stated", "rate", "runs", "source", "driven")
 
 PRIMARY_METRIC = "the same, up to equivalence"
 """Primary metric: cause named alone or in a set of at most two, equivalent effects counted once."""
+
+CASE_COLUMNS = ("noise", "stated", "rate", "seconds", "runs", "source", "driven", "size", "beyond")
+"""Attributes of a case that are columns of a result row."""
+SKIPPED_STATUS = "skipped"
+"""Status and outcome of a case that the diagnoser does not support."""
+RUN_SECONDS_COLUMN = "run_seconds"
+"""Column of the length of a run; the column `seconds` is the time of an answer."""
+_MAX_REASON_LENGTH = 200
+"""Maximum length of the reason of a missing answer in a result row, characters."""
+
+
+def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.DataFrame:
+    """Build the result rows, ordered by diagnoser and then by case.
+
+    Args:
+        answered: stored answers.
+        diagnosers: names of the diagnosers.
+    """
+    rows = [row for name in diagnosers for row in _iterate_rows(name, answered)]
+    return pd.DataFrame(rows)
+
+
+def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, Any]]:
+    """Yield the result rows of one diagnoser, ordered by the name of the case.
+
+    A case is left out if it was not drawn (its stored document has no hidden effects) or if this
+    diagnoser has not answered it.
+    """
+    for question, answer in sorted(answers.items()):
+        # The case could not be drawn, or its worker was lost before it was drawn.
+        if "effects" not in answer["item"] or diagnoser not in answer["rows"]:
+            continue
+        yield build_answer_row(
+            question, BenchmarkCase.from_document(answer["item"]), answer["rows"][diagnoser]
+        )
+
+
+def build_answer_row(
+    question: str, case: BenchmarkCase, stored_answer: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Build the result row of one answer: its case, true causes, answer, grade and cost.
+
+    The rows of all answers are the file items.csv, from which all tables and figures are computed.
+
+    Args:
+        question: name of the case.
+        case: the case with its true causes.
+        stored_answer: stored answer of one diagnoser, with its status, reason and cost.
+
+    Returns:
+        Values by column. ``found`` and ``found_class`` tell whether the cause was identified
+        without and with equivalent effects counted as one. ``alarm`` tells whether the diagnoser
+        says that something is missing; a missing answer counts as an alarm. ``intervals`` is the
+        number of closed 95 % intervals, ``holding`` how many of them contain the true value.
+    """
+    answer = stored_answer["answer"]
+    grade = grade_answer(case, answer)
+    known_coverage = [covered for covered in grade.covered.values() if covered is not None]
+    causes = answer["causes"] if answer else []
+    # The last line of a traceback states the error.
+    reason_lines = stored_answer["reason"].strip().splitlines()
+    case_columns = {name: getattr(case, name) for name in CASE_COLUMNS}
+    # The column "seconds" is the time of the answer; the length of a run has another name.
+    case_columns[RUN_SECONDS_COLUMN] = case_columns.pop("seconds")
+    return {
+        "question": question,
+        "diagnoser": stored_answer["diagnoser"],
+        "kind": case.kind,
+        "system": case.system,
+        "hidden": " + ".join(case.effects),
+        **case_columns,
+        "channels": " ".join(case.channels),
+        "status": stored_answer["status"],
+        "reason": reason_lines[-1][:_MAX_REASON_LENGTH] if reason_lines else "",
+        "verdict": answer["verdict"] if answer else "",
+        "named": grade.named,
+        "outcome": SKIPPED_STATUS if stored_answer["status"] == SKIPPED_STATUS else grade.outcome,
+        "set_size": grade.set_size,
+        "class_size": grade.class_size,
+        "largest_set": max((1 + len(cause["alternatives"]) for cause in causes), default=0),
+        "found": grade.is_correct,
+        "found_class": grade.is_correct_up_to_equivalence,
+        "alarm": answer is None or answer["verdict"] != "adequate",
+        "p_value": answer["p_value"] if answer else None,
+        "intervals": len(known_coverage),
+        "holding": sum(known_coverage),
+        "simulations": stored_answer["simulations"],
+        "seconds": stored_answer["seconds"],
+        "processor_seconds": stored_answer["processor_seconds"],
+        "trusted": stored_answer["trusted"],
+    }
+
 
 TableRow = dict[str, Any]
 RowFilter = Callable[[pd.DataFrame], pd.DataFrame]
@@ -76,7 +170,7 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
 
 
 def _compute_share(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:
-    """Compute the fraction of successes with its 95 % interval; see `compute_share`.
+    """Count the successes and compute their fraction with its 95 % interval, as one table row.
 
     Args:
         successes: whether each case is a success.
@@ -166,8 +260,8 @@ def _list_groups(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     for metric, columns in GROUPED_METRICS:
         for column in columns:
             for value, part in metric.select(diagnoser_rows).groupby(column):
-                place = {"metric": metric.name, "by": column, "value": str(value)}
-                yield {**place, **_compute_share(metric.predicate(part), metric.is_exact)}
+                group = {"metric": metric.name, "by": column, "value": str(value)}
+                yield {**group, **_compute_share(metric.predicate(part), metric.is_exact)}
 
 
 def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
@@ -181,9 +275,10 @@ def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
-    """List the fraction of clean recordings whose p-value is at most a level.
+    """Yield the lines of calibration.csv: fraction of clean recordings with p at most a level.
 
-    For a calibrated p-value this fraction equals the level.
+    A diagnoser without p-values has no lines. For a calibrated p-value this fraction equals the
+    level.
     """
     p_values = pd.to_numeric(select_clean(diagnoser_rows)["p_value"]).dropna()
     for level in P_VALUE_LEVELS if len(p_values) else ():
@@ -312,10 +407,10 @@ def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
 
 
 def index_by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, TableRow]:
-    """Index the rows of a table by diagnoser.
+    """Convert the rows of a table to dictionaries, by the name of the diagnoser.
 
     Args:
-        frame: table with a column diagnoser.
+        frame: table with a column diagnoser, and one row per diagnoser (and metric).
         metric: metric whose rows are used; empty for a table without a column metric.
     """
     if metric:
@@ -351,6 +446,7 @@ def build_all_tables(
         diagnoser_rows = rows[rows["diagnoser"] == name]
         for table, list_lines in _LINES_OF_TABLES.items():
             lines[table] += [{"diagnoser": name, **line} for line in list_lines(diagnoser_rows)]
+    # The cost of the training is stored apart from the answers.
     for line in lines["costs"]:
         costs = [cost for cost in training if cost["diagnoser"] == line["diagnoser"]]
         line["training_simulations"] = sum(int(cost["simulations"]) for cost in costs)
@@ -431,8 +527,8 @@ def build_failure_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFram
         [name for name in order if name in correct_names.get(q, ())] for q in wrong_rows["question"]
     ]
     wrong_rows["right_by"] = [" ".join(names) or "nobody" for names in correct_by_case]
-    wrong_rows["place"] = wrong_rows["diagnoser"].map({name: i for i, name in enumerate(order)})
-    failure_table: pd.DataFrame = wrong_rows.sort_values(["place", "kind", "question"])[
+    wrong_rows["position"] = wrong_rows["diagnoser"].map({name: i for i, name in enumerate(order)})
+    failure_table: pd.DataFrame = wrong_rows.sort_values(["position", "kind", "question"])[
         list(FAILURE_COLUMNS)
     ]
     return failure_table.reset_index(drop=True)

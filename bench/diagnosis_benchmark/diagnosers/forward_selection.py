@@ -135,7 +135,8 @@ class _ForwardSelection(Diagnoser):
             samples: number of samples.
         """
         intervals = _compute_intervals(evidence, best)
-        parameters = {n: e for n, e in intervals.items() if "." not in n}
+        # Coefficients of effects have a dot in their names, parameters of the system have none.
+        parameters = {name: interval for name, interval in intervals.items() if "." not in name}
         p_value = self.compute_p_value(first, samples)
         # A criterion that only compares models finds the selected one good enough.
         is_explained = p_value is None or self._is_sufficient(best, samples)
@@ -148,6 +149,7 @@ class _ForwardSelection(Diagnoser):
             if any(alternatives for _, alternatives in causes):
                 verdict = "ambiguous"
             return Answer(verdict, named_causes, parameters, p_value)
+        # Noise alone gives a sum of squares of about its degrees of freedom; the excess is the gap.
         gap = max(first.squares - float(samples - best.numbers), 1e-9)
         if not causes or (first.squares - best.squares) / gap < MIN_GAP_CLOSED:
             return Answer("unknown", (), parameters, p_value)
@@ -275,15 +277,15 @@ def _refit_with_one_more_effect(
     """
     evaluator = evidence.evaluator
     names = tuple(name for name in evaluator.library if name not in current_fit.effects)
-    # Directions of further effects must be computed at the current model.
+    # Directions of further effects must be computed at the current model: a copy recomputes them.
     evidence = replace(evidence, base=replace(evidence.base, fit=current_fit), names=names)
     residual, effects = evidence.build_trajectory_regression().project_out_base()
     best = find_strongest_columns(residual, effects, evidence.effect_columns)
-    order = sorted(best, key=lambda name: -best[name][0])[:REFITS_PER_ROUND]
+    promising = sorted(best.values(), key=lambda strongest: -strongest.gain)[:REFITS_PER_ROUND]
     starts = [
         start
-        for name in order
-        for start in _choose_starts(evidence, current_fit, name, best[name][1], residual, effects)
+        for _, column in promising
+        for start in _choose_starts(evidence, current_fit, column, residual, effects)
     ]
     if not starts:
         return []
@@ -301,7 +303,6 @@ def _refit_with_one_more_effect(
 def _choose_starts(
     evidence: RegressionEvidence,
     current_fit: TrajectoryFit,
-    name: str,
     column: EffectColumn,
     residual: Array,
     effects: Array,
@@ -309,22 +310,20 @@ def _choose_starts(
     """Choose starting values for a fit with one more effect.
 
     They are the size predicted by the linear model, and 0.3 of it because the linear model holds
-    for small sizes only.
+    for small sizes only. An effect that exists in one size only has one start: that size.
 
     Args:
         evidence: directions of the effects at the current model.
         current_fit: the current model.
-        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        column: the best column of the effect.
+        column: the effect and its best directions, one per coefficient that is linear in (1).
         residual: residual after parameters and initial states are projected out, (N,).
         effects: columns of all directions after this projection, (N, K).
     """
-    evaluator = evidence.evaluator
+    evaluator, name = evidence.evaluator, column.effect
     probes = [evidence.sensitivity_directions.candidates[index] for index in column.places]
     bounds = compute_coefficient_bounds(evaluator, name)
     sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
     starts = []
-    # The second start is smaller than the linear estimate, for effects that are not linear.
     for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         start_coefficients = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
@@ -350,8 +349,13 @@ def _compute_intervals(
     Args:
         evidence: base fit, noise, and directions of the effects on a recording.
         model: model with its effects, refitted to the runs.
+
+    Returns:
+        Interval (low, high) by name: ``mass`` for a parameter of the system, or
+        ``drag.linear.coefficient`` for a coefficient of an effect.
     """
     evaluator, fit = evidence.evaluator, model.fit
+    # Initial states are unknowns too, but only the parameters, the first columns, get intervals.
     columns = compute_base_jacobian(evaluator, fit) / evidence.noise.sigma[:, None]
     whitened_rows = columns[evidence.observed_mask]
     whitened_rows = whitened_rows[np.isfinite(whitened_rows).all(axis=1)]
@@ -382,5 +386,7 @@ def _select_effect_intervals(
     """
     prefix = f"{effect}."
     return {
-        name.removeprefix(prefix): e for name, e in intervals.items() if name.startswith(prefix)
+        name.removeprefix(prefix): interval
+        for name, interval in intervals.items()
+        if name.startswith(prefix)
     }

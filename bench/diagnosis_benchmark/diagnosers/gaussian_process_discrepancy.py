@@ -76,9 +76,10 @@ def _compute_gain_p_value(
     if min(len(fitted.residual), len(held_out.residual)) < 2 * HELD_OUT_BLOCK_COUNT:
         return 1.0
     centre, scale = fitted.state.mean(axis=0), fitted.state.std(axis=0)
-    moving = scale > 0
-    fitted_inputs = (fitted.state - centre)[:, moving] / scale[moving]
-    held_out_inputs = (held_out.state - centre)[:, moving] / scale[moving]
+    is_varying = scale > 0  # a constant input cannot be standardised
+    fitted_inputs = (fitted.state - centre)[:, is_varying] / scale[is_varying]
+    held_out_inputs = (held_out.state - centre)[:, is_varying] / scale[is_varying]
+    # A Gaussian process costs the cube of its number of samples.
     training_indices = np.sort(
         rng.choice(
             len(fitted_inputs), min(TRAINING_SAMPLE_COUNT, len(fitted_inputs)), replace=False
@@ -90,7 +91,7 @@ def _compute_gain_p_value(
     ) + WhiteKernel(1.0, NOISE_BOUNDS)
     process = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # it warns if a hyperparameter reaches its bound
         process.fit(fitted_inputs[training_indices], fitted.residual[training_indices])
     predicted = process.predict(held_out_inputs)
     gains = np.square(held_out.residual) - np.square(held_out.residual - predicted)

@@ -72,7 +72,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
         runs = [*case.recording.training(), *case.recording.held_out()]
         run_documents = []
         for run, values in zip(runs, residual, strict=True):
-            count = len(run.times)
+            count = len(run.times)  # shorter runs are filled up in the array of residuals
             run_documents.append(
                 {
                     "t": _thin_series(run.times),
@@ -137,6 +137,7 @@ def _run_command(prompt: str, seconds: float) -> str:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(f"language-model: {command}: {error}") from None
     if process.returncode:
+        # The last line of the errors; empty if the command printed none.
         last = "".join(process.stderr.strip().splitlines()[-1:])
         raise InputError(f"language-model: {command}: exit code {process.returncode}: {last:.200}")
     return process.stdout

@@ -87,6 +87,7 @@ class NeuralClassifier(Diagnoser):
         """
         classes = ["", *sorted(task.library)]
         images, labels = [], []
+        # The loop ends when the budget of simulations is used up.
         for number in count():
             name = (
                 "" if task.rng.random() < CLEAN_EXAMPLE_SHARE else str(task.rng.choice(classes[1:]))
@@ -126,10 +127,10 @@ class NeuralClassifier(Diagnoser):
         clean_probability = float(probabilities[0])
         if clean_probability >= CLEAN_PROBABILITY_THRESHOLD:
             return Answer("adequate", p_value=None)
-        order = [int(i) for i in np.argsort(-probabilities) if i]
-        max_probability = float(probabilities[order[0]])
-        min_probability = ALTERNATIVE_PROBABILITY_RATIO * max_probability
-        named_classes = [i for i in order if probabilities[i] >= min_probability]
+        # Class 0 is "no effect".
+        effect_classes = [int(i) for i in np.argsort(-probabilities) if i != 0]
+        min_probability = ALTERNATIVE_PROBABILITY_RATIO * float(probabilities[effect_classes[0]])
+        named_classes = [i for i in effect_classes if probabilities[i] >= min_probability]
         if float(probabilities[named_classes].sum()) < MIN_NAMED_PROBABILITY:
             return Answer("unknown")
         most_probable, *alternatives = (classes[i] for i in named_classes)
@@ -151,8 +152,8 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
         number: number of the example, added to the random seed.
 
     Returns:
-        The input of the network; None if the residual is outside the range
-        `TRAINING_RESIDUAL_RANGE`.
+        The input of the network; None if the residual is above `TRAINING_RESIDUAL_RANGE`, or below
+        it although there is an effect.
 
     Raises:
         SimulationBudgetExceededError: the budget is used up.
@@ -170,13 +171,17 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     observe = list(default_recording.observe) or (
         channels if rng.random() < ALL_CHANNELS_SHARE else channels[:1]
     )
-    forms = ("steps:{a}:{b}", "sine:{a}:{c}", "chirp:{a}:0.3:{c}")
+    # Input signals as texts: amplitude, then the duration of a step in s or frequencies in Hz.
+    forms = ("steps:{size}:{duration}", "sine:{size}:{frequency}", "chirp:{size}:0.3:{frequency}")
     inputs = dict(default_recording.inputs)
+    # A servo keeps its usual input, and half of the rotary systems are not driven.
     if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
-        # Torque in N m or force in N, duration of a step in s, frequency in Hz.
+        # Torque in N m or force in N.
         size = rng.uniform(0.05, 0.2) if system.kind == "rotary" else rng.uniform(0.5, 4.0)
         text = str(rng.choice(forms)).format(
-            a=f"{size:.3g}", b=f"{rng.uniform(0.25, 1.0):.3g}", c=f"{rng.uniform(0.3, 2.5):.3g}"
+            size=f"{size:.3g}",
+            duration=f"{rng.uniform(0.25, 1.0):.3g}",
+            frequency=f"{rng.uniform(0.3, 2.5):.3g}",
         )
         inputs[kind.inputs[0].name] = text
     specification = SimulationSpec(
@@ -194,12 +199,10 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
         force=True,
     )
     image, residual_rms = _compute_network_input(kind, simulate_recording(specification).recording)
-    is_usable = (
-        TRAINING_RESIDUAL_RANGE[0] <= residual_rms <= TRAINING_RESIDUAL_RANGE[1]
-        if name
-        else residual_rms <= TRAINING_RESIDUAL_RANGE[1]
-    )
-    return image if is_usable else None
+    min_residual, max_residual = TRAINING_RESIDUAL_RANGE
+    # An effect must be visible above the noise; without an effect the residual is noise alone.
+    is_visible = not name or residual_rms >= min_residual
+    return image if is_visible and residual_rms <= max_residual else None
 
 
 def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
@@ -233,17 +236,22 @@ def _compute_network_input(
 ) -> tuple[Array, float]:
     """Compute the network's input from a recording.
 
-    Each run is resampled to `GRID_POINT_COUNT` points. The rows are, for each channel, the residual
-    of the fitted base model (arcsinh, clipped), the normalised motion and a mask; then the inputs,
-    and the logarithm of the duration.
+    Each run is resampled to `GRID_POINT_COUNT` points. The F rows are, for the C channels of the
+    simulator and its I inputs (those that are not recorded remain zero):
+
+    * 0 to C - 1: residual of the fitted base model in units of the noise (arcsinh, clipped),
+    * C to 2C - 1: simulated motion, standardised,
+    * 2C to 3C - 1: 1 if the channel is recorded,
+    * 3C to 3C + I - 1: inputs, divided by their maximum,
+    * last: logarithm of the duration.
 
     Args:
         kind: simulator class.
         recording: recorded runs, with their channels, inputs and constants.
 
     Returns:
-        Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
-        POINTS); and the RMS of the residuals.
+        Input of the network, (R, F, `GRID_POINT_COUNT`) for R runs and F rows, and the RMS of the
+        residuals in units of the noise.
     """
     with closing(
         RunEvaluator(kind, recording, list(recording.runs), "batch", candidates=())
@@ -261,7 +269,6 @@ def _compute_network_input(
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
             relative_times = np.linspace(0.0, 1.0, size)
-            # The channels have fixed rows of the image; rows of those not recorded remain zero.
             for recorded_index, name in enumerate(evaluator.channels):
                 channel_index = names.index(name)
                 is_recorded = np.isfinite(residual[run_index, :size, recorded_index])
@@ -330,12 +337,10 @@ def _make_network(features: int, classes: int) -> Any:
             )
 
         def forward(self, images: Any, weights: Any) -> Any:
-            """Compute class scores.
-
-            Shapes: R runs.
+            """Compute the class scores of B recordings from their R runs each.
 
             Args:
-                images: inputs, (B, R, F, POINTS).
+                images: inputs, (B, R, F, GRID_POINT_COUNT).
                 weights: 1 for runs that exist, otherwise 0, (B, R).
 
             Returns:
@@ -354,10 +359,11 @@ def _stack_with_mask(images: Sequence[Array]) -> tuple[Any, Any]:
     """Stack inputs with different numbers of runs into one tensor, filled up with zeros.
 
     Args:
-        images: inputs of B recordings, each (R, F, POINTS) with its own number of runs R.
+        images: inputs of B recordings, each (R, F, GRID_POINT_COUNT) with its own number of runs R.
 
     Returns:
-        Inputs (B, largest R, F, POINTS), and weights (B, largest R) that are 1 for runs that exist.
+        Inputs (B, largest R, F, GRID_POINT_COUNT), and weights (B, largest R) that are 1 for runs
+        that exist.
     """
     import torch
 
@@ -380,7 +386,7 @@ def _train_network(
     Shapes: R runs.
 
     Args:
-        images: inputs, one (R, F, POINTS) per example.
+        images: inputs, one (R, F, GRID_POINT_COUNT) per example.
         labels: index of the class of each example, (B,).
         classes: number of classes.
         seed: seed of initial weights, order of the examples and dropout.
@@ -402,7 +408,7 @@ def _train_network(
             network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
         )
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, TRAINING_EPOCHS)
-        best, state = np.inf, network.state_dict()
+        best, state = np.inf, network.state_dict()  # validation loss and its weights
         for _ in range(TRAINING_EPOCHS):
             network.train()
             order = training[torch.randperm(len(training)).numpy()]
@@ -434,7 +440,7 @@ def _predict_probabilities(
 
     Args:
         trained_arrays: trained weights by the name of the layer.
-        image: input of the network, (R, F, POINTS).
+        image: input of the network, (R, F, GRID_POINT_COUNT).
         classes: number of classes.
     """
     import torch

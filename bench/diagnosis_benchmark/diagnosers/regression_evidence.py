@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,13 +182,13 @@ class RegressionEvidence:
         A nonlinear parameter, such as a period, has a grid of values; the directions at one value
         form one column.
         """
-        places: dict[tuple[str, int, int], list[int]] = {}
+        groups: dict[tuple[str, int, int], list[int]] = {}
         for i, probe in enumerate(self.sensitivity_directions.candidates):
             # Each direction of a fixed size is a column of its own, because such directions do not
-            # add up.
+            # add up; -1 is common to all others.
             separate_index = i if probe.is_single_size else -1
-            places.setdefault((probe.effect, probe.grid_point, separate_index), []).append(i)
-        return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
+            groups.setdefault((probe.effect, probe.grid_point, separate_index), []).append(i)
+        return [EffectColumn(effect, tuple(indices)) for (effect, _, _), indices in groups.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
         """Build the regression of the residual r on its causes, with one row per sample.
@@ -246,6 +247,9 @@ class RegressionEvidence:
             effects: columns of all directions of effects, (R, T, C, K).
             sigma: standard deviation of the noise, (R, T, C).
             is_observed: mask of the samples to use, (R, T, C).
+
+        Returns:
+            The regression with N rows, ordered by run, sample and channel.
         """
         runs = np.broadcast_to(np.arange(len(residual))[:, None, None], is_observed.shape)
         is_complete = is_observed & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
@@ -261,11 +265,12 @@ class RegressionEvidence:
         )
 
     def _compute_states(self) -> Array:
-        """Return time, channels of the base model and inputs, (R, T, F).
+        """Return time since the start, simulated channels, and inputs: (R, T, F = 1 + C + inputs).
 
-        They are the arguments of a discrepancy function, such as a Gaussian process.
+        They are the arguments of a discrepancy function, such as a Gaussian process. Samples after
+        the end of a run, and inputs that a run does not have, are zero.
 
-        Shapes: R runs, T samples.
+        Shapes: R runs, T samples, C channels.
         """
         evaluator = self.evaluator
         runs, length, channels = evaluator.observed.shape
@@ -302,10 +307,11 @@ class RegressionEvidence:
 
         evaluator, system = self.evaluator, self.evaluator.simulator.system
         runs, length, channels, _ = values.shape
+        # Unused channels stay NaN, with sigma 1 and a mask of False.
         filtered_runs = np.full_like(values, np.nan)
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
-        pairs = dict(zip(system.rates, system.coordinates, strict=False))
+        coordinate_by_rate = dict(zip(system.rates, system.coordinates, strict=False))
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
             step = float(np.median(np.diff(run_data.scenario.times)))
@@ -314,7 +320,7 @@ class RegressionEvidence:
             )
             stiffness, damping = self._linearise(run_index)
             for channel_index, name in enumerate(evaluator.channels):
-                is_rate = name in pairs
+                is_rate = name in coordinate_by_rate
                 if not is_rate and name not in system.coordinates:
                     continue
                 channel_values = values[run_index, :size, channel_index]
@@ -341,7 +347,7 @@ class RegressionEvidence:
                     )
                     return filtered
 
-                coordinate = system.coordinates.index(pairs[name] if is_rate else name)
+                coordinate = system.coordinates.index(coordinate_by_rate.get(name, name))
                 filtered_residual = smooth(order)
                 if is_rate:
                     filtered_residual -= damping[:size, coordinate, None] * smooth(0)
@@ -349,6 +355,8 @@ class RegressionEvidence:
                     filtered_residual -= stiffness[:size, coordinate, None] * smooth(0)
                     filtered_residual -= damping[:size, coordinate, None] * smooth(1)
                 filtered_runs[run_index, :size, channel_index] = filtered_residual
+                # White noise through a filter: its variance is multiplied by the sum of the squared
+                # weights. The noise of the smaller terms with A and B is neglected.
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[run_index, :size, channel_index] = self.noise.sigma[channel_index] * np.sqrt(
                     np.square(weights).sum()
@@ -386,9 +394,9 @@ class RegressionEvidence:
     def _linearise(self, run: int) -> tuple[Array, Array]:
         """Compute A and B of L r = r'' - A r - B r' (2), each (T, D), by finite differences.
 
-        They are the derivatives of the base model's acceleration by the D coordinates and by their
-        rates (stiffness and damping, per mass), along the fitted motion. They are zero
-        for systems of several coordinates.
+        They are the derivatives of the base model's acceleration by the coordinate and by its rate
+        (stiffness and damping, per mass), along the fitted motion. They are zero for systems of
+        several coordinates (D > 1), and if the coordinate is not recorded.
 
         Args:
             run: index of the run.
@@ -403,6 +411,7 @@ class RegressionEvidence:
         name = system.coordinates[0]
         if name not in evaluator.channels:
             return zeros, zeros
+        # Position and velocity of the fitted motion, (T, 1).
         x = self.base.fit.simulated[run, :size, evaluator.channels.index(name)][:, None]
         v = np.gradient(x[:, 0], times)[:, None]
         values = {c.name: c.value for c in evaluator.kind.constants}
@@ -423,12 +432,10 @@ class RegressionEvidence:
             force: Array = moment.system.force(moment) / moment.inertia
             return force
 
-        base_acceleration = compute_acceleration(x, v)
-        return (
-            compute_acceleration(x + FINITE_DIFFERENCE_STEP, v) - base_acceleration
-        ) / FINITE_DIFFERENCE_STEP, (
-            compute_acceleration(x, v + FINITE_DIFFERENCE_STEP) - base_acceleration
-        ) / FINITE_DIFFERENCE_STEP
+        step, base_acceleration = FINITE_DIFFERENCE_STEP, compute_acceleration(x, v)
+        stiffness = (compute_acceleration(x + step, v) - base_acceleration) / step
+        damping = (compute_acceleration(x, v + step) - base_acceleration) / step
+        return stiffness, damping
 
 
 _IMPACT_HEIGHT = 1.0
@@ -457,8 +464,10 @@ def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     """
     from scipy.linalg import block_diag
 
+    # The last axis of the Jacobian has the parameters, then the initial states of the run itself.
     parameters, states = np.split(fit.jacobian, [fit.free_indices.size], axis=3)
     runs, length, channels, state_count = states.shape
+    # One block of rows and columns per run: a state of one run does not change another run.
     own_columns = block_diag(*states.reshape(runs, length * channels, state_count))
     unknown = ~evaluator.known_state_mask.ravel()
     state_columns = own_columns[:, unknown].reshape(runs, length, channels, int(unknown.sum()))
@@ -481,30 +490,40 @@ def compute_standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
+class StrongestColumn(NamedTuple):
+    """Column of an effect that explains most of the residual.
+
+    Attributes:
+        gain: decrease of the sum of squares by a least-squares fit of its directions.
+        column: the column.
+    """
+
+    gain: float
+    column: EffectColumn
+
+
 def find_strongest_columns(
     residual: Array, effects: Array, columns: Sequence[EffectColumn]
-) -> dict[str, tuple[float, EffectColumn]]:
+) -> dict[str, StrongestColumn]:
     """Find for each effect the column that explains most of the residual.
 
-    The gain of a column is the decrease of the sum of squares by a least-squares fit of all
-    directions that the column contains.
-
     Args:
-        residual: residual after projection, (N,).
-        effects: effect columns after projection, (N, K).
-        columns: columns of the effects.
+        residual: residual after projection (`RegressionData.project_out_base`), (N,).
+        effects: directions of all effects after projection, (N, K).
+        columns: columns of the effects; each is one or several of these directions.
 
     Returns:
-        By effect, the decrease of the sum of squares and the column.
+        By effect; an effect without a direction that differs from zero is left out.
     """
-    best: dict[str, tuple[float, EffectColumn]] = {}
+    best: dict[str, StrongestColumn] = {}
     for column in columns:
         part = column.select_directions(effects)
         if not part.size:
             continue
+        # The small diagonal keeps the matrix invertible if two directions are parallel.
         normal_matrix = part.T @ part + 1e-9 * np.eye(part.shape[1])
         projected_residual = part.T @ residual
         gain = float(projected_residual @ np.linalg.solve(normal_matrix, projected_residual))
-        if column.effect not in best or gain > best[column.effect][0]:
-            best[column.effect] = gain, column
+        if column.effect not in best or gain > best[column.effect].gain:
+            best[column.effect] = StrongestColumn(gain, column)
     return best

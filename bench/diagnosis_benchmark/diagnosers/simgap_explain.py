@@ -20,7 +20,8 @@ class SimgapExplain(Diagnoser):
         from bench.diagnosis.explain import explain
 
         verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer
-        # p-value of the best score of the whole library, from surrogate data.
+        # The p-values of candidates come from surrogate data and hold for the whole library, so the
+        # smallest one tests whether anything is missing.
         p_value = min((candidate.p_value for candidate in verdict.candidates), default=None)
         causes = tuple(
             NamedCause(

@@ -101,7 +101,7 @@ class _SparseRegression(Diagnoser):
             return None
         residual, effects = fitting_rows.project_out_base()
         strongest_columns = find_strongest_columns(residual, effects, evidence.effect_columns)
-        chosen_columns = [column for _, column in strongest_columns.values()]
+        chosen_columns = [strongest.column for strongest in strongest_columns.values()]
         terms, library = _drop_duplicate_columns(
             [
                 (column.effect, column_index)
@@ -113,17 +113,23 @@ class _SparseRegression(Diagnoser):
         if not terms:
             return _RegressionResult(0.0, ())
         columns = [column_index for _, column_index in terms]
+        # Unit mean square in the runs for fitting, so that coefficients are comparable.
         scale = np.sqrt(np.square(library).mean(axis=0))
         held_out_residual, held_out_effects = held_out_rows.project_out_base()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             models = [
-                c for c in self._iterate_models(library / scale, residual) if np.isfinite(c).all()
+                coefficients
+                for coefficients in self._iterate_models(library / scale, residual)
+                if np.isfinite(coefficients).all()
             ]
         model, sigmas = _select_by_one_standard_error(
             models, held_out_residual, held_out_effects[:, columns] / scale
         )
-        selected_effects = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
+        # An effect with several directions may have several terms.
+        selected_effects = list(
+            dict.fromkeys(effect for (effect, _), size in zip(terms, model, strict=True) if size)
+        )
         causes = [
             NamedCause(
                 name, _find_equivalent_effects(name, selected_effects, chosen_columns, effects)
@@ -187,8 +193,7 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
 
         for max_terms in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
             model = optimizers.FROLS(max_iter=max_terms, alpha=RIDGE_PENALTY * len(residual))
-            # FROLS raises an error if the rest of all other terms depends linearly on the selected
-            # ones.
+            # FROLS raises an error if all other terms depend linearly on the selected ones.
             with suppress(ValueError):
                 model.fit(library, residual[:, None])
                 yield from (coefficients[0] for coefficients in model.history_)
@@ -211,8 +216,8 @@ def _drop_duplicate_columns(
     """
     kept_terms: list[tuple[str, int]] = []
     columns: list[Array] = []
-    for effect, place in terms:
-        column = effects[:, place]
+    for effect, column_index in terms:
+        column = effects[:, column_index]
         size = float(np.sqrt(column @ column))
         # A column that is zero up to rounding has no term.
         if size < 1e-9 * max(len(column), 1):
@@ -221,9 +226,9 @@ def _drop_duplicate_columns(
         if all(
             abs(float(unit @ kept_column)) < DUPLICATE_COLUMN_CORRELATION for kept_column in columns
         ):
-            kept_terms.append((effect, place))
+            kept_terms.append((effect, column_index))
             columns.append(unit)
-    library = effects[:, [place for _, place in kept_terms]]
+    library = effects[:, [column_index for _, column_index in kept_terms]]
     return kept_terms, library
 
 
@@ -248,8 +253,8 @@ def _select_by_one_standard_error(
     candidates = [zero_model, *models]
     errors = np.array(
         [
-            compute_block_means(np.square(residual - library @ c), HELD_OUT_BLOCK_COUNT)
-            for c in candidates
+            compute_block_means(np.square(residual - library @ coefficients), HELD_OUT_BLOCK_COUNT)
+            for coefficients in candidates
         ]
     )
     best = int(errors.mean(axis=1).argmin())
@@ -258,10 +263,10 @@ def _select_by_one_standard_error(
     if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
         return zero_model, sigmas
     allowed_models = []
-    for c, error in zip(candidates[1:], errors[1:], strict=True):
+    for coefficients, error in zip(models, errors[1:], strict=True):
         excess = error - errors[best]
         if excess.mean() <= compute_standard_error(excess):
-            allowed_models.append(c)
+            allowed_models.append(coefficients)
     return min(allowed_models or [candidates[best]], key=np.count_nonzero), sigmas
 
 

@@ -49,6 +49,7 @@ class WhitenessTest(Diagnoser):
             rows = evidence.build_trajectory_regression()
             residual, effects = rows.project_out_base()
             best = find_strongest_columns(residual, effects, evidence.effect_columns)
+        # The correlation is the root of the fraction of the sum of squares that a column explains.
         total = float(residual @ residual)
         correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
         order = sorted(correlated, key=lambda name: -correlated[name])
