@@ -71,8 +71,8 @@ def test_imports_run_downwards_and_never_in_a_circle(imports):
 
 REFERENCE_SIMULATORS = (
     "case_generation.ball_reference", "case_generation.joint_reference",
-    "case_generation.cause_sizes", "machine_cases.machine_dynamics",
-    "machine_cases.reference_motion",
+    "case_generation.strength_search", "machine_cases.machine_dynamics",
+    "machine_cases.machine_simulation",
 )  # fmt: skip
 """Modules that simulate and size hidden causes, also those of the robots in `tests/exams`."""
 

@@ -76,8 +76,8 @@ def check_global_random_state(location: str) -> Iterator[None]:
     Raises:
         CheckError: the block draws from a global generator or seeds it.
     """
-    python = random.getstate()
-    legacy = np.random.get_state()  # noqa: NPY002 - it is what must not change
+    python_state = random.getstate()
+    numpy_state = np.random.get_state()  # noqa: NPY002 - it is what must not change
     # Large primes as seeds: a method that seeds with 0 or 42 certainly changes the state.
     random.seed(82_589_933)
     np.random.seed(30_402_457)  # noqa: NPY002
@@ -86,8 +86,8 @@ def check_global_random_state(location: str) -> Iterator[None]:
         yield
         states_after = _get_random_states()
     finally:
-        random.setstate(python)
-        np.random.set_state(legacy)  # noqa: NPY002
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)  # noqa: NPY002
     changed_generators = [
         name for name in states_before if states_before[name] != states_after[name]
     ]
@@ -104,10 +104,12 @@ def _get_random_states() -> dict[str, object]:
 
     They are compared before and after a call, to see whether the call has used one of them.
     """
-    legacy: Any = np.random.get_state(legacy=True)  # noqa: NPY002
+    numpy_state: Any = np.random.get_state(legacy=True)  # noqa: NPY002
+    _, keys, *positions = numpy_state
     states: dict[str, object] = {
         "random": random.getstate(),
-        "numpy": (legacy[1].tobytes(), *legacy[2:]),
+        # Bytes, because arrays cannot be compared as a whole.
+        "numpy": (keys.tobytes(), *positions),
     }
     if "torch" in sys.modules:
         states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
@@ -150,4 +152,5 @@ def call_in_processes(
             [(function, argument) for argument in arguments], CALL_TIMEOUT_SECONDS
         )
     )
-    return [results[place] for place in range(len(arguments))]
+    # Results arrive in any order, each with the index of its call.
+    return [results[index] for index in range(len(arguments))]

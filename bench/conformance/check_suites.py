@@ -23,10 +23,10 @@ from bench.conformance.tuner_checks import (
     check_same_run_in_other_processes,
 )
 from bench.core.diagnoser import Diagnoser
-from bench.core.plugin_registries import REGISTRIES
+from bench.core.plugin_registries import REGISTRIES, find_part_kind
 from methods.tuner import Tuner
 from sims.core.effect import Effect
-from sims.core.simulator import InputError, Simulator, make_unknown_name_error
+from sims.core.simulator import InputError, Simulator
 
 if TYPE_CHECKING:
     import pytest
@@ -113,11 +113,9 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
         failed: set[Check] = set()
         for check in get_suite(subject):
             name = check.__name__
-            marks = (
-                [pytest.mark.xfail(reason=known_failures[name], strict=True)]
-                if name in known_failures
-                else []
-            )
+            marks = []
+            if name in known_failures:  # strict: a check that passes nevertheless fails
+                marks = [pytest.mark.xfail(reason=known_failures[name], strict=True)]
             title = f"{subject.__name__}-{name.removeprefix('check_')}"
             cases.append(pytest.param(_bind_check(check, subject, failed), id=title, marks=marks))
     return pytest.mark.parametrize("check", cases)
@@ -225,19 +223,6 @@ class SuiteResult(NamedTuple):
         }
 
 
-def find_part_kind(name: str) -> str:
-    """Return whether a name is that of a tuner, simulator, effect or diagnoser.
-
-    Raises:
-        InputError: nothing is registered under this name.
-    """
-    for registry in REGISTRIES:
-        if name in registry.names():
-            return registry.kind
-    names = [name for registry in REGISTRIES for name in registry.names()]
-    raise make_unknown_name_error("tuner, simulator, effect or diagnoser", name, names)
-
-
 def _get_subject(kind: str, name: str) -> Any:
     return {registry.kind: registry for registry in REGISTRIES}[kind].get(name)
 
@@ -246,9 +231,13 @@ def run_check(kind: str, name: str, check: Check) -> CheckResult:
     """Run one check in this process.
 
     Args:
-        kind: kind of the subject.
-        name: name of the subject.
+        kind: tuner, simulator, effect or diagnoser.
+        name: registered name of the subject.
         check: the check.
+
+    Returns:
+        The result. A failed `CheckError` that the subject announces in `known_failures` is known;
+        an announced failure that does not happen counts as failed.
     """
     subject = _get_subject(kind, name)
     known_failure = getattr(subject, "known_failures", {}).get(check.__name__)
@@ -278,9 +267,10 @@ def _make_failure(reason: object) -> CheckResult:
 def _describe_raise_location(error: Exception) -> str:
     """Describe where the subject's own code raised an exception, or else where it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
-    packages = Path(__file__).parents[2]
-    folders = [str(packages / name) for name in ("bench", "methods", "sims")]
-    subject_frames = [frame for frame in frames if not frame.filename.startswith(tuple(folders))]
+    root = Path(__file__).parents[2]
+    own_folders = tuple(str(root / name) for name in ("bench", "methods", "sims"))
+    subject_frames = [frame for frame in frames if not frame.filename.startswith(own_folders)]
+    # The innermost frame; all frames are the project's if it tests its own classes.
     frame = (subject_frames or list(frames))[-1]
     return f"see {Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
 
@@ -301,6 +291,7 @@ def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], Non
     results = {}
     for check, result in _run_all_checks(kind, name, plugins):
         results[title_of(check)] = result
+        # The label of the outcome says already that a failure is known.
         line = result.reason if result.outcome == "known" else result.says
         error_text = f"\n        {line}" if line else ""
         print_line(f"{_OUTCOME_LABELS[result.outcome]}  {title_of(check)}{error_text}")
@@ -336,7 +327,8 @@ def _run_all_checks(
 ) -> Iterator[tuple[Check, CheckResult]]:
     """Run the checks one after another, and yield each with its result.
 
-    After two checks that were killed or whose process died, no more checks are run.
+    Each check runs in a worker process, which a bad subject may block or end. After two checks that
+    were killed or whose process died, no more checks are run.
 
     Args:
         kind: kind of the subject: tuner, simulator, effect or diagnoser.
@@ -360,11 +352,15 @@ def _run_all_checks(
                 # this is safe.
                 result = run_check(kind, name, check)
             else:
-                ((_, end),) = pool.iterate_results(
+                ((_, result_or_error),) = pool.iterate_results(
                     [(run_check, (kind, name, check))], CALL_TIMEOUT_SECONDS
                 )
-                lost_workers += isinstance(end, Exception) and not isinstance(end, InputError)
-                result = end if isinstance(end, CheckResult) else _describe_lost_check(end)
+                if isinstance(result_or_error, CheckResult):
+                    result = result_or_error
+                else:
+                    # An InputError was raised by the worker; any other error is its end.
+                    lost_workers += not isinstance(result_or_error, InputError)
+                    result = _describe_lost_check(result_or_error)
             if result.outcome == "failed":
                 failed.append(check)
             yield check, result

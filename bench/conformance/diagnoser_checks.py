@@ -105,7 +105,7 @@ def _open_case(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
         simulated.write(path)
-        path.with_suffix(".truth.toml").unlink()
+        path.with_suffix(".truth.toml").unlink()  # it states the hidden cause
         simulator = type(simulated.simulator)
         assert issubclass(simulator, SystemSimulator)
         recording = read_recording(path, simulator)
@@ -117,11 +117,11 @@ def _open_case(
                 path,
                 recording,
                 simulator,
-                list_observable_effects(simulator, recording),
-                np.random.default_rng(3),
-                budget,
-                TIME_LIMIT_SECONDS,
-                _get_trained_state(kind),
+                library=list_observable_effects(simulator, recording),
+                rng=np.random.default_rng(3),
+                budget=budget,
+                seconds=TIME_LIMIT_SECONDS,
+                learned=_get_trained_state(kind),
             )
         finally:
             SIMULATION_COUNTER.reset()
@@ -165,9 +165,8 @@ def _train_diagnoser(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
         training_task = DiagnoserTrainingTask(
             simulator, library, np.random.default_rng(5), TRAINING_BUDGET
         )
-        return {
-            n: np.asarray(a) for n, a in kind().train(training_task).items()
-        }, SIMULATION_COUNTER.used
+        arrays = kind().train(training_task)
+        return {name: np.asarray(array) for name, array in arrays.items()}, SIMULATION_COUNTER.used
     finally:
         SIMULATION_COUNTER.reset()
 
@@ -190,25 +189,29 @@ class _Run(NamedTuple):
 
 @cache
 def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
-    """Run a diagnoser; the result is cached for several checks.
+    """Run a diagnoser, and record its answer and what it changed; several checks use the result.
 
     Args:
         kind: class of the diagnoser.
         hidden: whether the recording has a hidden cause.
-        turn: number of the run; another number repeats it.
+        turn: number of the run, not used: another number is not in the cache and repeats the run.
+
+    Raises:
+        CheckError: the diagnoser gave no valid answer.
     """
     with _open_case(kind, hidden) as case:
         files_before, random_state_error = _copy_case_bytes(case), ""
-        answers: list[Answer] = []
+        answer: Answer | None = None
         try:
             with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
-                answers.append(_run_diagnoser(kind, case))
+                answer = _run_diagnoser(kind, case)
         except CheckError as error:
             # Without an answer, there is nothing else to check.
-            if not answers:
+            if answer is None:
                 raise
+            # With an answer, the error is that of the random state, which one check reports.
             random_state_error = str(error)
-        (answer,) = answers
+        assert answer is not None
         names = {name for group in list_named_sets(answer) for name in group}
         foreign = tuple(sorted(names - set(case.library)))
         return _Run(answer, foreign, _copy_case_bytes(case) != files_before, random_state_error)
@@ -283,9 +286,7 @@ def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
 
 
 def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
-    """Check that the diagnoser answers with a tiny budget, or stops with the budget error.
-
-    A diagnoser that counts its simulations wrongly would use more than `TINY_SIMULATION_BUDGET`.
+    """Check that the diagnoser answers within a tiny budget, or stops with the budget error.
 
     Args:
         kind: Diagnoser class under test.

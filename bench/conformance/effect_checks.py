@@ -10,7 +10,6 @@ import numpy as np
 
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
 from bench.conformance.robot_place_checks import (
-    check_batch_independence,
     check_family_is_the_sum_of_its_members,
     check_it_acts_at_its_place_alone,
     check_lanes_of_a_robot_are_independent,
@@ -18,6 +17,7 @@ from bench.conformance.robot_place_checks import (
     check_places_are_declared,
 )
 from bench.conformance.sample_subjects import FirstOrderTank, list_effect_places
+from bench.conformance.simulator_checks import check_batch_independence
 from bench.core.plugin_registries import PartUnavailableError, simulators
 from sims import effects
 from sims.core.effect import (
@@ -75,13 +75,10 @@ def _make_simulator_with_effect(
     Raises:
         CheckError: another effect has the same name.
     """
-    registered_names = effects.list_names()
-    if effect.name not in registered_names or effects.get_effect(effect.name) is not effect:
-        if effect.name in registered_names:
-            raise CheckError(
-                f"expected a unique name; found {effect.name}; see {effect.__name__}.name"
-            )
+    if effect.name not in effects.list_names():
         effects.register_effect(effect)
+    elif effects.get_effect(effect.name) is not effect:
+        raise CheckError(f"expected a unique name; found {effect.name}; see {effect.__name__}.name")
     return host(engine=_choose_engine(host), effects=[effect.name])
 
 
@@ -120,10 +117,10 @@ def _make_parameters(simulator: SystemSimulator, share: float) -> Array:
     """
     # The coefficients of the effect follow the parameters of the system.
     base_count = len(simulator.system.parameters)
-    values = [p.nominal for p in simulator.parameters[:base_count]]
-    values += [
-        p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[base_count:]
-    ]
+    values = [parameter.nominal for parameter in simulator.parameters[:base_count]]
+    for coefficient in simulator.parameters[base_count:]:
+        low, high = coefficient.bounds
+        values.append(low + share * (high - low))
     return np.array([values])
 
 
@@ -143,6 +140,7 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
     )
     check(bool(effect.coefficients), "at least one coefficient", "none", location)
     for coefficient in effect.coefficients:
+        # One unit and range for each kind of system; without a unit the kind does not have it.
         for unit, (low, high) in zip(coefficient.units, coefficient.plausible, strict=True):
             check(
                 unit is None or low < high,
@@ -193,7 +191,8 @@ def _compute_contributions(
     values = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.6]])
     times = np.cumsum(np.full((2, 3), 0.1), axis=1)
     signal = Signal(values, np.full((2, 3), 0.1), np.array([[0.7], [0.2]]), times)
-    # Adding zero turns -0.0, the result of a product with zero, into 0.0.
+    # Adding zero turns -0.0, the result of a product with zero, into 0.0, and gives a scalar the
+    # shape of the expected result.
     if isinstance(active_effect, Force):
         return [(active_effect.force(c, moment) + 0.0, np.zeros_like(moment.x))]
     if isinstance(active_effect, Friction):
@@ -226,38 +225,27 @@ def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSn
         host: simulator that declares constants and inputs.
         system: the system on which the effect acts.
     """
-    shape = (2, len(system.coordinates))
     theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)
     constants = {c.name: np.full((2, 1), c.value) for c in host.constants}
     # Inputs, and all other numbers here, are arbitrary and not zero, SI units.
     inputs = {c.name: np.full((2, 1), 0.3) for c in host.inputs}
-    values = np.linspace(0.2, 1.1, 2 * shape[1])
-    return StateSnapshot(
-        system,
-        theta,
-        constants,
-        np.full((2, 1), 0.4),
-        values.reshape(shape),
-        -values.reshape(shape),
-        inputs,
-    )
+    positions = np.linspace(0.2, 1.1, 2 * len(system.coordinates)).reshape(2, -1)
+    times = np.full((2, 1), 0.4)
+    return StateSnapshot(system, theta, constants, times, positions, -positions, inputs)
 
 
 def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | None:
     """Check that the effect changes the observations and keeps them finite.
 
-    The change must occur somewhere within the plausible range; the observations at 0.7 of the range
-    must be finite. Several fractions of the range are tested, because a limit acts at the low end
-    of its range, and a force may destabilise the system at the high end.
+    Each system is simulated at 0.05, 0.3 and 0.7 of the plausible range. The observations must
+    change at one of them at least, because a limit acts only at the low end of its range; those at
+    0.7 must be finite.
     """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
-        simulator, base_simulator, scenario = (
-            _make_simulator_with_effect(host, effect),
-            host(engine=_choose_engine(host)),
-            _make_scenario(host.system),
-        )
-        # Shares of the ranges of the parameters.
+        simulator = _make_simulator_with_effect(host, effect)
+        base_simulator = host(engine=_choose_engine(host))
+        scenario = _make_scenario(host.system)
         thetas = np.concatenate([_make_parameters(simulator, share) for share in (0.05, 0.3, 0.7)])
         observations = simulator.simulate(thetas, scenario)
         location = f"{effect.__name__} on {host.name}"

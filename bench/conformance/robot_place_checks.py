@@ -15,6 +15,7 @@ from bench.conformance.sample_subjects import (
     make_arm_simulator,
     make_scenario,
 )
+from bench.conformance.simulator_checks import check_batch_independence
 from sims.core.effect import (
     Effect,
     Force,
@@ -24,7 +25,7 @@ from sims.core.effect import (
     ModelValueEffect,
     Sensor,
 )
-from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
     import mujoco
@@ -50,11 +51,11 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
             effect_class.name == expected_name, f"name {expected_name}", effect_class.name, location
         )
         for coefficient in effect_class.coefficients:
-            finite = all(
-                np.isfinite(limits).all() and limits[0] < limits[1]
-                for limits in coefficient.plausible
+            is_finite = all(
+                np.isfinite([low, high]).all() and low < high for low, high in coefficient.plausible
             )
-            check(finite, f"a finite range for {coefficient.name}", coefficient.plausible, location)
+            expected_range = f"a finite range for {coefficient.name}"
+            check(is_finite, expected_range, coefficient.plausible, location)
             check(
                 all(coefficient.units),
                 f"a unit for {coefficient.name} ('1' for a number)",
@@ -99,13 +100,14 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         c = np.zeros((len(effect_class.coefficients), 2, 1))
         for part, coefficients in effect_class().parts(c):
-            none = _acts_on(part, coefficients, kind) == ()
-            check(none, "no contribution at zero", "one", location)
-        # Shares of the plausible range: no effect, and an arbitrary one.
-        lanes = np.concatenate(
+            has_no_influence = _acts_on(part, coefficients, kind) == ()
+            check(has_no_influence, "no contribution at zero", "one", location)
+        # A batch of two: no effect, and the effect at 0.7 of its plausible range.
+        thetas = np.concatenate(
             [_make_coefficients(effect_class, 0.0), _make_coefficients(effect_class, 0.7)]
         )
-        observations = _simulate_arm(kind, lanes, [effect_class])
+        observations = _simulate_arm(kind, thetas, [effect_class])
+        # Adding zero turns -0.0 into 0.0.
         check(
             is_bitwise_equal(observations[:1] + 0.0, base_observations + 0.0),
             "the plain motion at zero",
@@ -118,7 +120,11 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
 def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | None:
     """Check that the effect is observable, stays finite, and acts only at its place.
 
-    The observations must be finite at 0.9 of the plausible range.
+    For each place (joint, body, motor, channel or contact of the arm):
+
+    * the observations are finite at 0.9 of the plausible range,
+    * they change, but for a sensor effect only in its own channel, if that is observed,
+    * no two places change the same model fields, coordinates or signals.
     """
     classes = list_effect_places(effect)
     if not classes:
@@ -145,8 +151,9 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
             location,
         )
         if signal and is_observable:
-            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != signal]
-            check(not changed[others].any(), "other channels unchanged", "changes", location)
+            other_channels = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != signal]
+            is_unchanged = not changed[other_channels].any()
+            check(is_unchanged, "other channels unchanged", "changes", location)
         for part, coefficients in effect_class().parts(
             np.ones((len(effect_class.coefficients), 2, 1))
         ):
@@ -207,8 +214,8 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
 def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicable | None:
     """Check that observations do not depend on other elements of the batch, bit for bit.
 
-    The order of the batch elements must not matter either. The effect acts at another place in each
-    of them.
+    The order of the batch elements must not matter either. The simulator has the effect at all
+    places; in each element, it acts at one of them, and in the first one nowhere.
     """
     classes = list_effect_places(effect)
     simulator = make_arm_simulator(effect)(observe=OBSERVED_CHANNELS, effects=classes)
@@ -227,29 +234,6 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     return None if classes else NO_PLACE
 
 
-def check_batch_independence(
-    simulator: Simulator, parameter_sets: Array, scenario: Scenario, location: str
-) -> None:
-    """Check that a simulation depends neither on the others of its batch nor on their order.
-
-    Args:
-        simulator: simulator with the effect.
-        parameter_sets: (n, P) parameters.
-        scenario: run to simulate.
-        location: where the author of the effect should look.
-
-    Raises:
-        CheckError: the observations are not equal bit for bit.
-    """
-    batch_result = simulator.simulate(parameter_sets, scenario)
-    single_results = [simulator.simulate(row[None], scenario) for row in parameter_sets]
-    reversed_result = simulator.simulate(parameter_sets[::-1], scenario)[::-1]
-    is_same = is_bitwise_equal(batch_result, np.concatenate(single_results)) and is_bitwise_equal(
-        batch_result, np.ascontiguousarray(reversed_result)
-    )
-    check(is_same, "bitwise equal results alone, in a batch and in any order", "others", location)
-
-
 def _make_coefficients(effect: type[Effect], share: float) -> Array:
     """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0.
 
@@ -257,8 +241,9 @@ def _make_coefficients(effect: type[Effect], share: float) -> Array:
         effect: class of the effect.
         share: position between the bounds of the plausible ranges, from 0 to 1.
     """
-    limits = np.array([c.plausible[0] for c in effect.coefficients])
-    theta: Array = limits[:, 0] + share * (limits[:, 1] - limits[:, 0])
+    low, high = np.array([coefficient.plausible[0] for coefficient in effect.coefficients]).T
+    theta: Array = low + share * (high - low)
+    # The lower bound may differ from zero.
     return theta[None] * (share != 0.0)
 
 
@@ -278,7 +263,7 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     if effect.of in MODEL_FIELD_EFFECTS and isinstance(effect, ModelValueEffect | Force | Friction):
         return _find_changed_fields(effect, c, kind)
     if isinstance(effect, HiddenStateEffect) and effect.between:
-        return _put_in_series(effect, c, kind)
+        return _find_series_joint_fields(effect, c, kind)
     if isinstance(effect, Force | Friction | HiddenStateEffect):
         return _find_forced_coordinates(effect, c, kind)
     return (effect.signal,) if c.any() else ()
@@ -303,15 +288,19 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
         native.fields,
         lambda fields: native.write(fields, robot, effect.place, c[:, :, 0]),
     )
-    changes = [(name, place) for name, places in changed.items() for place in places]
+    changes = [(name, index) for name, indices in changed.items() for index in indices]
     # Fields indexed by place must change at one place; fields of the world are indexed by axis.
-    if effect.place and len({place for _, place in changes}) > 1:
+    if effect.place and len({index for _, index in changes}) > 1:
         raise CheckError(f"expected one place; found {changes}; see {effect.name}")
     return tuple(changes)
 
 
-def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[object, ...]:
+def _find_series_joint_fields(
+    effect: HiddenStateEffect, c: Array, kind: type
+) -> tuple[object, ...]:
     """Return the model fields that an effect changes on the joint in series with its own joint.
+
+    An elastic or loose transmission is simulated by a second joint between drive and link.
 
     Args:
         effect: effect at a joint.
@@ -346,11 +335,12 @@ def _compare_fields(
     }
     fields = {name: values.copy() for name, values in values_before.items()}
     write(fields)
+    # The first axis is that of the batch elements, the second one that of joints, bodies or axes.
     changed = {
         name: np.unique(np.nonzero(fields[name] != values)[1]).tolist()
         for name, values in values_before.items()
     }
-    return {name: places for name, places in changed.items() if places}
+    return {name: indices for name, indices in changed.items() if indices}
 
 
 def _find_forced_coordinates(

@@ -7,8 +7,8 @@ Parameter i has the rate r_i = 0.5 + 0.6 p_i. The two channels are the sums over
 
 so that every parameter is observable, no two can be exchanged, and there is no symmetry in p.
 
-It has two joints, driven by a servo and a motor. Every quantity that an effect may change is stated
-in its model file.
+The arm has two joints, driven by a servo and a motor. Every quantity that an effect may change is
+stated in its model file.
 """
 
 from __future__ import annotations
@@ -293,7 +293,8 @@ _RUN_SECONDS = 0.8
 def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
     """Make the simulator of the arm, with its contact enabled for effects at contacts and geoms.
 
-    It is made anew for each effect, because it caches the places of effects by name.
+    It is made anew for each effect, because it caches the places of effects by name; the cache here
+    keeps that of the last effect only.
     """
     import mujoco
 
@@ -309,9 +310,10 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
 
 
 def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:
-    """Return an effect at all places of the arm where it can act, and its family.
+    """Return the classes of an effect at all places of the arm where it can act.
 
-    The result is empty if MuJoCo is not installed.
+    They include families, which act at all places of one kind together. The result is empty if
+    MuJoCo is not installed. An effect that is not registered yet is registered.
     """
     from importlib.util import find_spec
 
@@ -328,5 +330,5 @@ def make_scenario() -> Scenario:
     times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _RUN_SECONDS, 0.021)])
     # Arbitrary angles (rad) and rates (rad/s), and torques (N m) that change every 0.2 s.
     initial = {"q.shoulder": 0.4, "q.elbow": -0.7, "qd.shoulder": -1.0, "qd.elbow": 2.0}
-    first = np.where(times % 0.4 < 0.2, 0.6, -0.3)
-    return Scenario(times, initial, {"u.m_shoulder": first, "u.m_elbow": 0.4 - 2.0 * first})
+    shoulder = np.where(times % 0.4 < 0.2, 0.6, -0.3)
+    return Scenario(times, initial, {"u.m_shoulder": shoulder, "u.m_elbow": 0.4 - 2.0 * shoulder})

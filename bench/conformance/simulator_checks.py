@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from operator import itemgetter
 
 import numpy as np
 
@@ -54,26 +55,28 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     """
     if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
-    forced = kind.apply_force is not OwnSimulator.apply_force
-    heavy = kind.inertia is not OwnSimulator.inertia
-    hook = "apply_force" if forced else "inertia"
-    if forced or heavy:
+    # Optional hooks, which the class has if it overrides them.
+    has_forces = kind.apply_force is not OwnSimulator.apply_force
+    has_inertia = kind.inertia is not OwnSimulator.inertia
+    hook = "apply_force" if has_forces else "inertia"
+    if has_forces or has_inertia:
         expected = f"the attributes coordinates and rates with {hook}"
         check(bool(kind.coordinates), expected, "none", kind.__name__)
     simulator = kind()
     names = [c.name for c in simulator.channels]
     _start_run(simulator)
     try:
-        for _ in range(2):
+        for _ in range(2):  # before and after the first step
             observation = simulator.observe()
             for name in dict.fromkeys([*names, *kind.coordinates, *kind.rates, *kind.levels]):
                 observed(simulator, observation, name)
-            if heavy:
+            if has_inertia:
                 _check_inertia(kind, get_checked_inertia(simulator))
-            if forced:
+            if has_forces:
                 simulator.apply_force(np.zeros(len(kind.coordinates)))
             _make_step(simulator)
     except InputError as error:
+        # The message "expected ..., found ..." is given the form of the checks' messages.
         message = str(error).removeprefix(f"simulator {kind.name}: ")
         expected_text, _, found_text = message.partition(", found ")
         raise CheckError(
@@ -174,12 +177,12 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
         return NotApplicable("it takes no forces (it has no method apply_force)")
     simulator, location = kind(), f"{kind.__name__}.apply_force"
     unforced = _simulate_motion(simulator, None)
-    for place, name in enumerate(kind.coordinates):
+    for coordinate, name in enumerate(kind.coordinates):
         forced = unforced
         size = 1.0
         while is_bitwise_equal(unforced, forced) and size <= _MAX_TRIED_FORCE:
             force = np.zeros(len(kind.coordinates))
-            force[place] = size
+            force[coordinate] = size
             forced = _simulate_motion(simulator, force)
             size *= 10.0  # a heavy system needs a large force to move visibly
         found_text = f"the same motion with forces up to {_MAX_TRIED_FORCE:g}"
@@ -192,8 +195,9 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
         is_restored = is_bitwise_equal(unforced, _simulate_motion(simulator, None))
         reset = f"{kind.__name__}.reset: it must remove a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
-        velocity = np.abs(forced - unforced)[:, len(kind.coordinates) + place]
-        has_grown = 0.0 < velocity[1] * _GROWTH_RATIO < velocity[_CHECKED_STEP]
+        # Rates follow the coordinates. A force that acts on would change the rate more and more.
+        rate_change = np.abs(forced - unforced)[:, len(kind.coordinates) + coordinate]
+        has_grown = 0.0 < rate_change[1] * _GROWTH_RATIO < rate_change[_CHECKED_STEP]
         expected = f"a force along {name} to act in the next step alone"
         check(not has_grown, expected, "that it acts in later steps too", location)
     simulator.close()
@@ -346,9 +350,8 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
             location,
         )
         for channel_index, channel in enumerate(simulator.channels):
-            invalid_values = observations[:, :, channel_index][
-                ~np.isfinite(observations[:, :, channel_index])
-            ]
+            values = observations[:, :, channel_index]
+            invalid_values = values[~np.isfinite(values)]
             expected = f"finite values of {channel.name} for parameters inside the bounds"
             check(not invalid_values.size, expected, invalid_values[:1], location)
     simulator.close()
@@ -396,6 +399,31 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     new_simulator.close()
 
 
+def check_batch_independence(
+    simulator: Simulator, parameter_sets: Array, scenario: Scenario, location: str
+) -> None:
+    """Check that a simulation depends neither on the others of its batch nor on their order.
+
+    The parameter sets are simulated in one batch, one by one, and in reversed order.
+
+    Args:
+        simulator: simulator with the effect under test.
+        parameter_sets: (n, P) parameters.
+        scenario: run to simulate.
+        location: where the author of the effect should look.
+
+    Raises:
+        CheckError: the observations are not equal bit for bit.
+    """
+    batch_result = simulator.simulate(parameter_sets, scenario)
+    single_results = [simulator.simulate(row[None], scenario) for row in parameter_sets]
+    reversed_result = simulator.simulate(parameter_sets[::-1], scenario)[::-1]
+    is_same = is_bitwise_equal(batch_result, np.concatenate(single_results)) and is_bitwise_equal(
+        batch_result, np.ascontiguousarray(reversed_result)
+    )
+    check(is_same, "bitwise equal results alone, in a batch and in any order", "others", location)
+
+
 def _describe_first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
     """Describe where two observations (n, T, C) first differ in time.
 
@@ -411,16 +439,19 @@ def _describe_first_difference(kind: type[Simulator], expected: Array, observati
     is_different = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))
     if not is_different.any():
         return "zeros of the opposite sign"
-    lane, sample, channel = min(np.argwhere(is_different).tolist(), key=lambda index: index[1])
-    expected_value, found_value = (
-        expected[lane, sample, channel],
-        observations[lane, sample, channel],
+    batch_element, sample, channel = min(
+        np.argwhere(is_different).tolist(),
+        key=itemgetter(1),  # by sample
     )
+    expected_value = expected[batch_element, sample, channel]
+    found_value = observations[batch_element, sample, channel]
     # All digits are shown if the values differ only by rounding.
     digits = 6 if f"{expected_value:.6g}" != f"{found_value:.6g}" else 17
     name = kind.channels[channel].name
-    found, wanted = f"{found_value:.{digits}g}", f"{expected_value:.{digits}g}"
-    return f"{name} = {found} in place of {wanted} at sample {sample}"
+    return (
+        f"{name} = {found_value:.{digits}g} in place of {expected_value:.{digits}g} at sample "
+        f"{sample}"
+    )
 
 
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:

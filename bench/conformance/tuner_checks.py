@@ -48,7 +48,8 @@ _SIGNIFICANCE_LEVEL = 0.05
 def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     """Check that the tuner runs in an isolated process, with the same result as in this process.
 
-    An isolated process cannot start other processes and cannot access files or the network.
+    An isolated process cannot start other processes and cannot access files or the network. A tuner
+    that a comparison evaluates runs in such a process.
     """
     tuned = _make_tuner_spec(kind)
     if tuned is None:
@@ -66,8 +67,9 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
             )
     except (RunEndedError, KilledExternallyError) as error:
         last_line = str(error).strip().splitlines()[-1:]
-        check(False, "a run in a process of its own", last_line, location)
-        raise
+        raise CheckError(
+            f"expected a run in a process of its own; found {last_line}; see {location}"
+        ) from None
     end_text = (
         sandboxed_trace.reason.strip().splitlines()[-1:]
         if sandboxed_trace.status != local_trace.status
@@ -99,12 +101,9 @@ def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
     if kind.__module__.startswith("simgap_plugin_"):
         return TunerSpec(kind.name, "", file, {}, find_preloadable_packages(file))
     # A class of a script or a test is in a file that an isolated process cannot read.
-    is_importable = file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file
-    return (
-        TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
-        if is_importable
-        else None
-    )
+    if not (file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file):
+        return None
+    return TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
 
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]*$")
@@ -145,7 +144,7 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
             f"expected a default for every option; found {error}; see {location}.__init__"
         ) from None
     # The returned object is tested: a `tune` that returns a list would only fail in the harness's
-    # loop.
+    # loop. A learned tuner must be trained before.
     steps = make_trained_tuner(kind, 2).tune(make_task(2, 5)[0], np.random.default_rng(0))
     check(
         inspect.isgenerator(steps),
@@ -235,6 +234,7 @@ class _InspectedTuner(Tuner):
         try:
             proposal = next(steps)
             while True:
+                # A plain array has points without a recommendation.
                 points, recommended = (
                     proposal if isinstance(proposal, Proposal) else (proposal, None)
                 )
@@ -310,11 +310,9 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
     """
     used_tuner = make_trained_tuner(kind, 2)
     run_tuner(used_tuner, 2, 15, seed=1)
-    reused, fresh_trace = (
-        run_tuner(used_tuner, 2, 15, seed=2),
-        run_tuner(make_trained_tuner(kind, 2), 2, 15, seed=2),
-    )
-    is_same = is_bitwise_equal(reused.proposals, fresh_trace.proposals)
+    used_trace = run_tuner(used_tuner, 2, 15, seed=2)
+    fresh_trace = run_tuner(make_trained_tuner(kind, 2), 2, 15, seed=2)
+    is_same = is_bitwise_equal(used_trace.proposals, fresh_trace.proposals)
     check(
         is_same,
         "no state kept between runs",
@@ -358,7 +356,7 @@ def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
     The first simulation, every third one, or all of them fail.
     """
     tuner = make_trained_tuner(kind, 2)
-    # Methods start from the first simulation; if all fail, nothing can be fitted.
+    # Methods start from the first simulation; if all fail, nothing can be fitted. k counts from 1.
     for fails, condition in (
         (lambda k: k == 1, "when the first simulation fails"),
         (lambda k: k % 3 == 0, "when every third simulation fails"),
@@ -401,23 +399,22 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     from scipy.stats import wilcoxon
 
     tuner, random_search = make_trained_tuner(kind, 2), _RandomSearchBaseline()
-    logs: list[Array] = []
-    for target_count in _SEQUENTIAL_TEST_TARGETS:
-        logs += [
-            _compute_final_log_errors((tuner, random_search), target)
-            for target in range(len(logs), target_count)
-        ]
-        tuner_logs, random = np.array(logs).T
-        is_different = (tuner_logs != random).any()  # the test is undefined without a difference
-        p_value = (
-            float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if is_different else 1.0
-        )
-        # Bonferroni correction: three looks at 5 % in total.
-        if p_value < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
-            return
-    medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random)]
-    found_text = f"p = {p_value:.2g}, median error {' against '.join(medians)}"
+    # Bonferroni correction: three looks at 5 % in total.
     level = _SIGNIFICANCE_LEVEL / len(_SEQUENTIAL_TEST_TARGETS)
+    log_errors: list[Array] = []  # of the tuner and of random search, one pair per target
+    for target_count in _SEQUENTIAL_TEST_TARGETS:
+        log_errors += [
+            _compute_final_log_errors((tuner, random_search), target)
+            for target in range(len(log_errors), target_count)
+        ]
+        tuner_logs, random_logs = np.array(log_errors).T
+        p_value = 1.0  # the test is undefined without a difference
+        if (tuner_logs != random_logs).any():
+            p_value = float(wilcoxon(tuner_logs, random_logs, alternative="less").pvalue)
+        if p_value < level:
+            return
+    medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random_logs)]
+    found_text = f"p = {p_value:.2g}, median error {' against '.join(medians)}"
     expected = f"errors below random search's (p < {level:.2g})"
     raise CheckError(f"expected {expected}; found {found_text}; see {kind.__name__}.tune")
 
@@ -467,8 +464,8 @@ def compute_run_digests(
         TRAINED_TUNERS[kind, 2] = learned
     traces = [run_tuner(make_trained_tuner(kind, 2), 2, 12, seed) for seed in seeds]
     return [
-        hashlib.sha256(t.proposals.tobytes() + t.recommendations.tobytes()).hexdigest()[:16]
-        for t in traces
+        hashlib.sha256(trace.proposals.tobytes() + trace.recommendations.tobytes()).hexdigest()[:16]
+        for trace in traces
     ]
 
 

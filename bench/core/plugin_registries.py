@@ -18,7 +18,7 @@ from typing import Any
 from bench.core.diagnoser import Diagnoser
 from methods.tuner import Tuner
 from sims.core.registry import PartUnavailableError, Registry
-from sims.core.simulator import InputError, Simulator
+from sims.core.simulator import InputError, Simulator, make_unknown_name_error
 from sims.effects import registry as effects
 from sims.extended_simulator import load_extended
 
@@ -28,6 +28,7 @@ __all__ = [
     "Registry",
     "diagnosers",
     "effects",
+    "find_part_kind",
     "load_plugins",
     "simulators",
     "tuners",
@@ -48,6 +49,19 @@ diagnosers: Registry[Diagnoser] = Registry(
 
 REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects, diagnosers)
 """Registries of all kinds of parts, in the order in which a plugin's class is tried."""
+
+
+def find_part_kind(name: str) -> str:
+    """Return whether a name is that of a tuner, simulator, effect or diagnoser.
+
+    Raises:
+        InputError: nothing is registered under this name.
+    """
+    for registry in REGISTRIES:
+        if name in registry.names():
+            return registry.kind
+    names = [name for registry in REGISTRIES for name in registry.names()]
+    raise make_unknown_name_error("tuner, simulator, effect or diagnoser", name, names)
 
 
 def make_robot_simulator(

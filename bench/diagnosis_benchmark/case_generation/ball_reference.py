@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import cos, hypot, pi, sin, sqrt, tanh
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -26,15 +26,23 @@ MAX_FIRST_STEP = 0.02
 """Longest first step of the solver, s."""
 
 
+class Gust(NamedTuple):
+    """Temporary acceleration along x and upward, m/s^2, from `begin` to `end`, s."""
+
+    x: float
+    z: float
+    begin: float
+    end: float
+
+
 class FlightDynamics:
     """Accelerations of a ball in flight."""
 
     def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the hidden causes, and the times between which a gust blows.
 
-        `gust` is (acceleration along x, upward acceleration, begin, end) in this run, in m/s^2 and
-        s; None without a gust. `breaks` are the times at which the acceleration jumps: the solver
-        must not step over them.
+        `gust` is None without a gust in this run. `breaks` are the times at which the acceleration
+        jumps: the solver must not step over them.
 
         Args:
             true_system: true system of a case: constants, parameters and hidden effects.
@@ -47,17 +55,18 @@ class FlightDynamics:
             for name, c in self.acting.items()
             if name in ACCELERATION_LAWS
         ]
-        self.gust = None
+        self.gust: Gust | None = None
+        self.breaks: list[float] = []
         if "gust" in self.acting:
             gust_x, gust_z, duration, *start_times = self.acting["gust"]
-            self.gust = gust_x, gust_z, start_times[number], start_times[number] + duration
-        self.breaks = list(self.gust[2:]) if self.gust else []
+            self.breaks = [start_times[number], start_times[number] + duration]
+            self.gust = Gust(gust_x, gust_z, *self.breaks)
 
     def compute_acceleration(self, t: float, y: Any, middle: float) -> Acceleration:
-        """Compute the acceleration of a ball with a hidden cause.
+        """Compute the acceleration (x, y, z) of a ball with hidden causes, m/s^2.
 
         Args:
-            t: time.
+            t: time, s.
             y: position and velocity, (6,).
             middle: a time within the integrated interval, which decides whether a gust acts: it
                 begins and ends at ends of intervals.
@@ -66,8 +75,8 @@ class FlightDynamics:
         for law, c in self.laws:
             bx, by, bz = law(c, self.g, t, *y)
             ax, ay, az = ax + bx, ay + by, az + bz
-        if self.gust and self.gust[2] <= middle < self.gust[3]:
-            ax, az = ax + self.gust[0], az + self.gust[1]
+        if self.gust and self.gust.begin <= middle < self.gust.end:
+            ax, az = ax + self.gust.x, az + self.gust.z
         return ax, ay, az
 
 
@@ -92,7 +101,8 @@ def _compute_wind_drag(
 
     Args:
         c: drag coefficient in 1/m, and air velocity along x and along y in m/s.
-        g: gravitational acceleration; unused, as are time and position.
+        g: gravitational acceleration, m/s^2; unused, as are time and position: all laws of
+            acceleration have the same arguments.
         t: time, s.
         x: position, m.
         y: position, m.
@@ -129,7 +139,8 @@ def _compute_layer_drag(
 
     Args:
         c: drag coefficient in 1/m, and height in m.
-        g: gravitational acceleration; unused, as are time and horizontal position.
+        g: gravitational acceleration, m/s^2; unused, as are time and horizontal position: all laws
+            of acceleration have the same arguments.
         t: time, s.
         x: position, m.
         y: position, m.
@@ -183,9 +194,10 @@ def simulate_ball(
     state = np.array([scenario.initial[name] for name in STATES])
     states = np.empty((instants.size, 6))
     states[instants <= 0] = state
+    radius = true_system.constants["radius"]
     time, rise_duration, resting = 0.0, 0.0, False
     while time < end_time:
-        end = min([end_time, *(b for b in dynamics.breaks if b > time)], default=end_time)
+        end = min([end_time, *(instant for instant in dynamics.breaks if instant > time)])
         has_impact_event = not (rise_duration or resting)
         if rise_duration:  # the ground, where the rise after a bounce begins, is no event
             end = min(end, time + rise_duration)
@@ -194,7 +206,7 @@ def simulate_ball(
             time,
             end,
             state,
-            true_system.constants["radius"] if has_impact_event else None,
+            radius if has_impact_event else None,
             resting,
         )
         time_reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
@@ -204,14 +216,11 @@ def simulate_ball(
         time, rise_duration = time_reached, 0.0
         if has_impact_event and solved.t_events[0].size:
             state, resting = _compute_bounce(true_system, time, state)
-            state[2] = true_system.constants["radius"]
-            # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
-            if resting:
-                rise_duration = 0.0
-            else:
-                rise_duration = (
-                    0.4 * state[5] / max(-dynamics.compute_acceleration(time, state, time)[2], 1e-3)
-                )
+            state[2] = radius  # the height, without the error of the event
+            if not resting:
+                # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
+                _, _, az = dynamics.compute_acceleration(time, state, time)
+                rise_duration = 0.4 * state[5] / max(-az, 1e-3)
     return states
 
 
@@ -235,7 +244,7 @@ def _integrate_flight(
     Raises:
         RuntimeError: the solver failed.
     """
-    middle = 0.5 * (start + end)
+    middle = 0.5 * (start + end)  # decides whether a gust acts: an interval contains no end of one
 
     def rate(t: float, y: Array) -> tuple[float, ...]:
         """Return the time derivatives of position and velocity; a resting ball does not sink.
@@ -282,16 +291,17 @@ def _compute_bounce(true_system: TrueSystem, t: float, state: Array) -> tuple[Ar
         The state after it (6,), and whether the ball stays at rest because the rebound is slower
         than `REST_SPEED`.
     """
-    speed, e = -state[5], true_system.parameters["restitution"]
+    *_, vx, vy, vz = state.tolist()
+    speed, e = -vz, true_system.parameters["restitution"]
     if "restitution.speed" in true_system.effects:
         e = min(e * speed ** true_system.effects["restitution.speed"][0], 1.0)
     if "wear" in true_system.effects:  # unmodelled: restitution that decreases with time
         e = min(max(e * (1.0 - true_system.effects["wear"][0] * t), 0.0), 1.0)
-    tangential_speed = hypot(state[3], state[4])
+    tangential_speed = hypot(vx, vy)
     speed_loss = true_system.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
     rebound_state = state.copy()
-    rebound_state[3:5] *= (
-        max(1.0 - speed_loss / tangential_speed, 0.0) if tangential_speed > 0 else 1.0
-    )
-    rebound_state[5] = e * speed if e * speed > REST_SPEED else 0.0
-    return rebound_state, rebound_state[5] == 0.0
+    if tangential_speed > 0:
+        rebound_state[3:5] *= max(1.0 - speed_loss / tangential_speed, 0.0)
+    rebound_speed = e * speed if e * speed > REST_SPEED else 0.0
+    rebound_state[5] = rebound_speed
+    return rebound_state, rebound_speed == 0.0

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation import effect_coefficients, effect_sizing
-from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_for_size
+from bench.diagnosis_benchmark.case_generation import effect_coefficients, refitted_residuals
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     BenchmarkCase,
@@ -32,6 +31,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     simulate_with_mujoco,
     simulate_with_scipy,
 )
+from bench.diagnosis_benchmark.case_generation.strength_search import find_strength_for_size
 from sims import effects as library
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
@@ -83,8 +83,8 @@ def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset
     """
     classes = (
         names
-        for *conditions, names in EQUIVALENT_EFFECTS
-        if conditions == [system, driven] and effect in names
+        for class_system, has_input, names in EQUIVALENT_EFFECTS
+        if (class_system, has_input) == (system, driven) and effect in names
     )
     return frozenset({effect}).union(*classes)
 
@@ -97,18 +97,20 @@ def draw_case(
     size: float | None = None,
     requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
-    """Draw the hidden cause, its size and the nuisances of a benchmark case.
+    """Draw the hidden causes, the recording conditions and the size of the causes of a case.
 
-    The cause is drawn first, then recording conditions in which it can be observed, and finally its
-    size in units of the noise; see `recording_conditions.draw_size`.
+    The causes are drawn first, then recording conditions in which they can be observed, and finally
+    their size in units of the noise, see `recording_conditions.draw_size`. Coefficients that give
+    this size are found by simulation.
 
     Args:
-        kind: clean, single, double or foreign.
+        kind: clean (no cause), single, double, or foreign (a cause that the effect library does not
+            contain).
         system: ball, pendulum or slider.
         seed: seed from which everything else follows.
         effect: hidden effect (the first one of a double case); None to draw it.
         size: size in units of the noise; None to draw it.
-        requested: recording conditions that are not drawn.
+        requested: recording conditions that are given; those that are None are drawn.
 
     Returns:
         The case, or None if the sensors cannot show the effect at this size with a strength up to
@@ -121,13 +123,24 @@ def draw_case(
     setting = _draw_conditions(name, system, hidden, requested)
     source = str(rng.choice(["scipy", "mujoco"]))
     case = BenchmarkCase(
-        name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
-        setting.seconds,
+        name,
+        system,
+        kind,
+        effects={},
+        size=0.0,
+        noise=setting.noise.kind,
+        stated=setting.noise.stated,
+        rate=setting.rate,
+        seconds=setting.seconds,
+        runs=len(setting.scenarios),
         # The library, which MuJoCo uses, has no unmodelled causes.
-        len(setting.scenarios), "scipy" if kind == "foreign" else source, setting.is_driven,
-        setting.channels, seed,
-        setting.parameters, asked=requested,
-    )  # fmt: skip
+        source="scipy" if kind == "foreign" else source,
+        driven=setting.is_driven,
+        channels=setting.channels,
+        seed=seed,
+        parameters=setting.parameters,
+        asked=requested,
+    )
     target_size = draw_size(kind, size, rng)
     if not hidden:
         return case
@@ -153,13 +166,13 @@ def count_held_out_runs(case: BenchmarkCase) -> int:
 def _draw_conditions(
     name: str, system: str, hidden: tuple[str, ...], requested: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
-    """Draw the recording conditions of a case from its name, and cache them.
+    """Draw the recording conditions of a case from its name; the last 16 results are cached.
 
     Args:
         name: name of the case, from which its random numbers follow.
         system: name of the system, such as ``pendulum``.
-        hidden: names of the hidden effects.
-        requested: conditions that are not drawn.
+        hidden: names of the hidden effects, which the conditions must make observable.
+        requested: conditions that are given; those that are None are drawn.
     """
     return draw_conditions(system, make_case_rng(name, "setting"), hidden, requested=requested)
 
@@ -215,13 +228,16 @@ def find_coefficients(
         Coefficients, or None if there are none.
     """
     compute_coefficients = effect_coefficients.draw_effect_shape(name, setting, rng)
-    compute_residual = effect_sizing.make_gap_function(
+    compute_residual = refitted_residuals.make_gap_function(
         setting, lambda strength: _simulate_causes(setting, {name: compute_coefficients(strength)})
     )
-    found = find_strength_for_size(
+    strength_and_size = find_strength_for_size(
         compute_residual, target_size, effect_coefficients.get_max_strength(name)
     )
-    return None if found is None else compute_coefficients(found[0])
+    if strength_and_size is None:
+        return None
+    strength, _ = strength_and_size
+    return compute_coefficients(strength)
 
 
 def _simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -> Array:
@@ -232,7 +248,7 @@ def _simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -
     Shapes: R runs, T samples, C channels.
     """
     if set(causes).isdisjoint(UNMODELLED_CAUSES[setting.system]):
-        return effect_sizing.simulate_observations(setting, causes)
+        return refitted_residuals.simulate_observations(setting, causes)
     true_system = setting.make_true_system(causes)
     return np.array(
         [
@@ -247,8 +263,11 @@ def _compute_unexplained_size(
 ) -> float | None:
     """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
 
-    It would be a correct answer if it left little: the simpler form of an effect, one of two
-    effects, or the best effect of the library for an unmodelled cause.
+    It would be a correct answer if it left little. Wrong answers by kind of case:
+
+    * single: simpler forms of the effect, such as Coulomb friction for Stribeck friction,
+    * double: each of the two effects alone,
+    * foreign: the best effect of the library.
 
     Args:
         kind: single, double or foreign.
@@ -257,8 +276,10 @@ def _compute_unexplained_size(
         size: size of each in units of the noise.
 
     Returns:
-        The residual; None if the effect has no simpler form, or less than the size of the noise.
+        The residual; 0 if the simulation with the causes diverges, so that the case is rejected;
+        None for a single effect that has no simpler form or is smaller than the noise.
     """
+    # Effects with the coefficients from which their fit starts; None for several guesses.
     wrong_answers = (
         [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
         if kind == "single"
@@ -270,9 +291,9 @@ def _compute_unexplained_size(
     if not np.isfinite(observed).all():
         return 0.0
     if kind == "foreign":
-        return effect_sizing.find_best_effect(setting, observed)[1]
+        return refitted_residuals.find_best_effect(setting, observed)[1]
     return min(
-        effect_sizing.compute_refitted_residual(setting, observed, name, coefficients)
+        refitted_residuals.compute_refitted_residual(setting, observed, name, coefficients)
         for name, coefficients in wrong_answers
     )
 
@@ -280,6 +301,7 @@ def _compute_unexplained_size(
 def record_case(case: BenchmarkCase) -> RecordedCase:
     """Simulate the recording of a case, with sensor noise."""
     setting = restore_conditions(case)
+    # Only some recordings state the noise, as those of users.
     noise = setting.noise.sigma if case.stated else {}
     constants = {} if case.system == "slider" else setting.constants
     runs = _simulate_runs(case, setting)
@@ -294,7 +316,8 @@ def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[R
         case: the case; it states the simulator of the recording (`source`).
         setting: its recording conditions, with all runs.
     """
-    rng, held_out = make_case_rng(case.name, "noise"), count_held_out_runs(case)
+    rng = make_case_rng(case.name, "noise")
+    first_held_out = case.runs - count_held_out_runs(case)
     true_system, runs = setting.make_true_system(case.effects), []
     for run_index, scenario in enumerate(setting.scenarios):
         if case.source == "mujoco":
@@ -303,6 +326,9 @@ def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[R
             observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
         recorded = setting.noise.add_to(observed, rng)
         channels = dict(zip(setting.channels, recorded.T, strict=True))
-        last = run_index >= case.runs - held_out
-        runs.append(Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, last))
+        is_held_out = run_index >= first_held_out
+        # The recording states neither initial states nor constants of a run.
+        runs.append(
+            Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, is_held_out)
+        )
     return tuple(runs)

@@ -12,12 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.effect_sizing import simulate_observations
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     MAX_RUNS,
     RecordingConditions,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import SIMULATORS
+from bench.diagnosis_benchmark.case_generation.refitted_residuals import simulate_observations
 from sims import effects as library
 from sims.core.simulator import Array
 
@@ -77,7 +77,7 @@ def draw_effect_shape(
     """Draw the shape of an effect or unmodelled cause: everything except its strength.
 
     The shape is the sign, direction, period, speed or time constant. The strength stays free, so
-    that `effect_sizing` can find the one that gives the requested size.
+    that `refitted_residuals` can find the one that gives the requested size.
 
     Args:
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
@@ -87,6 +87,7 @@ def draw_effect_shape(
     Returns:
         Coefficients as a function of the strength.
     """
+    # A gust of a ball differs from one of a pendulum or slider, so the key contains this, too.
     if (unmodelled_cause := (setting.system == "ball", name)) in UNMODELLED_SAMPLERS:
         return UNMODELLED_SAMPLERS[unmodelled_cause](BaseMotion(setting), rng)
     kind = SIMULATORS[setting.system].system.kind
@@ -114,11 +115,11 @@ def draw_direction(
     rng: np.random.Generator,
     *further_coefficients: float,
 ) -> CoefficientFunction:
-    """Draw the direction of an effect with two components, such as a horizontal or a phase angle.
+    """Draw the angle of an effect with two components: a horizontal direction, or a phase.
 
     Args:
         coefficient_scale: magnitude at strength 1.
-        motion: motion without hidden causes; unused here.
+        motion: unused; all samplers of shapes have the same arguments.
         rng: random generator.
         *further_coefficients: coefficients that do not depend on the strength, such as a
             period.
@@ -189,9 +190,8 @@ def _draw_periodic_force(
         Function from the strength to sine amplitude, cosine amplitude and frequency.
     """
     low, high = 1.5 / motion.seconds, 4.0
-    return draw_direction(
-        coefficient_scale, motion, rng, float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    )
+    frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return draw_direction(coefficient_scale, motion, rng, frequency)  # the direction is the phase
 
 
 def _draw_wind(
@@ -238,9 +238,9 @@ def _draw_stribeck(
         Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
         speed.
     """
-    extra, median_speed = rng.uniform(2.0, 6.0), motion.speed
-    # The speed of the peak is 15 to 50 % of the median speed, in m/s or rad/s.
-    speed = float(np.clip(median_speed * rng.uniform(0.15, 0.5), 0.02, 2.0))
+    # The static part is added to the Coulomb friction: its factor is 3 to 7 less 1.
+    extra = rng.uniform(2.0, 6.0)
+    speed = float(np.clip(motion.speed * rng.uniform(0.15, 0.5), 0.02, 2.0))  # m/s or rad/s
     return lambda s: (coefficient_scale * s, extra * coefficient_scale * s, speed)
 
 
@@ -252,9 +252,9 @@ def _draw_saturation(
     The effect vanishes at strength 0, because the input never exceeds its own peak.
 
     Args:
-        coefficient_scale: unused here.
+        coefficient_scale: unused, as `rng`: all samplers of shapes have the same arguments.
         motion: motion without hidden causes.
-        rng: random generator.
+        rng: unused.
 
     Returns:
         Function from the strength to the limit.
@@ -277,8 +277,9 @@ def _draw_direction_dependent_friction(
         Function from the strength to the coefficients of both directions.
     """
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
-    rng.shuffle(shares)
-    return lambda s: (coefficient_scale * shares[0] * s, coefficient_scale * shares[1] * s)
+    rng.shuffle(shares)  # either direction may be the one with more friction
+    forward, backward = shares
+    return lambda s: (coefficient_scale * forward * s, coefficient_scale * backward * s)
 
 
 def _draw_power_law(
@@ -290,9 +291,9 @@ def _draw_power_law(
     that keeps the peak is peak^-s - 1.
 
     Args:
-        coefficient_scale: unused here.
+        coefficient_scale: unused, as `rng`: all samplers of shapes have the same arguments.
         motion: motion without hidden causes.
-        rng: random generator.
+        rng: unused.
 
     Returns:
         Function from the strength to gain and power.
@@ -307,9 +308,9 @@ def _draw_rate_limit(
     """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength.
 
     Args:
-        coefficient_scale: unused here.
+        coefficient_scale: unused, as `rng`: all samplers of shapes have the same arguments.
         motion: motion without hidden causes.
-        rng: random generator.
+        rng: unused.
 
     Returns:
         Function from the strength to the maximum rate of the input.
@@ -366,9 +367,9 @@ def _draw_position_friction(
 def _draw_warm_up_friction(
     coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous.
+    """Draw warm-up friction, partly viscous, which is largest at the begin of a run.
 
-    Friction is largest at the begin of a run and decays exponentially.
+    It decays exponentially, with a time constant of 0.2 to 0.8 run lengths but at least 0.5 s.
 
     Args:
         coefficient_scale: Coulomb friction at the begin, at strength 1.
@@ -378,9 +379,10 @@ def _draw_warm_up_friction(
     Returns:
         Function from the strength to Coulomb friction, viscous friction and time constant.
     """
-    time = float(motion.seconds * rng.uniform(0.2, 0.8))
+    time_constant = max(float(motion.seconds * rng.uniform(0.2, 0.8)), 0.5)
+    # At the median speed, the viscous part is at most as large as the Coulomb friction.
     viscous = float(coefficient_scale * rng.uniform(0.0, 1.0) / motion.speed)
-    return lambda s: (coefficient_scale * s, viscous * s, max(time, 0.5))
+    return lambda s: (coefficient_scale * s, viscous * s, time_constant)
 
 
 def _draw_sensor_slip(
@@ -433,12 +435,12 @@ def _draw_backlash(
     """Draw backlash between drive and load: at strength 1 the gap is 0.3 of the travel.
 
     Args:
-        coefficient_scale: unused here.
+        coefficient_scale: unused; all samplers of shapes have the same arguments.
         motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
-        Function from the strength to gap and share of the load.
+        Function from the strength to the gap and the fraction of the inertia that is the load's.
     """
     share, travel = float(rng.uniform(0.2, 0.8)), motion.travel
     return lambda s: (0.3 * travel * s, share)
@@ -475,17 +477,12 @@ def _draw_end_stop(
         rng: random generator.
 
     Returns:
-        Function from the strength to stiffness (its sign is the side of the stop), place, and
+        Function from the strength to stiffness (its sign is the side of the stop), position, and
         damping.
     """
-    # 5 to 20 % of the samples of the path lie beyond the stop, on one side.
     side, share_beyond = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
-    stop_position = float(
-        np.quantile(
-            motion.path,
-            1 - share_beyond if side > 0 else share_beyond,
-        )
-    )
+    stop_quantile = 1 - share_beyond if side > 0 else share_beyond
+    stop_position = float(np.quantile(motion.path, stop_quantile))
     # Loss of the stop: relative increase of its force per unit of speed, in s/m or s/rad.
     loss = float(rng.uniform(0.0, 0.4)) / (5.0 if motion.system == "pendulum" else 1.0)
     return lambda s: (side * coefficient_scale * s, stop_position, loss)
@@ -580,22 +577,22 @@ def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> Coeff
 
 
 def _draw_soft_stop(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
-    """Draw a soft stop in every other run, which the motion reaches for a short time.
+    """Draw a soft stop: a spring beyond a position that 15 to 30 % of the samples pass.
 
-    It is a spring beyond a place that 15 to 30 % of the samples pass.
+    It is the unmodelled cause `latch`, which the simulation lets act in every other run only.
 
     Args:
         motion: motion without hidden causes.
         rng: random generator.
 
     Returns:
-        Function from the strength to stiffness (N m/rad or N/m) and place.
+        Function from the strength to stiffness (N m/rad or N/m) and position.
     """
     # The stop begins at the 70 to 85 % quantile of the path.
-    place = float(np.quantile(motion.path, rng.uniform(0.7, 0.85)))
+    position = float(np.quantile(motion.path, rng.uniform(0.7, 0.85)))
     # Stiffness at strength 1, in N m/rad for the pendulum and in N/m for the slider.
     max_stiffness = 10.0 if motion.system == "pendulum" else 2000.0
-    return lambda s: (max_stiffness * s, place)
+    return lambda s: (max_stiffness * s, position)
 
 
 def _draw_updraft(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:

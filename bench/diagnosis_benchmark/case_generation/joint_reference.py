@@ -61,10 +61,12 @@ class JointDynamics:
     def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the system and of its hidden causes, for one run.
 
-        Further attributes are `sideways`, the generalised force of a unit horizontal acceleration;
-        `latched`, whether the cause `latch` acts in this run (every other run); `breaks`, the times
-        at which a gust begins and ends; and `restless`, whether forces change with time while the
-        coordinate rests. The inertia of driven loads is subtracted from that of the drive side.
+        Further attributes:
+
+        * `sideways`: generalised force of a unit horizontal acceleration, by position,
+        * `latched`: whether the cause `latch` acts in this run (every other run),
+        * `breaks`: times at which a gust begins and ends, s,
+        * `restless`: whether forces change with time while the coordinate rests.
 
         Args:
             true_system: true system of a case: constants, parameters and hidden effects.
@@ -111,6 +113,7 @@ class JointDynamics:
             for name, coefficients in true_system.effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
+        # Loads behind a transmission are parts of the total inertia.
         self.inertia = total_inertia - sum(part.inertia for part in self.hidden_state_effects)
 
     def set_input_segment(self, segment: InputSegment) -> None:
@@ -203,8 +206,9 @@ class ReferenceLoad(ABC):
     def force(self, x: float, v: float, y: float, w: float) -> float:
         """Compute the force of the load on the drive side.
 
-        It is the reaction to the force that accelerates the load, and the load's share of the
-        weight is subtracted, since `JointDynamics` adds all the weight to the drive side.
+        It is the reaction to the force that accelerates the load. The part of the weight that
+        belongs to the load is subtracted, since `JointDynamics` adds all the weight to the drive
+        side.
 
         Args:
             x: position of the drive side.
@@ -429,11 +433,14 @@ UNMODELLED_CAUSES = ("patch", "gust", "ageing", "latch")
 
 
 def compute_transmitted_force(drive: float, against: float) -> float:
-    """Return the smaller force that gears transmit; zero if both forces have the same direction.
+    """Compute the magnitude of the force that gears transmit from the drive to the load.
+
+    It is the smaller one of both forces if they oppose each other, otherwise zero.
 
     Args:
-        drive: force of the drive side, N or N·m.
-        against: force of the load side.
+        drive: force of the drive, N or N·m.
+        against: force of the load, N or N·m, counted in the opposite direction: with equal signs
+            both forces oppose each other.
     """
     return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
 
@@ -494,16 +501,16 @@ def simulate_joint(
     joint, end_time = JointDynamics(true_system, number), float(instants[-1])
     names = ("q", "qd") if true_system.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
-    hidden = [
-        value for load in joint.hidden_state_effects for value in load.get_initial_state(*state)
+    hidden_states = [
+        value for effect in joint.hidden_state_effects for value in effect.get_initial_state(*state)
     ]
-    state = np.concatenate([state, hidden])
+    state = np.concatenate([state, hidden_states])
     states = np.empty((instants.size, 2))
     states[instants <= 0] = state[:2]
     for segment in compute_applied_input(scenario, true_system.effects, end_time):
         boundaries = [
             segment.begin,
-            *(b for b in sorted(joint.breaks) if segment.begin < b < segment.end),
+            *(time for time in sorted(joint.breaks) if segment.begin < time < segment.end),
             segment.end,
         ]
         for start, end in pairwise(boundaries):
@@ -531,6 +538,7 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
         time_reached, end_state, solution = _integrate_until_stop(joint, time, state)
         first, last = np.searchsorted(instants, [time, time_reached], side="right")
         if last > first:
+            # Without a solution the coordinate rests; hidden states are not returned.
             states[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
         time, state = time_reached, end_state
     raise RuntimeError("no solution: the joint stops too often")
@@ -554,7 +562,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     """
     (x, v, *z), end = state, joint.segment.end
     direction = copysign(1.0, v) if v else 0.0
-    if joint.limits and v == 0.0:
+    if joint.limits and v == 0.0:  # dry friction, and the coordinate rests
         force = joint.compute_force(start, x, 0.0, *z)
         if abs(force) <= joint.compute_friction_limit(start, x, 0.0):
             if z:
@@ -585,7 +593,8 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     stop_event: Any = compute_directed_velocity
     stop_event.terminal, stop_event.direction = True, -1
     events = stop_event if joint.limits else None
-    max_first_step = MAX_FIRST_STEPS[0] if joint.limits else MAX_FIRST_STEPS[1]
+    with_friction, without_friction = MAX_FIRST_STEPS
+    max_first_step = with_friction if joint.limits else without_friction
     settings: dict[str, Any] = {
         "dense_output": True,
         "max_step": MAX_STEP,
@@ -597,6 +606,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     if not solved.success:
         raise RuntimeError(solved.message)
     end_state = solved.y[:, -1].copy()
+    # At a standstill the velocity is exactly zero, by which the next call recognises it.
     if joint.limits and solved.t_events is not None and solved.t_events[0].size:
         end_state[1] = 0.0
     return float(solved.t[-1]), end_state, solved.sol
@@ -660,11 +670,8 @@ def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
     grid: Sequence[float] = np.linspace(start, end, max(3, int(500 * (end - start)))).tolist()
     for left_time, right_time in pairwise(grid):
         if excess(right_time) > 0:
+            if excess(left_time) >= 0:  # no change of sign, which Brent's method needs
+                return right_time
             # Slightly after the root: at the root, the coordinate would still count as held.
-            return min(
-                brentq(excess, left_time, right_time, xtol=1e-13) + 1e-12
-                if excess(left_time) < 0
-                else right_time,
-                end,
-            )
+            return min(brentq(excess, left_time, right_time, xtol=1e-13) + 1e-12, end)
     return end

@@ -72,7 +72,7 @@ class SensorNoise:
     stated: bool = True
 
     def add_to(self, observed: Array, rng: np.random.Generator) -> Array:
-        """Add noise to observations: rounding, noise with memory (AR(1)), or white noise.
+        """Add noise to observations: rounding, autocorrelated noise (AR(1)), or white noise.
 
         All three have the standard deviation `sigma`. Before the rounding, white noise (dither) is
         added, as a real sensor has it.
@@ -89,7 +89,7 @@ class SensorNoise:
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded
-        if self.kind == "ar1":  # each sample is a share of the previous one plus new white noise
+        if self.kind == "ar1":  # x[t] = phi x[t-1] + sqrt(1 - phi^2) white noise, of variance 1
             for sample in range(1, len(white)):
                 white[sample] = (
                     self.phi * white[sample - 1] + np.sqrt(1 - self.phi**2) * white[sample]
@@ -169,7 +169,7 @@ def draw_conditions(
         system: name of the system, such as ``pendulum``.
         rng: random generator.
         hidden: names of the hidden effects.
-        requested: conditions that are not drawn.
+        requested: conditions that are given; those that are None are drawn.
     """
     # Rate in Hz and length of a run in s.
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
@@ -284,8 +284,8 @@ def _draw_pendulum_conditions(
             else {}
         )
         # Initial rate in rad/s, and angle in rad.
-        rates = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
-        start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rates}
+        rate = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
+        start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rate}
         scenario = Scenario(times, start, inputs)
         swing = PENDULUM.simulate(np.array([[parameters["inertia"]]]), scenario)
         if (
@@ -324,10 +324,10 @@ def _draw_slider_conditions(
         # Lowest and highest frequency in Hz.
         force = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
         force -= force.mean()  # otherwise the slider drifts away
+        # Range of the position, m, by integrating the acceleration twice.
         travel = np.ptp(np.cumsum(np.cumsum(force))) * times[1] ** 2 / parameters["mass"]
-        scenarios.append(
-            Scenario(times, start, {"u": force * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
-        )
+        amplitude = np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)  # N
+        scenarios.append(Scenario(times, start, {"u": force * amplitude}))
     return parameters, channels, scenarios
 
 
@@ -351,6 +351,7 @@ def draw_input_signal(
         levels: Array = rng.uniform(-1.0, 1.0, level_index[-1] + 1)[level_index]
         return levels
     log_low, log_high = np.log(hertz)
+    # A sine has the lower frequency; a chirp goes from the lower to the higher one.
     low, high = np.sort(np.exp(rng.uniform(log_low, log_high, 2)))
     # Number of cycles up to each time, the integral of the frequency.
     cycles = low * times
@@ -444,9 +445,12 @@ class BenchmarkCase(Document):
         Returns:
             The case; None if it is rejected or no coefficients give this size.
         """
-        effects = {n: c for n in causes if (c := find_coefficients(n)) is not None}
-        if len(effects) < len(causes):
-            return None
+        effects = {}
+        for name in causes:
+            coefficients = find_coefficients(name)
+            if coefficients is None:
+                return None
+            effects[name] = coefficients
         # A lag of the input comes last: nonlinear input effects act on the command.
         effects = dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
         beyond = compute_unexplained(effects)
@@ -476,6 +480,7 @@ def name_case(
         number: number that distinguishes the case from others.
         separator: text between the parts.
     """
+    # The values of `requested` are rate, number of runs and kind of noise.
     parts = [kind, system, effect, f"{size:g}" if size else "", *requested, number]
     return separator.join(str(part) for part in parts if part not in ("", None))
 

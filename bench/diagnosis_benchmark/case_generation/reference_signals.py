@@ -90,6 +90,7 @@ def compute_applied_input(
     levels, edges, lag = apply_input_effects(
         np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], effects
     )
+    # Equal neighbouring levels are one segment.
     changes = np.flatnonzero(np.diff(levels)) + 1
     starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
     # With a lag, each segment begins at the level that the one before it has reached.
@@ -184,6 +185,7 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
             deviation = level - state
             seconds_to_level = abs(deviation) / max_rate
             ramp_duration = min(seconds_to_level, end_of_step - start)
+            # Exactly the level if it is reached, so that the loop ends.
             next_state = (
                 level
                 if ramp_duration >= seconds_to_level
@@ -194,7 +196,7 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
             values.append(0.5 * (state + next_state) * ramp_share + next_state * (1 - ramp_share))
             starts.append(start)
             state, start = next_state, end_of_step
-        if start < end:
+        if start < end:  # the level is reached and held
             values.append(level)
             starts.append(start)
     return np.array(values), np.array(starts)

@@ -101,8 +101,9 @@ def simulate_with_scipy(
             instants = instants - coefficients[0]
         elif name == "clock.skew":
             instants = instants * (1 + coefficients[0])
+    # The motion is known from time 0 on: before it, a delayed sensor shows the initial state.
     instants = np.maximum.accumulate(np.maximum(instants, 0.0))
-    grid, rows = (
+    grid, sample_indices = (
         _refine_time_grid(instants)
         if "sensor.lag" in true_system.effects
         else (instants, np.arange(instants.size))
@@ -122,7 +123,7 @@ def simulate_with_scipy(
             )
         elif name == "sensor.lag":
             observed = _apply_lag(observed, grid, coefficients[0])
-    return observed[rows]
+    return observed[sample_indices]
 
 
 def simulate_with_mujoco(
@@ -182,13 +183,13 @@ def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
     Returns:
         The grid, and the index of each sample time in it.
     """
-    grid, rows = [0.0], []
+    grid, sample_indices = [0.0], []
     for instant in instants.tolist():
         if instant > grid[-1]:
             parts = int(np.ceil((instant - grid[-1]) / FINE_STEP_SECONDS))
             grid += np.linspace(grid[-1], instant, parts + 1)[1:].tolist()
-        rows.append(len(grid) - 1)
-    return np.array(grid), np.array(rows)
+        sample_indices.append(len(grid) - 1)
+    return np.array(grid), np.array(sample_indices)
 
 
 def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
@@ -207,9 +208,8 @@ def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
     lagged, y = values.copy(), values[0].copy()
     for sample, step in enumerate(np.diff(grid).tolist()):
         slope = (values[sample + 1] - values[sample]) / step
-        particular_solution = (
-            values[sample] - slope * lag
-        )  # particular solution: `lag` seconds behind the line
+        # On a line, the lagging reading ends up `lag` seconds behind it.
+        particular_solution = values[sample] - slope * lag
         y = particular_solution + slope * step + (y - particular_solution) * exp(-step / lag)
         lagged[sample + 1] = y
     return lagged

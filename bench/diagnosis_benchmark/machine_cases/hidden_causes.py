@@ -116,11 +116,12 @@ def list_effect_places(system: str, effect: str) -> tuple[str, ...]:
 
 
 def get_joint(system: str, place: str) -> int:
-    """Return the index of the joint that a place belongs to.
+    """Return the index of the joint that a place belongs to; each joint has one of each kind.
 
     Args:
         system: servo or arm2.
-        place: name of a joint, body, motor or channel.
+        place: name of a joint, body, motor or channel; empty for an effect on the whole machine,
+            which gets index 0.
     """
     plant = MACHINES[system]
     for names in (plant.joints, plant.bodies, plant.motors, plant.channels):
@@ -134,8 +135,8 @@ def draw_effect_shape(
 ) -> CoefficientFunction:
     """Draw the shape of a cause at a place: everything but its strength, such as its sign.
 
-    Forces are scaled by the typical forces and speeds of the joint, effects of the input by its
-    commands, and others have a fixed largest coefficient.
+    The largest coefficient is fixed for some effects (`_MAX_COEFFICIENTS`). Forces are scaled by
+    the typical forces and speeds of the joint, other effects of the input by its commands.
 
     Args:
         name: ``cause@place``, or ``cause`` alone.
@@ -158,8 +159,9 @@ def draw_effect_shape(
     if effect in MOTION_SCALED_EFFECTS:
         return MOTION_SCALED_EFFECTS[effect](typical_scales, rng)
     if effect == "gravity.tilt":
-        phase_coefficients = (0.0,) if setting.system == "arm2" else ()
-        return lambda s: (TILT_AT_STRENGTH_ONE * sign * s, *phase_coefficients)
+        # An arm can be tilted along x and y, of which its motion in a plane shows only the first.
+        tilt_along_y = (0.0,) if setting.system == "arm2" else ()
+        return lambda s: (TILT_AT_STRENGTH_ONE * sign * s, *tilt_along_y)
     command = setting.fitted_runs.commands[:, :, joint]
     max_command = float(np.abs(command).max())
     return {
@@ -205,7 +207,7 @@ def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> 
     Returns:
         Function from the strength to sine amplitude, cosine amplitude, and period.
     """
-    angle = rng.uniform(0, 2 * np.pi)
+    angle = rng.uniform(0, 2 * np.pi)  # phase
     period = float(np.clip(typical_scales["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
     sine, cosine = (
         2 * typical_scales["force"] * float(function(angle)) for function in (np.sin, np.cos)

@@ -62,8 +62,9 @@ class MachineDynamics(ABC):
         """Store the parameters and add the hidden causes.
 
         Further attributes are `added`, additional rotor inertia (N,); `patch`, (joint, friction
-        limit, centre, half width) of dry friction in a region; and `dull`, the deadband of a servo
-        in rad. Effects on commands and sensors stay in `effects`; `reference_motion` applies them.
+        limit, centre, half width) of dry friction in a region; and `dull`, the dead band of a servo
+        in rad. Effects on commands and sensors stay in `effects`; `machine_simulation` applies
+        them.
 
         Shapes: N joints.
 
@@ -85,11 +86,12 @@ class MachineDynamics(ABC):
 
     @property
     def has_dry_friction(self) -> NDArray[np.bool_]:
-        """True if each joint has dry friction, (N,)."""
-        rubs = (self.dry > 0) | (self.extra > 0)
+        """For each joint, true if it has dry friction anywhere, (N,)."""
+        has_friction = (self.dry > 0) | (self.extra > 0)
         if self.patch:
-            rubs[self.patch[0]] = True
-        return rubs
+            joint, *_ = self.patch
+            has_friction[joint] = True
+        return has_friction
 
     def compute_friction_limit(self, q: Array, v: Array) -> Array:
         """Compute the dry friction limit: the friction of a moving joint, the most at rest.
@@ -171,23 +173,24 @@ class MachineDynamics(ABC):
     def _add_effect(self, effect: str, place: str, c: list[float]) -> None:
         """Add a hidden cause to the equations of motion.
 
-        A patch is dry friction in a region of a joint angle: its limit, centre and half width.
-        Effects on commands (``input.``) and sensors (``sensor.``) are ignored here;
-        `reference_motion` applies them.
+        A force law or a tilt becomes a function in `acts`; friction, inertia, dead band and mass
+        change an attribute. Effects on commands (``input.``) and sensors (``sensor.``) are ignored
+        here; `machine_simulation` applies them.
 
         Args:
-            effect: name of the effect or unmodelled cause.
+            effect: name of the effect or unmodelled cause; a patch is dry friction in a region of a
+                joint angle.
             place: joint or body on which it acts; empty if the machine has only one place.
-            c: coefficients.
+            c: coefficients; of a patch its friction limit, centre and half width.
         """
         if effect in JOINT_FORCE_LAWS:
             joint, law = self.joints.index(place), JOINT_FORCE_LAWS[effect]
 
             def act(t: float, q: Array, v: Array, u: Array) -> Array:
                 """Return the generalised forces (L, N) of the effect on its joint."""
-                pushed = np.zeros_like(q)
-                pushed[:, joint] = law(c, t, q[:, joint], v[:, joint])
-                return pushed
+                force = np.zeros_like(q)
+                force[:, joint] = law(c, t, q[:, joint], v[:, joint])
+                return force
 
             self.acts.append(act)
         elif effect == "friction.coulomb":
@@ -273,7 +276,7 @@ class ServoDynamics(MachineDynamics):
         """
         n = self.numbers
         error = u[:, 0] - q[:, 0]
-        if self.dull:
+        if self.dull:  # the controller ignores errors within the dead band
             error = error - np.clip(error, -self.dull, self.dull)
         duty = np.clip(n["kp"] * n["error_gain"] * error, -1.0, 1.0)
         k = n["torque_constant"]
@@ -322,10 +325,13 @@ class ArmDynamics(MachineDynamics):
     def compute_mass_matrix(self, q: Array) -> Array:
         """Compute the mass matrices (L, 2, 2) of the arm, equations (2) and (3).
 
-        Shapes: L batch elements.
+            M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1                     (2)
+            M12 = I2 + m2 (c2^2 + l c2 cos q2),   M22 = I2 + m2 c2^2 + A2                      (3)
 
-        M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1 (2), M12 = I2 + m2 (c2^2 + l
-        c2 cos q2), M22 = I2 + m2 c2^2 + A2 (3), with the inertias A1, A2 of the rotors.
+        with masses m, distances c of the centres of mass, inertias I, length l of the first link
+        and inertias A of the rotors.
+
+        Shapes: L batch elements.
 
         Args:
             q: positions, (L, 2).
@@ -345,11 +351,13 @@ class ArmDynamics(MachineDynamics):
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
-        """Compute the forces of inputs, gravity, Coriolis effects and damping, as in (4).
+        """Compute the forces (L, 2) of inputs, gravity, Coriolis effects and damping.
+
+        They are the right-hand side of equation (4),
+
+            u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2).
 
         Shapes: L batch elements.
-
-        It is u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2) (4).
 
         Args:
             q: positions, (L, 2).

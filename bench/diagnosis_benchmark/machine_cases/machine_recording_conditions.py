@@ -23,7 +23,7 @@ from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     Effects,
     MachineDynamics,
 )
-from bench.diagnosis_benchmark.machine_cases.reference_motion import (
+from bench.diagnosis_benchmark.machine_cases.machine_simulation import (
     MachineMotion,
     MachineRuns,
     read_encoders,
@@ -86,8 +86,8 @@ class MachineRecordingConditions:
 
     def take_first_runs(self, count: int) -> MachineRuns:
         """Return the first runs."""
-        commands, q, v = (part[:count] for part in self.runs[1:])
-        return MachineRuns(self.runs.times, commands, q, v)
+        times, *arrays = self.runs
+        return MachineRuns(times, *(array[:count] for array in arrays))
 
     def make_machine(self, causes: Effects) -> MachineDynamics:
         """Make the machine with hidden causes: effects of the library, or unmodelled ones."""
@@ -102,7 +102,7 @@ class MachineRecordingConditions:
 
         Args:
             causes: hidden causes.
-            coarse: factor of the step size.
+            coarse: factor of the step size; above 1 is faster and less accurate.
 
         Returns:
             Readings, (R, T, N).
@@ -155,7 +155,7 @@ def draw_conditions(
     Args:
         system: servo or arm2.
         rng: random generator.
-        requested: conditions that are not drawn.
+        requested: conditions that are given; those that are None are drawn.
     """
     rate, seconds = int(rng.choice(SAMPLING_RATES_HZ)), float(rng.choice(RUN_LENGTHS_SECONDS))
     count = int(rng.choice(FITTED_RUN_COUNTS))
@@ -259,6 +259,7 @@ def _draw_runs(
     # Amplitude of the commands: rad for a servo, N m for an arm.
     is_servo = plant.motors == ("goal",)
     amplitude = 0.7 if is_servo else np.abs(plant.compute_gravity_force(probe_positions))[0] * 1.5
+    # Signals have amplitude 1.
     commands = commands * amplitude * rng.uniform(0.5, 1.0, (count, 1, joints))
     for _ in range(MAX_COMMAND_ATTEMPTS):
         runs = MachineRuns(times, commands, initial_positions, np.zeros_like(initial_positions))

@@ -19,14 +19,16 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
 from bench.diagnosis_benchmark.case_set import list_coefficient_names, render_recording, write_case
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import RegressionEvidence
 from bench.diagnosis_benchmark.grading import _count_classes, grade_answer
+from bench.diagnosis_benchmark.machine_cases.arm_model_file import (
+    MODEL_FILE_NAME,
+    render_arm_mjcf,
+)
 from bench.diagnosis_benchmark.machine_cases.hidden_causes import (
     EFFECTS_BY_MACHINE,
     list_effect_places,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import (
-    MODEL_FILE_NAME,
     draw_case,
-    render_arm_mjcf,
     restore_conditions,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
@@ -34,7 +36,7 @@ from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     ArmDynamics,
     ServoDynamics,
 )
-from bench.diagnosis_benchmark.machine_cases.reference_motion import (
+from bench.diagnosis_benchmark.machine_cases.machine_simulation import (
     MachineRuns,
     read_encoders,
     simulate_machine,

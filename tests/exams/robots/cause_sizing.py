@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import (
+from bench.diagnosis_benchmark.case_generation.strength_search import (
     compute_orthonormal_basis,
     find_strength_for_size,
 )

@@ -11,7 +11,7 @@ from bench.diagnosis_benchmark.case_generation.reference_signals import (
     SENSOR_EFFECTS,
     apply_input_effects,
 )
-from bench.diagnosis_benchmark.machine_cases.reference_motion import select_signal_effects
+from bench.diagnosis_benchmark.machine_cases.machine_simulation import select_signal_effects
 
 FORMS = ("multisine", "ramps", "steps", "chirp")
 

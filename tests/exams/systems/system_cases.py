@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation import effect_sizing
+from bench.diagnosis_benchmark.case_generation import refitted_residuals
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     SUBTHRESHOLD_SIZES,
     SYSTEMS,
@@ -118,11 +118,12 @@ class SystemCase(Case):
             return {}
         names = [name for names in sets for name in names if name not in item.effects]
         setting = restore_conditions(item)
-        observed = effect_sizing.simulate_observations(setting, item.effects)
+        observed = refitted_residuals.simulate_observations(setting, item.effects)
         phi = setting.noise.phi if item.noise == "ar1" else 0.0
         samples = observed.size * (1 - phi) / (1 + phi)  # Effective number with AR(1) noise.
         return {
-            name: effect_sizing.compute_refitted_residual(setting, observed, name) * samples**0.5
+            name: refitted_residuals.compute_refitted_residual(setting, observed, name)
+            * samples**0.5
             for name in names[:MAX_COMPETING_CAUSES]
         }
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from bench.diagnosis_benchmark.case_generation import effect_coefficients, effect_sizing
+from bench.diagnosis_benchmark.case_generation import effect_coefficients, refitted_residuals
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     EQUIVALENT_EFFECTS,
     count_held_out_runs,
@@ -98,7 +98,7 @@ def test_the_hidden_effect_leaves_only_noise(system, effect):
         observed = np.array(
             [see(drawn.make_true_system(item.effects), s, drawn.channels) for s in drawn.scenarios]
         )
-        left = effect_sizing.compute_refitted_residual(
+        left = refitted_residuals.compute_refitted_residual(
             drawn, observed, effect, item.effects[effect]
         )
         assert left * observed.size**0.5 < 1.0  # Sigmas of evidence against the true cause.
@@ -117,9 +117,9 @@ def test_cases_that_the_sensors_cannot_show_are_refused():
 
 def test_neither_of_two_effects_explains_both():
     item = draw_case("double", "ball", 1)
-    observed = effect_sizing.simulate_observations(restore_conditions(item), item.effects)
+    observed = refitted_residuals.simulate_observations(restore_conditions(item), item.effects)
     left = [
-        effect_sizing.compute_refitted_residual(restore_conditions(item), observed, name, c)
+        refitted_residuals.compute_refitted_residual(restore_conditions(item), observed, name, c)
         for name, c in item.effects.items()
     ]
     assert len(left) == 2
@@ -157,11 +157,11 @@ def test_equivalent_effects_explain_each_other(system, driven, names):
     )
     drawn = next(conditions for conditions in drawings if conditions.is_driven is driven)
     first = min(names)
-    observed = effect_sizing.simulate_observations(
+    observed = refitted_residuals.simulate_observations(
         drawn, {first: find_coefficients(first, drawn, 3.0, np.random.default_rng(0))}
     )
     for other in names - {first}:
-        assert effect_sizing.compute_refitted_residual(drawn, observed, other) < 0.03
+        assert refitted_residuals.compute_refitted_residual(drawn, observed, other) < 0.03
 
 
 def test_the_same_seed_gives_the_same_files(tmp_path):

@@ -65,13 +65,16 @@ def simulate_machine(
     Args:
         plant: machine with its parameters and hidden causes.
         runs: initial states and commands.
-        coarse: factor of the step size.
+        coarse: factor of the step size; above 1 is faster and less accurate.
+
+    Returns:
+        The motion at the times of all steps.
     """
     sampling_interval = runs.times[1] - runs.times[0]
     max_step = coarse * (
         FRICTION_STEP_SECONDS if plant.has_dry_friction.any() else SMOOTH_STEP_SECONDS
     )
-    # The small number prevents a further part by rounding.
+    # Steps per sampling interval; the small number prevents a further step by rounding.
     parts = int(np.ceil(sampling_interval / max_step - 1e-9))
     times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
     applied_inputs = compute_applied_inputs(runs, plant, times)
@@ -98,7 +101,7 @@ class _MachineIntegrator:
     def __init__(self, plant: MachineDynamics, q: Array, v: Array) -> None:
         """Start at given positions and velocities.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             plant: machine with its parameters and hidden causes.
@@ -117,7 +120,7 @@ class _MachineIntegrator:
         With dry friction, the direction of friction is fixed for the step; joints that come to rest
         within it are corrected afterwards.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             t: time at the begin of the step, s.
@@ -142,7 +145,7 @@ class _MachineIntegrator:
     def _compute_accelerations(self, t: float, q: Array, v: Array, u: Array) -> Array:
         """Compute the accelerations (L, N), with dry friction against the direction of motion.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             t: time, s.
@@ -158,7 +161,7 @@ class _MachineIntegrator:
     def _solve_accelerations(self, q: Array, force: Array) -> Array:
         """Solve M q'' = force for the accelerations (L, N); those of stuck joints are zero.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             q: positions, (L, N).
@@ -167,6 +170,7 @@ class _MachineIntegrator:
         is_free = ~self.held
         inertia = self.plant.compute_mass_matrix(q)
         if self.held.any():
+            # Rows and columns of stuck joints become those of the identity matrix.
             inertia = np.where(is_free[:, :, None] & is_free[:, None], inertia, 0.0)
             inertia += np.eye(q.shape[1]) * self.held[:, :, None]
             force = np.where(is_free, force, 0.0)
@@ -183,7 +187,7 @@ class _MachineIntegrator:
 
         A joint breaks away if holding it needs more force than its friction limit.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             t: time, s.
@@ -191,7 +195,7 @@ class _MachineIntegrator:
         """
         resting = self.has_friction & (self.v == 0.0)
         self.sliding_direction = np.where(self.has_friction & ~resting, np.sign(self.v), 0.0)
-        self.held = resting
+        self.held = resting  # all at first; those that break away are released below
         if not resting.any():
             return
         limit = self.plant.compute_friction_limit(self.q, self.v)
@@ -213,7 +217,7 @@ class _MachineIntegrator:
         The time of rest is estimated by linear interpolation of the velocity. For the time that is
         left (`remaining_time`), the joint sticks or moves with constant acceleration.
 
-        Shapes: L batch elements, N joints.
+        Shapes: L runs, N joints.
 
         Args:
             t: time at the begin of the step, s.
@@ -221,6 +225,7 @@ class _MachineIntegrator:
             u: applied input, (L, N).
             velocity_before: velocities at the begin of the step, (L, N).
         """
+        # The velocity has changed its sign against the direction of friction.
         has_stopped = (self.sliding_direction * self.v < 0.0) & (
             self.sliding_direction * velocity_before >= 0.0
         )
@@ -228,10 +233,12 @@ class _MachineIntegrator:
             return
         with np.errstate(divide="ignore", invalid="ignore"):
             remaining_time = np.where(has_stopped, self.v / (self.v - velocity_before), 0.0) * h
+        # The motion after the time of rest, in the wrong direction, is taken back.
         q = self.q - np.where(has_stopped, 0.5 * self.v * remaining_time, 0.0)
         v = np.where(has_stopped, 0.0, self.v)
         self.q, self.v = q, v
         self._update_stuck_joints(t + h, u)
+        # Zero for a joint that sticks, otherwise with friction in the new direction.
         onward = np.where(has_stopped, self._compute_accelerations(t + h, q, v, u), 0.0)
         self.q, self.v = q + 0.5 * onward * remaining_time**2, v + onward * remaining_time
 
@@ -241,7 +248,7 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
 
     Effects without memory act first, then delay and lag.
 
-    Shapes: L batch elements, N joints.
+    Shapes: L runs, N joints.
 
     Args:
         runs: the runs with their commands.
@@ -257,11 +264,11 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
         input_effects = select_signal_effects(plant.effects, "input.", motor)
         for run in range(run_count):
             levels: Array = runs.commands[run, :, joint]
-            for name, c in input_effects.items():
+            for name, coefficients in input_effects.items():
                 if name in STEPWISE_INPUT_EFFECTS:
-                    levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
-            delay = input_effects.get("input.delay", (0.0,))[0]
-            lag = input_effects.get("input.lag", (0.0,))[0]
+                    levels = STEPWISE_INPUT_EFFECTS[name](levels, *coefficients)
+            (delay,) = input_effects.get("input.delay", (0.0,))
+            (lag,) = input_effects.get("input.lag", (0.0,))
             applied_inputs[run, :, joint] = _average_input(runs.times, levels, times, delay, lag)
     return applied_inputs
 
@@ -282,7 +289,7 @@ def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag
     Returns:
         Averages, (K,).
     """
-    # The first level holds before the first sample, the last one after the last sample.
+    # The last level holds for one second more, so that the integral reaches beyond the last step.
     end_times = np.append(stamps[1:], times[-1] + 1.0)
     integral_at_samples = np.concatenate([[0.0], np.cumsum(levels * (end_times - stamps))])
     delayed_times = times - delay
@@ -329,7 +336,7 @@ def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> 
 def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -> Array:
     """Compute the encoder readings at the sample times.
 
-    Shapes: L batch elements, T samples, N joints.
+    Shapes: L runs, T samples, N joints.
 
     Args:
         motion: simulated motion.
@@ -339,14 +346,16 @@ def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -
     Returns:
         Readings, (L, T, N).
     """
-    lanes, joints = motion.q.shape[1:]
-    readings = np.empty((lanes, len(times), joints))
+    _, runs, joints = motion.q.shape
+    readings = np.empty((runs, len(times), joints))
     for joint, channel in enumerate(plant.channels):
         sensor_effects = select_signal_effects(plant.effects, "sensor.", channel)
-        delayed_times = np.maximum(times - sensor_effects.get("sensor.delay", (0.0,))[0], 0.0)
+        (delay,) = sensor_effects.get("sensor.delay", (0.0,))
+        delayed_times = np.maximum(times - delay, 0.0)
         values = _interpolate_positions(motion, delayed_times)[:, :, joint].T
         for name in ("sensor.gain", "sensor.bias", "sensor.drift"):
             if name in sensor_effects:
+                # Times since the first sample are those of the recording: it starts at zero.
                 values = SENSOR_EFFECTS[name](values, sensor_effects[name], times, times)
         readings[:, :, joint] = values
     return readings
@@ -355,7 +364,7 @@ def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -
 def select_signal_effects(
     effects: Effects, prefix: str, place: str
 ) -> dict[str, tuple[float, ...]]:
-    """Select the effects on one signal.
+    """Select the effects on one motor or channel: those at it, and those without a place.
 
     Args:
         effects: coefficients by name, with or without a place.
@@ -366,8 +375,8 @@ def select_signal_effects(
         Coefficients by name without the place.
     """
     return {
-        name.partition("@")[0]: tuple(c)
-        for name, c in effects.items()
+        name.partition("@")[0]: tuple(coefficients)
+        for name, coefficients in effects.items()
         if name.startswith(prefix) and name.partition("@")[2] in ("", place)
     }
 
@@ -375,17 +384,18 @@ def select_signal_effects(
 def _interpolate_positions(motion: MachineMotion, query_times: Array) -> Array:
     """Interpolate positions (T, L, N) by cubic Hermite polynomials, which use velocities too.
 
-    Shapes: L batch elements, T samples, N joints.
+    Shapes: L runs, T samples, N joints.
 
     Args:
         motion: simulated motion with steps of equal length.
         query_times: times, s, (T,).
     """
     step = motion.times[1] - motion.times[0]
-    place = np.clip((query_times / step).astype(int), 0, len(motion.times) - 2)
-    s = ((query_times - motion.times[place]) / step)[:, None, None]
-    q0, q1 = motion.q[place], motion.q[place + 1]
-    v0, v1 = motion.v[place] * step, motion.v[place + 1] * step
+    interval = np.clip((query_times / step).astype(int), 0, len(motion.times) - 2)
+    # Relative time within the interval, 0 to 1; velocities are per interval.
+    s = ((query_times - motion.times[interval]) / step)[:, None, None]
+    q0, q1 = motion.q[interval], motion.q[interval + 1]
+    v0, v1 = motion.v[interval] * step, motion.v[interval + 1] * step
     positions: Array = (
         q0 * (1 + 2 * s) * (1 - s) ** 2
         + v0 * s * (1 - s) ** 2

@@ -16,12 +16,12 @@ from itertools import product
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.cause_sizes import arrange_slopes
 from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     EffectCoefficients,
 )
+from bench.diagnosis_benchmark.case_generation.strength_search import arrange_slopes
 from sims import effects as library
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
@@ -118,17 +118,20 @@ class NuisanceFitter:
             theta: starting values of parameters and coefficients; None for those of the conditions.
             starts: starting values of the initial states, (R, S); None for those of the conditions.
             rounds: maximum number of iterations.
+
+        Returns:
+            The fit; its RMS residual is infinite if the simulation diverges at the start.
         """
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
         starts, damping = self.starts if starts is None else starts, FIRST_DAMPING
         residual, slope = self.linearise(observed, theta, starts)
-        if not np.isfinite(residual).all():
+        if not np.isfinite(residual).all():  # the simulation diverges at the start
             return ResidualFit(np.inf, theta, starts)
         for _ in range(rounds):
             step = self.compute_step(residual, slope, damping)
-            count = theta.size
-            new_theta = np.clip(theta + step[:count] * self.scales, self.low, self.high)
-            new_starts = starts + step[count:].reshape(starts.shape)
+            theta_step, starts_step = step[: theta.size], step[theta.size :]
+            new_theta = np.clip(theta + theta_step * self.scales, self.low, self.high)
+            new_starts = starts + starts_step.reshape(starts.shape)
             new_residual, new_slope = self.linearise(observed, new_theta, new_starts)
             if not new_residual @ new_residual < residual @ residual:  # a NaN is no improvement
                 damping *= DAMPING_INCREASE
@@ -229,6 +232,9 @@ def make_gap_function(
 ) -> Callable[[float], float]:
     """Make the function that computes the size of a cause from its strength.
 
+    The size is the RMS residual that is left when the model without the cause is refitted to the
+    recording with the cause. Each call starts its fit at the result of the last one.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -244,14 +250,12 @@ def make_gap_function(
     def compute_size(strength: float) -> float:
         """Return the RMS residual, in units of the noise, that a cause of a strength leaves.
 
-        The recording with the cause is refitted by the model without it. The fit starts at the
-        values of the last strength, scaled to this strength, which saves iterations.
-
         `observed` gives the recording with the cause at a strength, and `fit` refits the model
-        without it.
+        without it, from the true parameters and initial states or, if there was a call before, from
+        values extrapolated from its fit, which saves iterations.
         """
         theta, starts = fit.theta, fit.starts
-        # Fitted parameters and states change about in proportion to the strength.
+        # The fitted values differ from the true ones about in proportion to the strength.
         if last_evaluation:
             last_strength, fitted = last_evaluation[-1]
             share = strength / last_strength
@@ -326,17 +330,21 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     base_fit = NuisanceFitter(setting)(observed)
     usable = library.list_effects_for(SIMULATORS[setting.system].system)
     names = [
-        n for n in usable if setting.is_driven or not (n.startswith("input.") or n == "backlash")
+        name
+        for name in usable
+        if setting.is_driven or not (name.startswith("input.") or name == "backlash")
     ]
-    best_starts = {n: _rank_starts(setting, observed, n, base_fit)[0] for n in names}
-    promising_names = sorted(best_starts, key=lambda n: best_starts[n][0])[:MAX_REFITTED_EFFECTS]
+    # By effect, the first-order residual of its best start, and the start.
+    best_starts = {name: _rank_starts(setting, observed, name, base_fit)[0] for name in names}
+    promising_names = sorted(names, key=lambda name: best_starts[name][0])[:MAX_REFITTED_EFFECTS]
     residuals = {}
-    for n in promising_names:
-        _, theta = best_starts[n]
-        refit = NuisanceFitter(setting, [n])(observed, theta, base_fit.starts)
-        residuals[n] = refit.rms_residual
-    name = min(residuals, key=lambda n: residuals[n])
-    return name, min(residuals[name], base_fit.rms_residual)
+    for name in promising_names:
+        _, theta = best_starts[name]
+        refit = NuisanceFitter(setting, [name])(observed, theta, base_fit.starts)
+        residuals[name] = refit.rms_residual
+    best_name = min(residuals, key=lambda name: residuals[name])
+    # An effect can be zero, so it never leaves more than the model without it.
+    return best_name, min(residuals[best_name], base_fit.rms_residual)
 
 
 def _rank_starts(
@@ -344,8 +352,10 @@ def _rank_starts(
 ) -> list[tuple[float, Array]]:
     """List starting points for refitting an effect, the best first.
 
-    A least-squares fit finds only the minimum near its start, so effects with a shape (a period, a
-    time, a place) start from several shapes.
+    A least-squares fit finds only the minimum near its start. Effects with a shape (a period, a
+    time, a position) therefore start from several shapes, each after one linear step from an effect
+    of size zero. A saturation or an end stop has no derivative while it is not reached; such
+    effects start from a grid of values at which they act.
 
     Shapes: R runs, T samples, C channels.
 
@@ -359,32 +369,31 @@ def _rank_starts(
         Pairs of RMS residual (to first order where that is possible) and theta.
     """
     fit = NuisanceFitter(setting, [name])
-    if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
+    guesses: list[tuple[float, ...]]
+    if name == "input.saturation":
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
-        guesses = [np.array([*base_fit.theta, share * peak]) for share in SATURATION_SHARES]
-        residuals_and_starts = [
-            (_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses
-        ]
-    elif name == "state.limit":  # an end stop that is not reached has no derivative either
-        guesses = [
-            np.array([*base_fit.theta, *stop])
-            for stop in _iterate_stop_starts(setting, observed[..., 0])
-        ]
-        residuals_and_starts = [
-            (_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses
-        ]
+        guesses = [(share * peak,) for share in SATURATION_SHARES]
+    elif name == "state.limit":
+        guesses = list(_iterate_stop_starts(setting, observed[..., 0]))
     else:
-        residuals_and_starts = [
+        guesses = []
+    if guesses:
+        thetas = [np.array([*base_fit.theta, *coefficients]) for coefficients in guesses]
+        starts = [(_compute_residual(fit, observed, theta, base_fit), theta) for theta in thetas]
+    else:
+        starts = [
             _estimate_linear_step(fit, observed, shape, base_fit)
             for shape in SHAPE_GRIDS.get(name, [()])
         ]
-    return sorted(residuals_and_starts, key=lambda pair: pair[0])
+    return sorted(starts, key=lambda residual_and_theta: residual_and_theta[0])
 
 
 def _iterate_stop_starts(
     setting: RecordingConditions, path: Array
 ) -> Iterator[tuple[float, float, float]]:
-    """Yield starting values of an end stop: stiffness, place and loss.
+    """Yield starting values of an end stop: stiffness, position and loss.
+
+    The sign of the stiffness is the side of the stop; the loss is its damping in s/m or s/rad.
 
     There are soft and hard stops at either end of the travel, which the motion meets late and
     early. A grid is used because a stop that the motion does not reach has no derivative.
@@ -429,7 +438,7 @@ def _estimate_linear_step(
 
     theta consists of the base parameters, the linear coefficients of the effect (zero at first) and
     its shape parameters, which the step does not change. Shape parameters that the system does not
-    have are omitted.
+    have are omitted, as the second component of the wind for a slider.
 
     Shapes: R runs, T samples, C channels.
 
@@ -443,11 +452,12 @@ def _estimate_linear_step(
         RMS residual of the linear model, and theta after the step.
     """
     base_count, count = base_fit.theta.size, fit.theta.size
-    # At least one coefficient is linear.
+    # The effect has count - base_count coefficients, of which at least one is linear.
     shape = shape[: count - base_count - 1]
     fitted_count = count - len(shape)
     theta = np.array([*base_fit.theta, *[0.0] * (fitted_count - base_count), *shape])
     residual, slope = fit.linearise(observed, theta, base_fit.starts)
+    # The columns of the initial states follow those of theta and stay.
     slope = np.delete(slope, np.s_[fitted_count:count], axis=1)
     # Almost no damping, because the model is linear here.
     step = fit.compute_step(residual, slope, damping=1e-9)

@@ -51,7 +51,8 @@ def arrange_slopes(slopes: Array, shared_count: int) -> Array:
             last.
         shared_count: number of shared unknowns, P.
     """
-    columns = slopes.swapaxes(1, 2)
+    columns = slopes.swapaxes(1, 2)  # (R, N, P + S)
+    # The own unknowns of a run do not change the other runs.
     own_columns: Array = block_diag(*columns[:, :, shared_count:])
     return np.hstack([np.concatenate(columns[:, :, :shared_count]), own_columns])
 
@@ -89,6 +90,7 @@ def find_strength_for_size(
         if abs(size / target_size - 1) < tolerance:
             return strength, size
         if size < target_size:
+            # At the largest strength the size would be too small even if it grew fastest.
             if strength >= largest or size * (largest / strength) ** max_exponent < target_size:
                 return None
             low = strength, size
@@ -101,28 +103,30 @@ def find_strength_for_size(
 def _choose_next_strength(
     low: tuple[float, float], high: tuple[float, float], target_size: float
 ) -> float:
-    """Return the next strength to try.
+    """Return the next strength to try, from the nearest trials below and above the requested size.
 
-    Without a strength below, the size is assumed to be proportional to it. Without a strength
-    above, the strength grows by at most `MAX_STRENGTH_FACTOR`. With both, it is interpolated on
-    logarithmic scales, or halved there if the bracket is very wide or the upper size is not finite.
+    * Only a trial above: the size is assumed to be proportional to the strength; a fifth of the
+      strength if the size is not finite.
+    * Only a trial below: the same, but the strength grows by at most `MAX_STRENGTH_FACTOR`.
+    * Both: interpolation on logarithmic scales, or the middle on a logarithmic scale if the
+      strengths differ much or the upper size is not finite.
 
     Args:
         low: strength and size below the requested size; strength 0 if there is none.
         high: strength and size above it; infinite strength if there is none.
         target_size: requested size.
     """
-    if not low[0]:
-        return (
-            # From 1 % to 90 % of the upper strength.
-            high[0] * min(max(target_size / high[1], 1e-2), 0.9)
-            if np.isfinite(high[1])
-            else high[0] / 5
-        )
-    if not np.isfinite(high[0]):
-        return low[0] * min(target_size / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
-    if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
-        return float(np.sqrt(low[0] * high[0]))
-    log_position = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
+    (low_strength, low_size), (high_strength, high_size) = low, high
+    if not low_strength:
+        if not np.isfinite(high_size):
+            return high_strength / 5
+        # From 1 % to 90 % of the upper strength.
+        return high_strength * min(max(target_size / high_size, 1e-2), 0.9)
+    if not np.isfinite(high_strength):
+        return low_strength * min(target_size / max(low_size, 1e-9), MAX_STRENGTH_FACTOR)
+    if not np.isfinite(high_size) or high_strength / low_strength > MAX_STRENGTH_FACTOR**2:
+        return float(np.sqrt(low_strength * high_strength))
+    # Relative position of the requested size between both sizes, on a logarithmic scale.
+    log_position = float(np.log(target_size / low_size) / np.log(high_size / low_size))
     limited_position = min(max(log_position, BRACKET_MARGIN), 1.0 - BRACKET_MARGIN)
-    return float(low[0] * (high[0] / low[0]) ** limited_position)
+    return float(low_strength * (high_strength / low_strength) ** limited_position)
