@@ -41,7 +41,7 @@ class Proposal(NamedTuple):
     """Proposals together with what the tuner recommends now.
 
     Yield a bare array to have the harness recommend the proposal with the lowest loss so far; yield
-    an `Proposal` to recommend another point. The recommendation is valid until the next `yield`.
+    a `Proposal` to recommend another point. The recommendation is valid until the next `yield`.
 
     Attributes:
         points: (n, dim) or (dim,) proposals in the unit cube.
@@ -358,7 +358,8 @@ def from_callback(
             to_optimiser.append(get_value(evaluation))
             value_ready.release()
     finally:
-        # The optimiser waits for a loss, and gets an exception instead.
+        # The harness has closed the generator, or the optimiser has ended: an optimiser that still
+        # waits for a value gets an exception instead.
         is_closing = True
         value_ready.release()
         worker.join(timeout=_THREAD_TIMEOUT_SECONDS)

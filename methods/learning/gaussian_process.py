@@ -90,16 +90,18 @@ class GaussianProcess:
     ) -> tuple[Array, Array]:
         """Compute the correlation of pairs, and its derivative by their scaled squared distance.
 
+        The scaled squared distance is the sum over the coordinates of squared difference by squared
+        length scale.
+
         Args:
-            squares: (n, m, dim) squared differences of the pairs.
-            hyper: (dim + 1,) hyper-parameters; None for the present ones.
+            squares: (n, m, dim) squared differences of the pairs of points.
+            hyper: (dim + 1,) logarithms of length scales and noise; None for the present ones.
 
         Returns:
             Correlations (n, m) and derivatives (n, m).
         """
-        hyperparameters = self.hyper if hyper is None else hyper
-        lengths = hyperparameters[:-1]
-        scaled = squares @ np.exp(-2.0 * lengths)
+        log_lengths = (self.hyper if hyper is None else hyper)[:-1]  # the last one is the noise
+        scaled = squares @ np.exp(-2.0 * log_lengths)
         if self.settings.kernel == "rbf":
             k = np.exp(-0.5 * scaled)  # (4.9)
             return k, -0.5 * k
@@ -124,7 +126,7 @@ class GaussianProcess:
             `hyper` (dim + 1,) are the logarithms of the length scales and of the noise.
             """
             value, slope = self._compute_negative_evidence(hyper)
-            # The priors are normal distributions of the logarithms.
+            # The priors are normal distributions of the logarithms; z is in standard deviations.
             z = (hyper - self._centre) / self._width
             return value + 0.5 * float(z @ z), slope + z / self._width
 
@@ -185,10 +187,9 @@ class GaussianProcess:
         """
         from scipy.linalg import solve_triangular
 
-        to_known = (points[:, None] - self.points) ** 2
-        squared_distances = (points[:, None] - points) ** 2
-        cross_correlation, _ = self._compute_correlation(to_known)
-        prior, _ = self._compute_correlation(squared_distances)
+        # Correlations with the n known points (m, n), and among the m points.
+        cross_correlation, _ = self._compute_correlation((points[:, None] - self.points) ** 2)
+        prior, _ = self._compute_correlation((points[:, None] - points) ** 2)
         explained = solve_triangular(self._lower, cross_correlation.T, lower=True)
         spread = _compute_cholesky_factor(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))

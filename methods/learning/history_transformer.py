@@ -94,6 +94,11 @@ def get_weight_shapes(
 ) -> dict[str, tuple[int, ...]]:
     """Return the shape of every weight array by name, from which saved weights are checked.
 
+    The layers: ``seen`` projects input rows, ``first`` and ``token`` embed tokens. Each block has
+    ``heard`` (queries, keys and values of the attention), ``mixed`` (its output), ``lag`` (bias by
+    distance of two tokens), and the two layers ``inner`` and ``outer``. ``guess`` and ``next`` give
+    the proposals before and after a simulation.
+
     Args:
         inputs: length of an input row.
         dim: number of parameters.
@@ -126,6 +131,11 @@ def predict_proposals(
     tried: Any,
 ) -> Any:
     """Compute the proposals before and after each simulation of a history.
+
+    Each simulation becomes a token: direction and size of its difference from the target, its
+    parameters, the target, and the step from the simulation before (3). The network embeds the
+    tokens (4). Its output for a token is a matrix by which the difference is multiplied to give the
+    step to the next proposal (5), or as published the next proposal itself.
 
     The code is shared by numpy and torch, whose functions have the same names.
 
@@ -162,6 +172,7 @@ def predict_proposals(
         h = h + _apply_linear_layer(
             w, f"outer{block}", _compute_swish(xp, _apply_linear_layer(w, f"inner{block}", h))
         )
+    # The first token is that of the target alone.
     guess = _apply_linear_layer(w, "guess", h[..., :1, :])
     next_proposals = _apply_linear_layer(w, "next", h[..., 1:, :])
     if not design.published:
@@ -197,7 +208,9 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     """
     count, token_size = h.shape[-2:]
     projections = _apply_linear_layer(w, f"heard{block}", h)
-    query, key = projections[..., :token_size], projections[..., token_size : 2 * token_size]
+    query = projections[..., :token_size]
+    key = projections[..., token_size : 2 * token_size]
+    value = projections[..., 2 * token_size :]
     lag = np.arange(count)[:, None] - np.arange(count)
     future_penalty = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
     score = (
@@ -207,7 +220,7 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     # The largest score is subtracted, so that the exponentials do not overflow.
     attention = xp.exp(score - xp.amax(score, -1)[..., None])
     attention = attention / attention.sum(axis=-1, keepdims=True)
-    return _apply_linear_layer(w, f"mixed{block}", attention @ projections[..., 2 * token_size :])
+    return _apply_linear_layer(w, f"mixed{block}", attention @ value)
 
 
 def _apply_linear_layer(w: dict[str, Any], layer: str, x: Any) -> Any:
@@ -240,6 +253,7 @@ def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, c
         (count, dim) points; the first one is the target.
     """
     target, start = simulator.sample(rng, 2)
+    # At first the nearest points on either side are the corners of the training range.
     lower, upper = (corner.copy() for corner in simulator.training)
     points = [target, start]
     while len(points) < count:
@@ -394,7 +408,8 @@ def _compute_loss(
     Args:
         w: weights by name.
         design: design of the network.
-        parts: input rows without and with noise, and parameters, of one batch of scenarios.
+        parts: `TrainingHistories` of one batch of scenarios as tensors: input rows of simulations
+            and of targets, and parameters.
         histories: indices of the simulations that form each history, and of its target.
     """
     import torch
@@ -406,9 +421,11 @@ def _compute_loss(
     truth = parameters[:, histories.targets][:, :, None]
     proposals = predict_proposals(torch, w, design, aim, tokens, proposed)
     if design.published:
+        # Without the first guess, and the proposal after the last simulation.
         return ((proposals[:, :, 1:-1] - proposed[:, :, 1:]) ** 2).mean()  # (9)
     squares = ((proposals - truth) ** 2).sum(dim=-1)
     # Small distances matter in the last steps of tuning, so they must have enough weight.
     distances = ((proposed - truth) ** 2).sum(dim=-1) + design.relative**2
-    parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _ERROR_FACTOR]
-    return torch.cat(parts, dim=2).mean()  # (8)
+    first_guess_errors = squares[:, :, :1]
+    relative_errors = squares[:, :, 1:] / distances * _ERROR_FACTOR
+    return torch.cat([first_guess_errors, relative_errors], dim=2).mean()  # (8)

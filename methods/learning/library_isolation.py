@@ -6,12 +6,8 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    pass
 
 
 @contextmanager
@@ -41,7 +37,7 @@ def isolated_library_call(rng: np.random.Generator) -> Iterator[None]:
     import torch
 
     # Packages draw from NumPy's and torch's global generators, which the caller uses too.
-    legacy = np.random.get_state()  # noqa: NPY002 - it is what is guarded
+    numpy_state = np.random.get_state()  # noqa: NPY002 - it is what is guarded
     seed = int(rng.integers(2**62))
     with (
         torch.random.fork_rng(devices=[]),
@@ -55,7 +51,7 @@ def isolated_library_call(rng: np.random.Generator) -> Iterator[None]:
         try:
             yield
         finally:
-            np.random.set_state(legacy)  # noqa: NPY002
+            np.random.set_state(numpy_state)  # noqa: NPY002
 
 
 class NullTracker:

@@ -134,6 +134,7 @@ class NoiseMatchedNetworks(Generic[Learner]):
             learn: function that trains a network.
         """
         spread = data.flattened_observations.std(axis=(0, 1))
+        # A target counts as noisy if it is clearly rougher than every noise-free simulation.
         data_noise = estimate_noise_sigma(data.flattened_observations, data.lengths).max(axis=0)
         limit = (
             _CLEAN_ROUGHNESS_FACTOR * data_noise + reading.noise / _NOISE_SHARE_THRESHOLD * spread
@@ -153,7 +154,8 @@ class NoiseMatchedNetworks(Generic[Learner]):
 
     def select_for(self, task: Task) -> Learner:
         """Return the network for a target, chosen by the target's roughness."""
-        roughness = estimate_noise_sigma(task.observed[None], task.lengths)[0]
+        # One estimate per channel; one rough channel makes the target noisy.
+        (roughness,) = estimate_noise_sigma(task.observed[None], task.lengths)
         return self.noisy if (roughness > self.limit).any() else self.clean
 
     def to_arrays(self) -> dict[str, Array]:
@@ -195,6 +197,7 @@ class NoiseMatchedNetworks(Generic[Learner]):
                 "array limit: expected finite numbers of shape (channels,), "
                 f"found shape {limit.shape}"
             )
+        # As in `train`: one network without noise, or without noise-free targets.
         has_two_networks = bool(reading.noise) and reading.clean
         if has_two_networks != bool(arrays_by_part["noisy"]):
             raise ValueError(

@@ -49,12 +49,12 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
     Raises:
         ValueError: the lengths do not add up to T.
     """
-    run_count, samples, channels = observations.shape
+    observation_count, samples, channels = observations.shape
     if sum(lengths) != samples:
         raise ValueError(
             f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}"
         )
-    resampled = np.empty((run_count, len(lengths), channels, points))
+    resampled = np.empty((observation_count, len(lengths), channels, points))
     first = 0
     for run, length in enumerate(lengths):
         series = observations[:, first : first + length].transpose(0, 2, 1)
@@ -63,14 +63,13 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
         if length == points and not np.isnan(series).any():
             resampled[:, run] = series
             continue
-        samples = np.arange(length)
+        sample_indices = np.arange(length)
         positions = np.linspace(0, length - 1, points)
-        for run_index in range(run_count):
-            for channel_index in range(channels):
-                resampled[run_index, run, channel_index] = _interpolate_channel(
-                    positions, samples, series[run_index, channel_index]
-                )
-    return resampled.reshape(run_count, len(lengths) * channels, points)
+        for observation_index, channel_index in np.ndindex(observation_count, channels):
+            resampled[observation_index, run, channel_index] = _interpolate_channel(
+                positions, sample_indices, series[observation_index, channel_index]
+            )
+    return resampled.reshape(observation_count, len(lengths) * channels, points)
 
 
 def _interpolate_channel(positions: Array, samples: NDArray[np.intp], values: Array) -> Array:
@@ -231,6 +230,7 @@ def make_weighted_features(
     # A stable sort chooses the same numbers on every machine if weights are equal.
     order = np.argsort(-np.maximum(parameter_weight, scenario_weight), kind="stable")
     chosen_numbers = np.sort(order[:max_inputs])
+    # The deviation that a weight refers to: within scenarios, or in all of the data.
     by_parameters = _compute_weight_per_deviation(
         parameter_weight[chosen_numbers], spread[chosen_numbers]
     )
@@ -270,14 +270,15 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
     scenarios, simulations_per_scenario, dim = parameters.shape
     count = rows.shape[2]
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
-    # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
+    # A fit with 1 + dim free numbers leaves this share of the variance of pure noise, by which the
+    # residual is corrected.
     residual_share = max(simulations_per_scenario - 1 - dim, 1) / simulations_per_scenario
     total = np.zeros(count)
     residual_variance = np.zeros(count)
     explained = np.zeros((dim, count))
     for delta, values in zip(offsets, rows, strict=True):
         centred = values - values.mean(axis=0)
-        slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
+        slopes, *_ = np.linalg.lstsq(delta, centred, rcond=None)  # (1)
         residuals = centred - delta @ slopes
         total += np.mean(centred**2, axis=0)
         residual_variance += np.mean(residuals**2, axis=0) / residual_share

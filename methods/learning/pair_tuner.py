@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.learning.input_features import FeatureConfig, InputFeatures, fill_gaps
+from methods.learning.gap_filling import fill_gaps
+from methods.learning.input_features import FeatureConfig, InputFeatures
 from methods.learning.network_training import TrainingMonitor, check_shapes
 from methods.learning.noise_matched_networks import NoiseMatchedTuner
 from methods.learning.pair_network import (
@@ -59,7 +60,7 @@ class TrainedPairNetwork:
             data: training data.
             rng: random generator.
             reading: configuration of the inputs.
-            alone: as in `pair_network.train`.
+            alone: True to learn the parameters from the target's side alone (direct regression).
             monitor: monitor of the training; None for none.
         """
         features = InputFeatures.fit(data, reading)
@@ -68,16 +69,14 @@ class TrainedPairNetwork:
             if reading.proposed
             else features
         )
-        rows_monitor = (
-            None
-            if monitor is None
-            else monitor.convert(
+        rows_monitor = None
+        if monitor is not None:
+            rows_monitor = monitor.convert(
                 lambda held_out: (
                     _compute_input_rows(proposed, features, held_out),
                     held_out.parameters,
                 )
             )
-        )
         rows = _compute_input_rows(proposed, features, data)
         weights = train_pair_network(rows, data.parameters, design, rng, alone, rows_monitor)
         return cls(design, features, weights, proposed)
@@ -94,11 +93,10 @@ class TrainedPairNetwork:
     def make_estimator(self, task: Task) -> Callable[[Array], Array]:
         """Return a function that estimates the parameter error of one simulation (1, T, C).
 
-        The function returns the target's parameters less those of the simulation, (dim,), as
-        the network estimates them from both observations; NaN if the simulation
-        failed. `self.proposed` makes the row of network inputs of a simulation, `self.features`
-        that of the target. They are one function unless the target has another sensor, such as a
-        camera.
+        The function returns the target's parameters less those of the simulation, (dim,), as the
+        network estimates them from both observations; NaN if the simulation failed. `self.proposed`
+        makes the row of network inputs of a simulation, `self.features` that of the target. They
+        are one function unless the target has another sensor, such as a camera.
 
         Shapes: T samples, C channels.
 
@@ -124,7 +122,7 @@ class TrainedPairNetwork:
             """
             if not np.isfinite(observations).all():
                 return np.full(task.dim, np.nan)
-            proposed = self.proposed(observations, task.lengths, task.scene, hidden)[0]
+            (proposed,) = self.proposed(observations, task.lengths, task.scene, hidden)
             target = row
             if target is None:
                 filled_target = _fill_target_gaps(task, observations[0], self)

@@ -65,8 +65,10 @@ class PosteriorRounds:
         """
         residuals = self._task.residuals(evaluation.observations)
         usable = np.isfinite(residuals).all(axis=1)
-        # Two simulations are the minimum for a training and a validation set.
-        if usable.sum() < 2 + 2 * (self._components is None):
+        # Two simulations are the minimum for a training and a validation set; the first round also
+        # needs some for the principal components.
+        min_simulations = 4 if self._components is None else 2
+        if usable.sum() < min_simulations:
             return rng.uniform(size=(count, self._task.dim))
         points, residuals = evaluation.proposals[usable], residuals[usable]
         if self._components is None:
@@ -123,6 +125,7 @@ class PosteriorRounds:
         zero = self._compute_features(np.zeros((1, len(self._centre))))
         target = torch.as_tensor(zero, dtype=torch.float32)
         self._posterior = self._trainer.build_posterior().set_default_x(target)
+        # Enough that `count` remain if only a tenth of them lies within the bounds.
         drawn_points = self._draw_points(max(round(count / _MIN_INSIDE_SHARE), _POSTERIOR_DRAWS))
         self.mean = drawn_points.mean(axis=0)
         return drawn_points[:count]

@@ -90,6 +90,9 @@ def generate_training_data(
 ) -> TrainingData:
     """Simulate several points in each of several scenarios; fewer scenarios for a small budget.
 
+    A scenario is a drawn set of initial values and inputs. It is left out if a simulation in it
+    fails.
+
     Args:
         simulator: training simulator.
         rng: random generator.
@@ -114,8 +117,7 @@ def generate_training_data(
     for _ in range(count):
         points = draw_parameters(simulator, rng, each)
         simulated = simulator.simulate(rng, points)
-        # A scenario with a failed simulation is left out, because all need the same number of
-        # points.
+        # All scenarios need the same number of points.
         if np.isfinite(simulated).all():
             parameters.append(points)
             observations.append(simulated)

@@ -8,7 +8,7 @@ import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -33,8 +33,12 @@ class MuJoCoSysId(Tuner):
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             cube = sysid.ParameterDict()
             cube.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
-            ask: Any = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
-            sysid.optimize(cube, ask, verbose=False, output=io.StringIO())
+
+            def compute_residuals(x: Array, _: object) -> tuple[list[Array], None, None]:
+                # One group of residuals; the toolbox's predictions and data are not used.
+                return [residuals(x.reshape(task.dim, -1).T).T], None, None
+
+            sysid.optimize(cube, compute_residuals, verbose=False, output=io.StringIO())
             return "mujoco.sysid reached its tolerance"
 
         return from_callback(minimise, task.compute_finite_residuals)

@@ -35,7 +35,7 @@ class DirectRegressor(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.input_features`).
+            (`methods.learning.scenario_features`).
         channels: first and last channel that is read, by number, where targets do not show the
             others; None for all.
         clean: as in `methods.tuners.tunenet.TuneNet`.

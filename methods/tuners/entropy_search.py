@@ -150,7 +150,7 @@ class EntropySearch(Tuner):
             candidates = self._choose_candidates(process, points[values.argmin()], rng)
             p = compute_minimiser_probability(process, candidates, self.draws, rng)
             score = compute_entropy_terms(p)  # (1)
-            # The first candidate has already been simulated.
+            # The first candidate is the best point, which has already been simulated.
             proposal = candidates[score[1:].argmax() + 1]
 
     def _choose_candidates(

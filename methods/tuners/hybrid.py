@@ -17,6 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from methods.learning.broyden_search import MIN_STEP, BroydenSearch
 from methods.tuner import Array, Proposal, Task, TunerGenerator
 from methods.tuners.least_squares import (
     EvaluationHistory,
@@ -25,7 +26,7 @@ from methods.tuners.least_squares import (
     Mask,
     SimulationGenerator,
 )
-from methods.tuners.tunenet import MIN_STEP, BroydenSearch, TuneNet
+from methods.tuners.tunenet import TuneNet
 
 _ROUNDING_LOSS = 1e-13
 """Loss caused by rounding, as a share of the observation's root mean square."""
@@ -68,6 +69,9 @@ class TuneNetLeastSquares(TuneNet):
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Take network steps, then fit by least squares from there, then from new starts.
 
+        The least-squares fit begins at the lowest loss, first with all samples, then with growing
+        parts of the runs (horizons). Each stage ends the run if the target is reproduced.
+
         Args:
             task: start, observations, number of parameters and budget of the run.
             rng: random numbers of the run.
@@ -81,6 +85,7 @@ class TuneNetLeastSquares(TuneNet):
             yield from finish.fit_from_point(run, task.training.mean(axis=0))
         # Growing horizons cost simulations, so they are used only if a fit of all samples failed.
         for fit in (_FULL_HORIZON, finish):
+            # Without a successful simulation there is no point to begin at.
             if run.finished or not np.isfinite(run.losses).any():
                 break
             model = yield from self._build_linear_model(run, finish)
@@ -153,6 +158,7 @@ class TuneNetLeastSquares(TuneNet):
             # Differences have the length of the secants, so that all columns have similar accuracy.
             size = float(np.abs(directions).max()) if chosen_steps else finish.difference
             size = min(max(size, finish.smallest_difference), finish.difference)
+            # Towards the middle of the cube, so that the points stay inside.
             inward = np.where(missing @ (0.5 - point) < 0.0, -size, size)
             probe_points = np.clip(point + missing * inward[:, None], 0.0, 1.0)
             residuals = yield from run.simulate(probe_points)
@@ -162,9 +168,8 @@ class TuneNetLeastSquares(TuneNet):
         # If no simulation nearby succeeded, the model predicts no decrease.
         if not changes:
             return LinearModel(point, residual, np.zeros((len(residual), len(point))))
-        solution = np.linalg.lstsq(directions, np.array(changes), rcond=None)[0]  # (1)
-        slopes = np.asarray(solution, dtype=np.float64)
-        return LinearModel(point, residual, slopes.T)
+        slopes, *_ = np.linalg.lstsq(directions, np.array(changes), rcond=None)  # (1)
+        return LinearModel(point, residual, np.asarray(slopes, dtype=np.float64).T)
 
     def _choose_secants(
         self, steps: Array, finite: Mask, smallest: float
@@ -207,6 +212,6 @@ def _compute_orthogonal_complement(basis: list[Array], dim: int) -> Array:
     """
     if not basis:
         return np.eye(dim)
-    # These are the right singular vectors beyond the rank.
-    directions: Array = np.linalg.svd(np.array(basis))[2][len(basis) :]
+    _, _, right_vectors = np.linalg.svd(np.array(basis))
+    directions: Array = right_vectors[len(basis) :]  # those beyond the rank
     return directions

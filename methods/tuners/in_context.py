@@ -27,6 +27,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from methods.learning.broyden_search import MIN_STEP
 from methods.learning.history_transformer import (
     HistoryIndices,
     HistoryTransformerDesign,
@@ -43,7 +44,6 @@ from methods.learning.network_training import TrainingMonitor, check_shapes
 from methods.learning.noise_matched_networks import NoiseMatchedTuner
 from methods.learning.training_data import TrainingData
 from methods.tuner import Array, Proposal, Task, TrainingSimulator, TunerGenerator
-from methods.tuners.tunenet import MIN_STEP
 
 _RANGE_ARRAY = "box"
 """Name of the array with the training range."""
@@ -82,8 +82,8 @@ class TrainedHistoryNetwork:
             tried: points (dim,) of the simulations so far.
         """
         window = self.design.window
-        half_widths = (self.training_range[1] - self.training_range[0]) / 2.0
-        middle = self.training_range.mean(axis=0)
+        low, high = self.training_range
+        middle, half_widths = (low + high) / 2.0, (high - low) / 2.0
         simulations = np.array(simulations_seen[-window:]).reshape(-1, target.size)
         points = np.array(tried[-window:]).reshape(-1, half_widths.size)
         proposals = predict_proposals(
@@ -197,13 +197,11 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
             monitor: monitor of the training; None for none.
         """
         features = InputFeatures.fit(data, self.make_feature_config())
-        history_monitor = (
-            None
-            if monitor is None
-            else monitor.convert(
+        history_monitor = None
+        if monitor is not None:
+            history_monitor = monitor.convert(
                 lambda held_out: _build_training_histories(features, held_out, training_range)
             )
-        )
         design = self.make_network_design()
         material = _build_training_histories(features, data, training_range)
         per_scenario = data.parameters.shape[1]
@@ -285,12 +283,10 @@ def _build_training_histories(
         data: training simulations.
         box: (2, dim) corners of the training range.
     """
-    half_widths = (box[1] - box[0]) / 2.0
-    parameters = (data.parameters - box.mean(axis=0)) / half_widths
-    target = features.compute_rows(data)
-    simulations = (
-        target
-        if data.noise_free_observations is None
-        else features.compute_rows(data.without_noise)
-    )
-    return TrainingHistories(simulations, target, parameters)
+    low, high = box
+    parameters = (data.parameters - box.mean(axis=0)) / ((high - low) / 2.0)
+    targets = features.compute_rows(data)
+    simulations = targets
+    if data.noise_free_observations is not None:
+        simulations = features.compute_rows(data.without_noise)
+    return TrainingHistories(simulations, targets, parameters)

@@ -172,6 +172,7 @@ class LeastSquares(Tuner):
         if failed.any():
             steps[failed] *= -1.0
             probe_residuals[failed] = yield from run.simulate(point + np.diag(steps)[failed])
+        # One simulation per parameter, which is a column of the Jacobian.
         slopes = (probe_residuals - residual) / steps[:, None]
         # If both sides fail, the column stays zero.
         return LinearModel(point, residual, np.nan_to_num(slopes).T)
@@ -184,14 +185,15 @@ class LeastSquares(Tuner):
         It starts from the point of the linear model (point, residual, Jacobian). After each step
         the Jacobian gets Broyden's update; it is computed again by finite differences when it is
         outdated. `is_selected` masks the residuals, for example to a short horizon at first, since
-        a long simulation can have many local minima.
+        a long simulation can have many local minima. The linear model at the last point is
+        returned.
         """
         convergence_share = (
             _FINAL_CONVERGENCE_SHARE if is_selected.all() else _HORIZON_CONVERGENCE_SHARE
         )
         damping = _Damping(self.damping)
-        stalled_steps = 0
-        failed = 0
+        stalled_steps = 0  # steps in a row without progress
+        failed_steps = 0  # steps in a row that did not decrease the error
         while stalled_steps < self.patience:
             error_before = model.compute_error(is_selected)
             step, predicted_decrease = model.compute_step(is_selected, damping.mu)
@@ -218,14 +220,13 @@ class LeastSquares(Tuner):
             decrease = error_before - error_after
             model.trusted = decrease > _MIN_TRUST_RATIO * predicted_decrease
             damping.adapt(decrease / predicted_decrease)  # (2)
-            failed = 0 if is_better else failed + 1
-            stalled_steps = (
-                0 if error_after < (1.0 - self.progress) * error_before else stalled_steps + 1
-            )
+            failed_steps = 0 if is_better else failed_steps + 1
+            has_progress = error_after < (1.0 - self.progress) * error_before
+            stalled_steps = 0 if has_progress else stalled_steps + 1
             if run.finished:
                 break
             # With one parameter the secant is the slope; with several the secants may be outdated.
-            is_stale = failed == 2 and len(step) > 1
+            is_stale = failed_steps == 2 and len(step) > 1
             if is_stale or (is_better and not self.secant):
                 longest = float(np.abs(step).max())
                 model = yield from self._compute_differences(
@@ -312,7 +313,7 @@ class LinearModel:
         stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, is_free]
         step = np.zeros_like(self.point)
         target = np.append(-r, np.zeros_like(step))
-        step[is_free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
+        step[is_free], *_ = np.linalg.lstsq(stacked, target, rcond=None)
         # The step is clipped to the cube, and the predicted decrease is that of the clipped step.
         step = np.clip(self.point + step, 0.0, 1.0) - self.point
         remaining = r + jacobian @ step

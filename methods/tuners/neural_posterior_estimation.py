@@ -158,7 +158,7 @@ class NeuralPosteriorEstimation(Tuner):
             name = [*foreign, *not_finite][0]
             raise ValueError(f"array {name}: expected an array of the flow, of finite numbers")
         self._flow = self._rebuild_flow(
-            {name.removeprefix("flow."): a for name, a in flow_arrays.items()},
+            {name.removeprefix("flow."): array for name, array in flow_arrays.items()},
             features.feature_count,
         )
         self._read = features
@@ -173,7 +173,10 @@ class NeuralPosteriorEstimation(Tuner):
         """
         import torch
 
-        sizes = {a.size for name, a in arrays.items() if name.endswith("_transforms.0._shift")}
+        # The first transform shifts each parameter.
+        sizes = {
+            array.size for name, array in arrays.items() if name.endswith("_transforms.0._shift")
+        }
         dim = sizes.pop() if sizes else 0
         if not 0 < dim < 1000:
             raise ValueError("expected the arrays of a flow, found others")
@@ -185,7 +188,7 @@ class NeuralPosteriorEstimation(Tuner):
             flow = self._make_flow_builder()(theta, rows)
             try:
                 flow.load_state_dict(
-                    {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
+                    {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
                 )
             except (RuntimeError, TypeError) as error:
                 raise ValueError(

@@ -20,10 +20,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from methods.learning.broyden_search import MIN_STEP, BroydenSearch
 from methods.learning.input_features import FeatureConfig
 from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
 from methods.learning.pair_tuner import PairTuner
-from methods.tuner import Array, Proposal, Task, TunerGenerator
+from methods.tuner import Proposal, Task, TunerGenerator
 
 
 @dataclass(eq=False)
@@ -56,7 +57,7 @@ class TuneNet(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.input_features`).
+            (`methods.learning.scenario_features`).
         channels: first and last channel that is read, by number, where targets do not show the
             others; None for all.
         clean: whether targets may be as clean as simulations. False for a sensor whose errors last
@@ -161,133 +162,3 @@ class TuneNetPublished(PairTuner):
             evaluation = yield Proposal(guess, recommend=guess)
             residual = np.nan_to_num(estimate(evaluation.observations))
             guess = np.maximum(evaluation.proposals[0] + residual, 0.0)  # (1)
-
-
-MIN_STEP = 1e-10
-"""Step length in the unit cube below which a step is rounding."""
-
-
-_MAX_BROYDEN_STEP_RATIO = 2.0
-"""Maximum length of a Broyden step, in multiples of the step of Algorithm 1."""
-_MAX_BISECTION_STEP_RATIO = 10.0
-"""Maximum length of a bisection step, in multiples of the step of Algorithm 1."""
-
-
-class BroydenSearch:
-    """Broyden's method for h(simulation of x, target) = 0.
-
-    The initial slope is -1, so that the first step is that of Algorithm 1.
-
-    Attributes:
-        best: (dim,) point with the smallest estimated difference so far.
-    """
-
-    def __init__(self, task: Task) -> None:
-        """Begin at the start of the task, with slope -1 in every direction.
-
-        `_slope` (dim, dim) estimates dh/dx. `_last` is the last point with its estimate h,
-        `_residual` the estimate at `best`, and `_setbacks` counts the points since then that were
-        not better. `_fallback` is the middle of the training range, used if the first simulation
-        fails.
-
-        Args:
-            task: task of the target.
-        """
-        self._slope = -np.eye(task.dim)
-        self._fallback = task.training.mean(axis=0)
-        self._last: tuple[Array, Array] | None = None
-        self._residual: Array | None = None
-        self._setbacks = 0
-        # In one dimension: the largest point known to be too low, and the smallest known too high.
-        self._low = -np.inf
-        self._high = np.inf
-        self.best = task.start
-
-    def propose_next(self, point: Array, residual: Array) -> Array:
-        """Compute the next guess from the best point so far, its residual and the residuals' slope.
-
-        Args:
-            point: (dim,) simulated point.
-            residual: (dim,) estimate h at this point; NaN if the simulation failed.
-
-        Returns:
-            (dim,) point of the unit cube.
-        """
-        if not np.isfinite(residual).all():
-            # The simulation failed: go half the way to the best point, or to the middle of the
-            # training range.
-            fallback = self._fallback if self._residual is None else self.best
-            return (point + fallback) / 2.0
-        if self._last is not None:
-            self._update_slope(point - self._last[0], residual - self._last[1])
-        self._last = point, residual
-        if self._residual is None or residual @ residual < self._residual @ self._residual:
-            self.best = point
-            self._residual = residual
-            self._setbacks = 0
-        else:
-            self._setbacks += 1
-        guess: Array = np.clip(self.best + self._compute_step(self._residual), 0.0, 1.0)
-        return self._limit_to_bracket(guess, point, residual) if len(point) == 1 else guess
-
-    def _update_slope(self, step: Array, change: Array) -> None:
-        """Correct the slope B by Broyden's update, B + (y - B s) s^T / (s^T s) (3).
-
-        Then B explains the last step. A step of length zero is ignored.
-
-        Args:
-            step: (dim,) s, the difference of two points.
-            change: (dim,) y, the difference of the network's estimates h at these points.
-        """
-        square = step @ step
-        if square > 0.0:
-            prediction_error = change - self._slope @ step
-            self._slope = self._slope + np.outer(prediction_error, step) / square
-
-    def _compute_step(self, residual: Array) -> Array:
-        """Compute Broyden's step from the best point, at most twice as long as Algorithm 1's.
-
-        If it points against the estimate, Algorithm 1's step is used. After the first setback the
-        updated slope is enough; after each further one the step is halved.
-
-        It is s = -B^-1 h (2), with the slope B of the network's estimate h; B = -1 at first.
-        """
-        try:
-            step = np.linalg.solve(self._slope, -residual)  # (2)
-        except np.linalg.LinAlgError:
-            step = residual
-        # If the step points against the estimate, the slope is wrong, because h is trained to have
-        # the right direction.
-        if not step @ residual > 0.0:
-            step = residual
-        length = max(float(np.linalg.norm(step)), 1e-300)
-        longest = _MAX_BROYDEN_STEP_RATIO * float(np.linalg.norm(residual)) / length
-        share = min(1.0, longest) / 2.0 ** max(self._setbacks - 1, 0)
-        return np.asarray(step * share, dtype=np.float64)
-
-    def _limit_to_bracket(self, guess: Array, point: Array, residual: Array) -> Array:
-        """Limit the guess in one dimension to the interval between a low and a high point.
-
-        This is done after a setback. The step to the middle of the interval is limited, because the
-        middle is far away if the other end is one of the first points; a guess that is already
-        close would be lost if the estimates are inaccurate.
-
-        Args:
-            guess: (1,) the next point, in the unit cube.
-            point: (1,) the present point.
-            residual: (1,) estimated step from the present point to the target.
-        """
-        if residual[0] > 0.0:
-            self._low = max(self._low, point[0])
-        elif residual[0] < 0.0:
-            self._high = min(self._high, point[0])
-        # Inaccurate estimates may contradict each other; then there is no interval.
-        has_bracket = np.isfinite([self._low, self._high]).all() and self._low < self._high
-        if self._setbacks and has_bracket and not self._low < guess[0] < self._high:
-            max_step = 1.0
-            if self._residual is not None:
-                max_step = _MAX_BISECTION_STEP_RATIO * float(np.abs(self._residual).max())
-            halfway = np.array([(self._low + self._high) / 2.0])
-            limited_guess: Array = np.clip(halfway, self.best - max_step, self.best + max_step)
-            return limited_guess
-        return guess

@@ -23,7 +23,7 @@ class TuneNetVision(TuneNet):
     The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed;
     the target's side reads the other channels of the target, as the pixel row `v`, and nothing of
     what is known of the camera, as published. Gaps of the target are bridged by the proposed model
-    (`learning.input_features`). Where there is one channel both sides read it. Inputs, training
+    (`learning.gap_filling`). Where there is one channel both sides read it. Inputs, training
     and the step are otherwise those of `methods.tuners.tunenet.TuneNet`; h(o, o) = 0 cannot hold by
     construction, since no target is seen as a simulation is.
 

@@ -88,8 +88,7 @@ class TuRBO(Tuner):
         while True:
             count = max(2, self.initial * task.dim)
             points = list(_draw_sobol_points(rng, count, task.dim))
-            # The start is used in the first region only.
-            if first is not None:
+            if first is not None:  # the start is used in the first region only
                 points[0] = first
                 first = None
             losses = []
@@ -160,15 +159,14 @@ class TuRBO(Tuner):
             anywhere: Array = rng.uniform(size=(points.shape[1],))
             return anywhere
         values = np.where(finite, losses, losses[finite].max())
+        # Equal losses need no scale.
         scale = float(values.std()) or 1.0
         with isolated_library_call(rng):
             from botorch.generation.sampling import MaxPosteriorSampling
 
             model = _fit_gaussian_process(points, -(values - values.mean()) / scale)
-            scales = model.covar_module.base_kernel.lengthscale.detach().numpy()
-            side_lengths = np.asarray(scales).ravel()
-            # (1)
-            side_lengths = length * side_lengths / np.exp(np.log(side_lengths).mean())
+            length_scales = model.covar_module.base_kernel.lengthscale.detach().numpy().ravel()
+            side_lengths = length * length_scales / np.exp(np.log(length_scales).mean())  # (1)
             candidates = self._draw_candidates(points[values.argmin()], side_lengths, rng)
             with torch.no_grad():
                 sampled_point = MaxPosteriorSampling(model=model, replacement=False)(

@@ -22,12 +22,13 @@ from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.core.random_streams import make_rng
 from bench.figures.figure_output import write_figure
 from bench.figures.style import BLACK, BLUE, CONNECTOR_GREY, ORANGE, VERMILION, make_panel_grid
+from methods.learning.broyden_search import MIN_STEP, BroydenSearch
 from methods.learning.input_features import FeatureConfig
 from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
 from methods.learning.pair_tuner import PairTuner, TrainedPairNetwork
 from methods.learning.training_data import generate_training_data
 from methods.tuner import EMPTY_SCENE, Proposal, Task
-from methods.tuners.tunenet import MIN_STEP, BroydenSearch, TuneNet, TuneNetPublished
+from methods.tuners.tunenet import TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)
 SEEDS, TARGETS, MEMBERS = 2, 100, 5

@@ -101,7 +101,8 @@ EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
 SHARED = (
     "pair_network",
     "observation_features",
-    "input_features",
+    "scenario_features",
+    "gap_filling",
     "gaussian_process",
 )
 """Modules below methods/learning that several tuners share."""

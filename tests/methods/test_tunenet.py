@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.runner.tuner_loop import drive_tuner
+from methods.learning.broyden_search import BroydenSearch
 from methods.learning.noise_matched_networks import estimate_noise_sigma
 from methods.learning.observation_features import make_weighted_features, resample_runs
 from methods.learning.pair_network import (
@@ -15,7 +16,7 @@ from methods.learning.pair_network import (
 )
 from methods.learning.training_data import TrainingData
 from methods.tuner import EMPTY_SCENE, Array, BudgetExceededError, Task
-from methods.tuners.tunenet import BroydenSearch, TuneNet, TuneNetPublished
+from methods.tuners.tunenet import TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 

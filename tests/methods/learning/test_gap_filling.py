@@ -5,7 +5,7 @@ data are insufficient.
 import numpy as np
 import pytest
 
-from methods.learning.input_features import fill_gaps
+from methods.learning.gap_filling import fill_gaps
 from sims.vision.pinhole_camera import PinholeCamera
 
 TIMES = np.arange(120) / 60
