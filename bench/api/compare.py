@@ -181,9 +181,9 @@ def build_experiment(
     load_plugins_for_experiment(_list_plugin_files(options), loaded)
     # The robot's default commands are filled in, so that the result folder contains them.
     complete = complete_robot_experiment(loaded)
-    labels = (
-        None if options.tuners is None else [get_tuner_label(tuner) for tuner in options.tuners]
-    )
+    labels = None  # all tuners of the experiment
+    if options.tuners is not None:
+        labels = [get_tuner_label(tuner) for tuner in options.tuners]
     if options.model_command is not None:
         # Workers inherit the environment.
         os.environ[language_model.COMMAND_VARIABLE] = options.model_command
@@ -297,10 +297,10 @@ class ComparisonResult:
         """
         remedy = f"write it again with simgap plot {self.folder}"
         path = self.folder / f"{name}.csv"
-        columns = (
+        columns_by_table = (
             _SHOT_TABLE_COLUMNS if self.experiment.shot else _MISSPECIFICATION_TABLE_COLUMNS
-        )[name]
-        table: pd.DataFrame = CsvTable(path, columns, remedy).table.to_pandas()
+        )
+        table: pd.DataFrame = CsvTable(path, columns_by_table[name], remedy).table.to_pandas()
         return table
 
     @property
@@ -419,7 +419,9 @@ class ComparisonResult:
         )
 
     def summary(self) -> pd.DataFrame:
-        """Return each tuner's last error in ranking order, with verdict and failures.
+        """Return each tuner's last error of the first metric in ranking order, with its verdict.
+
+        Failures are counted, too.
 
         For diagnosers, the measures of each diagnoser.
         """
@@ -428,17 +430,18 @@ class ComparisonResult:
             return diagnosis.build_leaderboard(table)
         if self._in_files:
             return table
-        last = table[table["simulations"] == table["simulations"].max()]
-        first_metric_rows = last[last["metric"] == last["metric"].iloc[0]]
         import pandas as pd
 
+        last_rows = table[table["simulations"] == table["simulations"].max()]
+        rows = last_rows[last_rows["metric"] == last_rows["metric"].iloc[0]]
+        # The verdict of the ranking after all simulations, in the order of these rows.
         ranking = self.tables["ranking"]
-        last = ranking[ranking["simulations"] == ranking["simulations"].max()]
-        verdicts = last.set_index(["range", "tuner"])["verdict"]
-        places = pd.MultiIndex.from_frame(first_metric_rows[["range", "tuner"]])
-        first_metric_rows = first_metric_rows.assign(verdict=verdicts.reindex(places).to_numpy())
+        last_ranking = ranking[ranking["simulations"] == ranking["simulations"].max()]
+        verdicts = last_ranking.set_index(["range", "tuner"])["verdict"]
+        ranges_and_tuners = pd.MultiIndex.from_frame(rows[["range", "tuner"]])
+        rows = rows.assign(verdict=verdicts.reindex(ranges_and_tuners).to_numpy())
         columns = ["tuner", "range", "verdict", "metric", "median", "mean", "low", "high"]
-        best: pd.DataFrame = first_metric_rows[[*columns, "runs", "failures"]]
+        best: pd.DataFrame = rows[[*columns, "runs", "failures"]]
         return best.reset_index(drop=True)
 
     def __repr__(self) -> str:

@@ -105,8 +105,8 @@ def apply_changes(
 
     Args:
         experiment: configuration of the experiment.
-        labels: tuners or diagnosers to compare.
-        seeds: number of seeds of each tuner.
+        labels: tuners or diagnosers to compare, by label of the experiment or registered name.
+        seeds: number of seeds of each tuner; unused for diagnosers, which have none.
         changes: numbers of the experiment by name.
 
     Raises:

@@ -50,8 +50,9 @@ class NextRecording:
             return ["no run could be simulated that stays within the limits of joints and commands"]
         initial_text = ", ".join(f"{name} = {value:.4g}" for name, value in design.initial.items())
         lines = [f"record next, {design.times[-1]:.3g} s: {design.says}; begin near {initial_text}"]
-        if design.by == "T":
+        if design.is_for_discrimination:
             return [*lines, *_format_discrimination(design)]
+        # The gain is a logarithm; its limit keeps the factor printable.
         factor = math.exp(min(design.gain, MAX_LOG_GAIN))
         benefit = (
             f"it shrinks the joint confidence region of all parameters by a factor of {factor:.3g}"
@@ -105,6 +106,7 @@ def _format_discrimination(design: NextRunDesign) -> list[str]:
     remaining = [name for name in discrimination if name not in design.distinguished_effects]
     if remaining:
         lines.append(f"no run of this kind distinguishes it from {', '.join(remaining)}")
+    # The cause that needs the fewest repetitions.
     best = max((discrimination[name] for name in remaining), default=0.0)
     if best > 0 and (repeats := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
         lines.append(f"{repeats} recordings of it would distinguish one more of these")
@@ -159,6 +161,7 @@ def design(recording: Sources, options: DesignOptions) -> NextRecording:
             f"longest: expected {seconds:g} to {MAX_RUN_SECONDS:g}, found {longest_seconds!r}"
         )
     sources = list_sources(recording, options)
-    return NextRecording(
-        *explaining.explain_and_design(sources, seconds, longest_seconds, with_all_cores(options))
+    explanation, next_run = explaining.explain_and_design(
+        sources, seconds, longest_seconds, with_all_cores(options)
     )
+    return NextRecording(explanation, next_run)

@@ -65,7 +65,7 @@ def select_training(
     # A robot's simulator is not registered; it is defined by its experiment.
     has_model = experiment is not None and load_experiment(experiment).model
     if not plugins and not has_model:
-        simulators.get(simulator)
+        simulators.get(simulator)  # raises an error for an unknown name
     chosen_experiment = load_experiment(experiment or default_experiment(simulator)).chosen(
         training_budget=budget
     )
@@ -81,6 +81,7 @@ def select_training(
             f"experiment {chosen_experiment.name}: its simulator is {chosen_experiment.simulator}, "
             f"not {simulator}"
         )
+    # A tuner that the experiment does not list is trained with its default options.
     entries = {entry.label: entry for entry in chosen_experiment.tuners}
     entry = entries.get(tuner, TunerEntry(tuner, tuner))
     if not tuners.get(entry.tuner).learned:
@@ -97,7 +98,9 @@ def run_training(
     watch: TrainingCallback | None,
     again: bool,
 ) -> TrainingResult:
-    """Train a tuner, or load its earlier training; see `tuner_training.train_or_load`.
+    """Train a tuner into the cache that comparisons use, or load its earlier training from there.
+
+    It runs in an isolated process unless the experiment trusts its tuners.
 
     Args:
         experiment: Experiment in whose settings it is trained.
@@ -145,7 +148,11 @@ def default_experiment(simulator: str) -> str:
     if simulator in DEFAULT_EXPERIMENTS:
         return DEFAULT_EXPERIMENTS[simulator]
     shipped = [load_experiment(name) for name in list_experiment_names()]
-    fitting = [e.name for e in shipped if e.simulator == simulator and e.calibration is None]
+    fitting = [
+        experiment.name
+        for experiment in shipped
+        if experiment.simulator == simulator and experiment.calibration is None
+    ]
     if len(fitting) == 1:
         return fitting[0]
     hint = f"choose one with --experiment: {', '.join(fitting)}"

@@ -243,7 +243,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Only in simgap's own process: the environment of a calling program is not changed.
         set_glfw_library()
         mark_as_command()
-        # Most objects that a command creates while it loads modules live until its end.
+        # Most objects that a command creates while it loads modules live until its end, so that a
+        # frequent search for garbage would find nothing.
         gc.set_threshold(GARBAGE_THRESHOLD)
         # The operating system frees the memory at once; Python would search all objects for cycles.
         atexit.register(gc.freeze)
@@ -282,6 +283,7 @@ def _parse_command_line(words: Sequence[str]) -> argparse.Namespace:
     if command_name is not None and command_name not in names:
         parser.refuse_unknown("command", command_name, names)
     options, unknown_words = parser.parse_known_args(words)
+    # The first unknown word is reported.
     for word in unknown_words:
         command = options.command_parser
         if word.startswith("-"):
@@ -320,7 +322,7 @@ def build_parser(only: str | None = "") -> _Parser:
             epilog=f"example: {example}",
             formatter_class=_HelpFormatter,
         )
-        if only not in ("", name):
+        if only not in ("", name):  # it is listed in the help, without its options
             continue
         module, _, add_arguments = function_path.partition(":")
         getattr(import_module(f"bench.cli.commands.{module}"), add_arguments)(command)

@@ -252,6 +252,7 @@ class ProgressDisplay:
         The short form of the line is used if the long one does not fit into the terminal.
         """
         if self._waiting:
+            # Permanent lines take the place of the live line, which follows below them.
             self._write_live_line("")
             self._print_waiting()
         if self._live and self._name:
@@ -276,6 +277,7 @@ class ProgressDisplay:
 
             width = min(disp_len(self._shown) + 2, _get_terminal_width(self._stream) - 1)
             padding = max(width - disp_len(line), 0)
+            # The cursor returns to the end of the new line.
             end = "\b" * padding if line else "\r"
             self._stream.write("\r" + line + " " * padding + end)
             self._stream.flush()
@@ -303,7 +305,7 @@ class ProgressDisplay:
             effects: names of the effects of the model.
             share: share of the discrepancy that they explain, from 0 to 1.
         """
-        # 99.96 % must not be shown as 100 %.
+        # A share below 1 must not be shown as 100 %.
         percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
         self._best = " + ".join(effects), percent
         self._redraw_if_due()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -31,14 +31,15 @@ def add_options(
     from bench.core.options import read_option_texts
 
     texts = read_option_texts(options)
-    # Inherited options are listed last.
+    # Inherited options are listed last: their names are not attributes of the class itself.
     for option in sorted(fields(options), key=lambda each: each.name not in vars(options)):
-        kind = str(option.type).removesuffix(" | None")
+        kind = str(option.type).removesuffix(" | None")  # annotations are texts
         metadata = {"in_command": True, **option.metadata}
         if kind not in _PARSERS_BY_ANNOTATION or not metadata["in_command"]:
             continue
         parse, metavar = _PARSERS_BY_ANNOTATION[kind]
         flags = metadata.get("flags") or [f"--{option.name.replace('_', '-')}"]
+        # argparse formats the help, in which %% is a per cent sign.
         text = texts[option.name].rstrip(".").replace("`", "").replace("%", "%%")
         settings: dict[str, Any] = {"help": text[0].lower() + text[1:]}
         if kind == "bool":
@@ -51,8 +52,9 @@ def add_options(
                 default_text = f"{default:g}" if kind == "float" else default
                 settings["help"] += f" (default: {default_text})"
             settings |= {"type": parse, "default": default}
-            settings |= {"choices": metadata.get("choices")} if metadata.get("choices") else {}
             settings |= {"metavar": metadata.get("metavar") or metavar}
+            if metadata.get("choices"):
+                settings["choices"] = metadata["choices"]
         parser.add_argument(*flags, **{**settings, **changed.get(option.name, {})})
 
 
@@ -202,6 +204,58 @@ def parse_file_name(text: str) -> str:
 def parse_name_list(text: str) -> list[str]:
     """Parse a list of names separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def parse_key_values(option: str, texts: Sequence[str]) -> dict[str, str]:
+    """Parse NAME=VALUE texts of an option, which is named in errors.
+
+    Returns:
+        Values by name.
+
+    Raises:
+        InputError: A text does not have this form, or a name is given twice.
+    """
+    from sims.core.simulator import InputError
+
+    values: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name or not value:
+            raise InputError(f"{option} {text}: expected NAME=VALUE")
+        if name in values:
+            raise InputError(f"{option}: {name} is given twice")
+        values[name] = value
+    return values
+
+
+def parse_number(option: str, name: str, text: str) -> float:
+    """Parse a finite number, the value of a name in an option; both are named in errors.
+
+    Raises:
+        InputError: The text is not a finite number.
+    """
+    from sims.core.simulator import InputError
+
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise InputError(f"{option} {name}={text}: expected a number")
+    return value
+
+
+def parse_key_numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
+    """Parse NAME=NUMBER texts of an option into numbers by name."""
+    return {
+        name: parse_number(option, name, text)
+        for name, text in parse_key_values(option, texts).items()
+    }
+
+
+def is_path_argument(action: argparse.Action) -> bool:
+    """Return whether an argument is the path of a file or folder."""
+    return action.type in (parse_path, parse_file_name)
 
 
 _PARSERS_BY_ANNOTATION: Mapping[str, tuple[Callable[[str], Any], str]] = {

@@ -83,9 +83,9 @@ def _compute_random_steps(
         amplitude: largest absolute level, in the unit of the input.
         seconds: duration of each level.
     """
-    place = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
-    levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
-    held_levels: Array = levels[place]
+    level_index = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
+    levels: Array = rng.uniform(-amplitude, amplitude, size=level_index[-1] + 1)
+    held_levels: Array = levels[level_index]
     return held_levels
 
 
@@ -186,7 +186,7 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         InputError: the text is not a known form with valid numbers.
     """
     name, *arguments = text.split(":")
-    if not arguments:
+    if not arguments:  # a number alone
         name, arguments = "constant", [text]
     if name not in _FORMS:
         raise make_unknown_name_error("signal", name, list(_FORMS))
@@ -195,15 +195,19 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         signal_arguments = [float(number) for number in arguments]
     except ValueError:
         signal_arguments = []
-    complete = len(signal_arguments) == len(form.split(":")) and np.isfinite(signal_arguments).all()
+    is_complete = (
+        len(signal_arguments) == len(form.split(":")) and np.isfinite(signal_arguments).all()
+    )
     # All numbers except the first are frequencies or durations.
-    if not complete or min([1.0, *signal_arguments[1:]]) <= 0:
+    frequencies_or_durations = signal_arguments[1:]
+    if not is_complete or min([1.0, *frequencies_or_durations]) <= 0:
         expected = f"{name}:{form} with numbers, all but the first > 0"
         raise InputError(f"signal '{truncate_text(text)}': expected {expected}")
     span = float(times[-1])
+    # Number of levels, of one duration each, or of periods at a frequency.
     changes = [
-        span / n if compute_form is _compute_random_steps else span * n
-        for n in signal_arguments[1:]
+        span / number if compute_form is _compute_random_steps else span * number
+        for number in frequencies_or_durations
     ]
     if max(map(abs, signal_arguments)) > MAX_NUMBER or max([0.0, *changes]) > _MAX_CHANGES:
         expected = f"numbers within {MAX_NUMBER:g}, and at most {_MAX_CHANGES:g} periods or levels"

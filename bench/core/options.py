@@ -49,6 +49,7 @@ def option(
 def read_option_texts(options: type) -> dict[str, str]:
     """Return the description of each field of an options dataclass, from the docstrings."""
     texts: dict[str, str] = {}
+    # Base classes first, so that a subclass can describe a field anew.
     for base in reversed(options.__mro__):
         _, _, attributes = (inspect.cleandoc(base.__doc__ or "")).partition("Attributes:\n")
         entries = _ATTRIBUTE.findall(inspect.cleandoc(attributes))
@@ -98,6 +99,7 @@ def with_options(
     def decorate(
         function: Callable[[Source, Options], Result],
     ) -> Callable[Concatenate[Source, P], Result]:
+        # The caller gives the fields of the second argument, the options, by keyword.
         source, _ = inspect.signature(function).parameters.values()
         keywords = inspect.signature(options).parameters.values()
         signature = inspect.Signature(

@@ -98,6 +98,7 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
         InputError: a file is missing, does not run, or defines no such part; nothing of this file
             is registered then.
     """
+    # Something that is neither a path nor a list is reported below like a wrong entry of a list.
     paths_to_load = (
         [paths] if isinstance(paths, str | Path) or not isinstance(paths, Iterable) else paths
     )

@@ -115,11 +115,11 @@ def get_machine_resources(folder: Path | None = None) -> MachineResources:
     Args:
         folder: folder to write to, which need not exist; None for the current one.
     """
-    place = (folder or Path()).absolute()
-    while not place.is_dir() and place != place.parent:
-        place = place.parent
+    existing_folder = (folder or Path()).absolute()
+    while not existing_folder.is_dir() and existing_folder != existing_folder.parent:
+        existing_folder = existing_folder.parent
     try:
-        disk = float(shutil.disk_usage(place).free)
+        disk = float(shutil.disk_usage(existing_folder).free)
     except OSError:
         disk = math.inf
     return MachineResources(_read_memory_limit(), disk)

@@ -23,7 +23,7 @@ from bench.benchmark.storage.table_schemas import (
     EmptyCellRule,
 )
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.cli import catalogue
+from bench.cli.commands import list_catalogue
 from bench.cli.main import build_parser
 from bench.cli.output import EXIT_CODES
 from bench.diagnosis.evaluation.search_control import EarlyStop
@@ -70,7 +70,7 @@ def summary(cls):
 
 def commands():
     """Return the page of all commands with their options."""
-    found = catalogue.list_commands(build_parser())
+    found = list_catalogue.list_commands(build_parser())
     listing = [("command", "what it does")]
     listing += [(f"[`{each['name']}`](#simgap-{each['name']})", each["says"]) for each in found]
     codes = [
@@ -373,7 +373,7 @@ def cell_schema(column):
 
 def json_documents():
     """Return the page of the JSON documents of all commands, made from the schemas."""
-    commands_of = [each["name"] for each in catalogue.list_commands(build_parser())]
+    commands_of = [each["name"] for each in list_catalogue.list_commands(build_parser())]
     others = [name for name in schema_names() if name not in commands_of]
     parts = [
         "`simgap COMMAND --json` prints one JSON document to stdout and nothing else; progress and "

@@ -71,7 +71,9 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
     values = collect_options(options, ComparisonOptions)
     if options.resume:
         changed = {"experiment": options.experiment, **values}
-        refused = [n for n, value in changed.items() if value and n not in _UNCHANGED_BY_RESUME]
+        refused = [
+            name for name, value in changed.items() if value and name not in _UNCHANGED_BY_RESUME
+        ]
         if refused:
             raise InputError(
                 "--resume uses the configuration of its folder unchanged; leave out "
@@ -126,8 +128,8 @@ def _run_study(
         options: parsed command line.
         print_line: prints one line of text.
     """
-    from bench.cli.output import summarise_study
     from bench.cli.progress_display import ProgressBars
+    from bench.cli.study_summary import summarise_study
 
     with ProgressBars() as bars:
         outcome = study.run(options.jobs, bars.start_bar, pool)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from bench.cli.catalogue import is_path_argument
 from bench.cli.output import CommandResult, PrintLine
+from bench.cli.shared_options import is_path_argument
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _BASH_FUNCTIONS = """
@@ -48,7 +48,10 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
     from bench.core.plugin_registries import REGISTRIES
     from bench.schemas import list_schema_names
 
-    (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    # argparse has no public way to list the arguments of a parser.
+    (commands,) = [
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    ]
     for name, command in commands.choices.items():
         for action in command._actions:
             _set_completion(name, action, shtab)

@@ -123,6 +123,7 @@ def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path 
     """
     if target_folder is None:
         return data_set.folder()
+    # In a named folder the files themselves are looked for.
     folder = target_folder / data_set.name
     return folder if all((folder / file).is_file() for file in data_set.provides) else None
 

@@ -129,13 +129,15 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     for line in format_summary(explanation.story):
         print_line(line)
     left_out = explanation.ranges.left_out if options.ranges else ()
+    # What the verdict contains but the extended simulator, or a range, cannot express.
     for line in (*explanation.unsaid, *left_out):
         print_line(line)
-    print_line(f"\n{_FILE_LABELS['report.html']:11} {paths[-1]}")
-    for path in paths[:-1]:
+    *result_files, report = paths
+    print_line(f"\n{_FILE_LABELS['report.html']:11} {report}")
+    for path in result_files:
         if path.suffix not in _FIGURE_SUFFIXES:
             print_line(f"{_FILE_LABELS.get(path.name, path.stem):11} {path}")
-    cutoff = explanation.answer.cut
+    cutoff = explanation.answer.cut  # why the search ended early; None if it did not
     document = {
         "verdict": explanation.answer.to_document(),
         "title": explanation.story.title,
@@ -262,7 +264,7 @@ def _report_batch(
     ):
         print_line(line)
     code = EXIT_PROBLEMS_FOUND if any(row.error for row in log_results) else EXIT_OK
-    if remaining:
+    if remaining:  # the user has interrupted the command
         print_line(
             f"{remaining} of {len(logs)} recordings remain; run the same command again to continue"
         )

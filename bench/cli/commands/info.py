@@ -127,9 +127,9 @@ def _describe_packages() -> Iterator[JsonDocument]:
         requirements = []
     for requirement in requirements:
         extra = _parse_extra(str(requirement.marker or ""))
-        if extra == "dev" or not (
-            requirement.marker is None or requirement.marker.evaluate({"extra": extra})
-        ):
+        # A marker may also exclude this platform or version of Python.
+        applies = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+        if extra == "dev" or not applies:
             continue
         version = _read_package_version(requirement.name)
         # simgap is in no package index, so its extras cannot be installed by name.

@@ -98,7 +98,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         *find_missing_base_poses(recording, kind),
     ]
     warnings_to_print = [
-        *(o.text for o in oddities),
+        *(oddity.text for oddity in oddities),
         *recording_summary.format_log_warnings(recording, kind),
     ]
     findings = list(check_log_quality(recording, kind))
@@ -142,7 +142,9 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         "check": numbers,
         "files": files,
     }
-    has_unidentifiable = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
+    has_unidentifiable = any(
+        number["free"] and number["word"] == "not identifiable" for number in numbers or ()
+    )
     return CommandResult(document, EXIT_PROBLEMS_FOUND if has_unidentifiable else EXIT_OK)
 
 
@@ -163,6 +165,7 @@ def _remove_inactive_drives(
 
     active = remove_inactive_drives(recording, kind)
     findings = []
+    # Each drive adds a note to those of the recording: what was removed; and what to do.
     for note in active.notes[len(recording.notes) :]:
         text, _, remedy = note.rpartition("; ")
         findings.append(QualityFinding("drive", text, remedy))
@@ -222,6 +225,11 @@ def _print_identifiability(
     numbers = check_identifiability(options.recording, options.system, options.model, free)
     print_line("\n".join(("", *format_identifiability(numbers))))
     return [
-        {**asdict(number), "mixed": [{"with": n, "correlation": c} for n, c in number.mixed]}
+        {
+            **asdict(number),
+            "mixed": [
+                {"with": name, "correlation": correlation} for name, correlation in number.mixed
+            ],
+        }
         for number in numbers
     ]

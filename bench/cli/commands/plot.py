@@ -80,8 +80,12 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     for folder in options.runs:
         if not isinstance(study := open_study(folder), Comparison):
             experiment = study.configuration.experiment
-            found_text = "a bounce shot" if experiment.shot else "a study of two comparisons"
-            found_text = "a comparison of diagnosers" if experiment.diagnosis else found_text
+            if experiment.diagnosis:
+                found_text = "a comparison of diagnosers"
+            elif experiment.shot:
+                found_text = "a bounce shot"
+            else:
+                found_text = "a study of two comparisons"
             raise InputError(f"{folder}: expected the folder of a comparison, found {found_text}")
     document = compare_across_problems(options.runs, options.out, print_line).to_document()
     return CommandResult(
@@ -102,7 +106,7 @@ def _report_again(
         references: reference results that are drawn behind the figures.
         print_line: prints one line of text.
     """
-    from bench.cli.output import summarise_study
+    from bench.cli.study_summary import summarise_study
     from bench.studies.study import list_study_folders, open_study, report_jointly
 
     comparisons = []

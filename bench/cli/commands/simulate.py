@@ -1,7 +1,4 @@
-"""Command `simgap simulate`: write the recording of a simulated experiment.
-
-It has parsers of ``NAME=VALUE`` arguments of the command line.
-"""
+"""Command `simgap simulate`: write the recording of a simulated experiment."""
 
 from __future__ import annotations
 
@@ -15,60 +12,21 @@ from bench.cli.shared_options import (
     add_out_option,
     add_plugin_option,
     collect_options,
+    parse_key_numbers,
+    parse_key_values,
+    parse_number,
     parse_positive_int,
 )
 from bench.logs.synthetic_recording import ALL_CHANNELS
 from sims.core.simulator import InputError
 
 
-def parse_key_values(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Parse NAME=VALUE texts.
-
-    Returns:
-        Values by name.
-
-    Raises:
-        InputError: A text does not have this form, or a name is given twice.
-    """
-    values: dict[str, str] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name or not value:
-            raise InputError(f"{option} {text}: expected NAME=VALUE")
-        if name in values:
-            raise InputError(f"{option}: {name} is given twice")
-        values[name] = value
-    return values
-
-
-def parse_number(option: str, name: str, text: str) -> float:
-    """Parse a finite number.
-
-    Raises:
-        InputError: The text is not a finite number.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < float("inf"):
-        raise InputError(f"{option} {name}={text}: expected a number")
-    return value
-
-
-def parse_key_numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
-    """Parse NAME=NUMBER texts of an option into numbers by name."""
-    return {
-        name: parse_number(option, name, text)
-        for name, text in parse_key_values(option, texts).items()
-    }
-
-
 def parse_parameters(texts: Sequence[str]) -> dict[str, float] | list[float]:
     """Parse parameters by name, or all of them in order from one text separated by commas."""
     if len(texts) == 1 and "=" not in texts[0]:
         return [
-            parse_number("--theta", f"value {i}", t) for i, t in enumerate(texts[0].split(","), 1)
+            parse_number("--theta", f"value {position}", text)
+            for position, text in enumerate(texts[0].split(","), 1)
         ]
     return parse_key_numbers("--theta", texts)
 

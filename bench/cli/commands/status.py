@@ -100,8 +100,8 @@ def _format_isolation(isolation: JsonDocument) -> str:
     if isolation["trusted"]:
         return "trusted: its tuners run without isolation"
     missing, salt = isolation["missing"], isolation["salt_sha256"]
-    processes = "isolated: a process for each "
-    processes += "run" if isolation["isolation"] == "run" else "tuner and seed"
+    scope = "run" if isolation["isolation"] == "run" else "tuner and seed"
+    processes = f"isolated: a process for each {scope}"
     layers = f", WITHOUT the layers {', '.join(missing)}" if missing else ", all layers active"
     salt_note = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
     return processes + layers + salt_note + (", revealed" if isolation["revealed"] else "")
@@ -169,7 +169,8 @@ def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
     lines = []
     for group, counts in groups.items():
         ordered = sorted(counts, key=lambda status: (status == MISSING_STATUS, status))
-        lines.append(f"{group:{width}}  {', '.join(f'{counts[s]} {s}' for s in ordered)}")
+        counts_text = ", ".join(f"{counts[status]} {status}" for status in ordered)
+        lines.append(f"{group:{width}}  {counts_text}")
     return lines
 
 

@@ -61,6 +61,11 @@ class NextRunDesign:
     groups: tuple[tuple[str, ...], ...] = ()
 
     @property
+    def is_for_discrimination(self) -> bool:
+        """True if the run distinguishes models (criterion T), and not parameters (D)."""
+        return self.by == "T"
+
+    @property
     def distinguished_effects(self) -> tuple[str, ...]:
         """Alternative effects that the run would distinguish from the present effect."""
         return tuple(

@@ -24,8 +24,8 @@ from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.code_digest import hash_class_source, hash_effect_sources
 from bench.benchmark.runner.run_fingerprint import RunIds, compute_fingerprint
 from bench.benchmark.runner.tuner_training import compute_training_key
-from bench.cli import catalogue
-from bench.cli.catalogue import format_documents
+from bench.cli.commands import list_catalogue
+from bench.cli.commands.list_catalogue import format_documents
 from sims import effects
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError
@@ -176,7 +176,7 @@ def test_model_files_are_found_in_packages_and_in_the_folder_of_robots(tmp_path,
 
 
 def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypatch):
-    from bench.cli.catalogue import list_experiments
+    from bench.cli.commands.list_catalogue import list_experiments
 
     monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -199,7 +199,7 @@ def without(monkeypatch, *packages):
 
 def test_the_list_marks_experiments_whose_engine_or_tuners_are_absent(monkeypatch):
     without(monkeypatch, "torch", "pybullet", "pybullet_data")
-    listed = {each["name"]: each for each in catalogue.list_experiments()}
+    listed = {each["name"]: each for each in list_catalogue.list_experiments()}
     pybullet = "needs pybullet, not installed (pip install pybullet)"
     for name in ("ball-drop", "ball-crossengine", "pendulum-real"):
         assert listed[name]["skipped"] == pybullet, name
