@@ -261,6 +261,9 @@ def _read_system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | No
     Args:
         path: path of the file.
         document: its content.
+
+    Raises:
+        InputError: A name is missing or not a text, or an entry is allowed for robots only.
     """
     for key in document:
         if key in robot_reference.ROBOT_KEYS and key != "engine":
@@ -330,20 +333,24 @@ def make_simulator_class(
     """
     check_known_names(f"parameter of system {extended.system}", extended.parameters, _names(kind))
     fitted = extended.parameters
-    base_parameters = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
-    values = _list_coefficients(extended, kind)
-    # Make one instance, so that wrong settings are refused here; it knows the coefficients' bounds.
+    base_parameters = [
+        _set_nominal(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters
+    ]
+    coefficients = _list_coefficients(extended, kind)
+    # Make one instance, so that wrong settings are refused here; its parameters include those of
+    # the effects, with their bounds.
     effects, observed = list(extended.effects), list(extended.observe)
-    extended_simulator = kind(extended.constants, observed, effects=effects, **_engine(extended))
+    settings = _get_engine_setting(extended)
+    extended_simulator = kind(extended.constants, observed, effects=effects, **settings)
+    effect_parameters = extended_simulator.parameters[len(base_parameters) :]
     added_parameters = [
-        _at(p, n)
-        for p, n in zip(extended_simulator.parameters[len(base_parameters) :], values, strict=True)
+        _set_nominal(p, number) for p, number in zip(effect_parameters, coefficients, strict=True)
     ]
     extended_simulator.close()
     return _make_subclass(extended, kind, (*base_parameters, *added_parameters))
 
 
-def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
+def _get_engine_setting(extended: ExtendedSimulator) -> dict[str, Any]:
     """Return the setting that selects the engine; user-defined simulators have none."""
     return {"engine": extended.engine} if extended.engine else {}
 
@@ -351,7 +358,10 @@ def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
 def _make_subclass(
     extended: ExtendedSimulator, kind: type[SystemSimulator], parameters: tuple[Parameter, ...]
 ) -> type[SystemSimulator]:
-    """Make a subclass of `kind` with all fitted values as defaults.
+    """Make a subclass of `kind` whose instances are the fitted simulator.
+
+    Constants, observed channels and settings may be given when an instance is made; the effects
+    are fixed.
 
     Args:
         extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
@@ -376,7 +386,7 @@ def _make_subclass(
         """
         # Engine, sensors and constants may be changed; the effects are fixed.
         stated_constants = {**extended.constants, **(constants or {})}
-        engine_settings = {**_engine(extended), **settings}
+        engine_settings = {**_get_engine_setting(extended), **settings}
         kind.__init__(
             self, stated_constants, observe or observed, effects=effects, **engine_settings
         )
@@ -441,13 +451,17 @@ def _list_coefficients(
         check_known_names(f"coefficient of effect {name}", numbers, [c.name for c in coefficients])
         parameters = make_effect_parameters(effect, kind.system, extended.observe)
         for parameter, coefficient in zip(parameters, coefficients, strict=True):
-            zero = FittedValue(0.0, parameter.unit, None, None)
+            zero = FittedValue(0.0, parameter.unit, low=None, high=None)
             values.append(numbers.get(coefficient.name, zero))
     return values
 
 
-def _at(parameter: Parameter, number: FittedValue) -> Parameter:
-    """Set the nominal value of a parameter to a fitted number, with a training range around it."""
+def _set_nominal(parameter: Parameter, number: FittedValue) -> Parameter:
+    """Set the nominal value of a parameter to a fitted number, with a training range around it.
+
+    The half width of the range is the larger of two: a share of the number, and a multiple of the
+    half width of its 95 % interval, if it has one.
+    """
     reach = max(MIN_TRAINING_RANGE_SHARE * abs(number.value), _MIN_HALF_WIDTH)
     if number.low is not None and number.high is not None:
         reach = max(reach, TRAINING_RANGE_HALF_WIDTHS * (number.high - number.low) / 2.0)
@@ -455,6 +469,7 @@ def _at(parameter: Parameter, number: FittedValue) -> Parameter:
     # The fitted value may be outside the plausible range; extend the bounds to include it.
     low, high = min(low, number.value), max(high, number.value)
     training_range = (max(low, number.value - reach), min(high, number.value + reach))
+    # Bounds on both sides of the number may leave no range.
     training = training_range if training_range[0] < training_range[1] else None
     return replace(parameter, nominal=number.value, bounds=(low, high), training=training)
 
@@ -473,7 +488,8 @@ def load_extended(path: Path, find: SimulatorLookup) -> type[SystemSimulator]:
     Raises:
         InputError: The file, or the system that it names, is not usable.
     """
-    return open_extended(path, find)[2]
+    _, _, simulator = open_extended(path, find)
+    return simulator
 
 
 def open_extended(
@@ -507,6 +523,8 @@ def list_effect_coefficients(
 ) -> dict[str, list[float]]:
     """List the coefficients of an extended simulator by effect, in the order of the effect.
 
+    Coefficients that its file does not state are zero.
+
     Args:
         extended: extended simulator of a diagnosis: fitted parameters, constants and effects.
         kind: class of the simulator.
@@ -518,8 +536,8 @@ def list_effect_coefficients(
         raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
     coefficients = {}
     for name, numbers in extended.effects.items():
-        declared_effect = library.find_effect(name, kind.system).on(kind.system)
+        declared_coefficients = library.find_effect(name, kind.system).on(kind.system)
         coefficients[name] = [
-            numbers[c.name].value if c.name in numbers else 0.0 for c in declared_effect
+            numbers[c.name].value if c.name in numbers else 0.0 for c in declared_coefficients
         ]
     return coefficients

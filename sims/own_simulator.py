@@ -59,14 +59,14 @@ class OwnSimulatorSystem(System):
             return "its levels cannot be set (it has no method put)"
         if issubclass(effect, HiddenStateEffect):
             return "an own simulator takes forces, but no additional states"
-        if not issubclass(effect, Force | Friction):
+        if not issubclass(effect, Force | Friction):  # an effect on an input, a sensor or a level
             return ""
         if cls.simulator.apply_force is OwnSimulator.apply_force:
             return "it takes no forces (it has no method apply_force)"
         if issubclass(effect, Friction) and cls.simulator.inertia is OwnSimulator.inertia:
             return "it does not define its inertia (it has no method inertia)"
         try:
-            _ask(effect, cls)
+            _evaluate_once(effect, cls)
         except _NotDeclaredError as reason:
             return str(reason)
         return ""
@@ -108,10 +108,13 @@ class _NotDeclaredError(InputError):
     """Error for a quantity that an effect needs and the simulator does not provide."""
 
 
-def _ask(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
+def _evaluate_once(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
     """Evaluate an effect once, which fails if the system lacks a quantity that it needs.
 
     So a missing quantity is reported before a simulation starts.
+
+    Raises:
+        _NotDeclaredError: The effect uses a mass, gravity or drive that the system does not define.
     """
     # Coefficients, positions and inputs are zero: only whether they exist matters, not the result.
     ones = np.ones((1, 1))
@@ -163,10 +166,10 @@ class OwnSimulator(SystemSimulator):
         them. The first paragraph of the class docstring is its description, unless it states
         `says`.
         """
-        _check(cls)
-        forced = {*cls.coordinates, *cls.rates}
-        # Other states are appended to the rates, because engines pass two vectors only.
-        free_states = [name for name in cls.states if name not in forced]
+        _check_declaration(cls)
+        motion_states = {*cls.coordinates, *cls.rates}
+        # Engines pass two vectors of states only, positions and rates: others follow the rates.
+        other_states = [name for name in cls.states if name not in motion_states]
         summary = " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split())
         shared = ("name", "parameters", "channels", "constants", "inputs", "states")
         attributes = {
@@ -174,7 +177,7 @@ class OwnSimulator(SystemSimulator):
             "says": cls.__dict__.get("says") or summary,
             "kind": cls.kind,
             "coordinates": cls.coordinates,
-            "rates": (*cls.rates, *free_states),
+            "rates": (*cls.rates, *other_states),
             "levels": cls.levels,
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
@@ -288,7 +291,7 @@ _RESERVED_ATTRIBUTES = (
 """Attributes that are set once, by the base classes."""
 
 
-def _check(cls: type[OwnSimulator]) -> None:
+def _check_declaration(cls: type[OwnSimulator]) -> None:
     """Check the declaration of a user's simulator when its class is created.
 
     Raises:

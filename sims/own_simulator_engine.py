@@ -77,9 +77,10 @@ class OwnSimulatorEngine:
         """Do nothing, because there are no resources."""
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
-        """Return readings (L, R, C) instead of positions.
+        """Return readings (L, R, C) of all channels, in place of positions and their derivatives.
 
-        There is one row before the first step, and one after every `batch.every` steps.
+        There is one row before the first step, and one after each `batch.steps_per_sample` steps.
+        An element with a number that is not finite is all NaN.
 
         Shapes: L batch elements, C channels.
 
@@ -89,7 +90,7 @@ class OwnSimulatorEngine:
         count = batch.steps.shape[1] // batch.steps_per_sample + 1
         width = len(batch.system.channels)
         shape = len(batch.theta), count, width
-        levels = np.full(shape, np.nan)
+        readings = np.full(shape, np.nan)
         for element in range(len(batch.theta)):
             try:
                 rows = self._run(batch.select(np.array([element])))
@@ -98,8 +99,8 @@ class OwnSimulatorEngine:
             except Exception as error:
                 raise _make_simulator_error(self.world, error) from error
             if rows is not None and np.isfinite(rows).all():
-                levels[element] = rows
-        return Trajectories(levels, levels, levels)
+                readings[element] = rows
+        return Trajectories(readings, readings, readings)
 
     def _run(self, batch: IntegrationBatch) -> Array | None:
         """Simulate one batch element with the user's simulator.
@@ -128,8 +129,8 @@ class OwnSimulatorEngine:
             return None
         world.reset(theta, constants, initial)
         forces = _Forces(batch, world)
-        rims = _LevelLimits(batch, world)
-        rims.keep()
+        level_limits = _LevelLimits(batch, world)
+        level_limits.keep()
         steps = batch.steps[0].copy()
         # Steps of zero length, in which this batch element waits for others, are skipped.
         moving = steps > 0
@@ -144,7 +145,7 @@ class OwnSimulatorEngine:
                 if forces.any:
                     world.apply_force(forces.at(time, inputs, seconds))
                 world.step(inputs, seconds)
-                rims.keep()
+                level_limits.keep()
                 time = time + seconds
                 has_moved = True
             # Without a step, the previous row is still valid.
@@ -167,6 +168,7 @@ def _make_simulator_error(world: SteppableSimulator, error: Exception) -> InputE
         world: simulator that a user has written, stepped in time.
         error: the exception.
     """
+    # Prefer the last line in the user's own file to one in a library that it calls.
     frames = traceback.extract_tb(error.__traceback__)
     module = sys.modules.get(type(world).__module__)
     module_frames = [
@@ -338,28 +340,28 @@ class _Forces:
         return force
 
     def _compute_friction(self, moment: StateSnapshot, force: Array, seconds: float) -> Array:
-        """Return the force (D,) that stops the motion within the step, up to the limit.
+        """Return the force (D,) that stops the motion within the step, up to the limit L.
 
-        The simulator's own force is estimated from the last step.
-
-        The simulator's own force is P = M (v - v_before) / h_before - F_before (1), the stopping
-        force S = -(M v / h + P + F) (2), and friction is S where |S| <= L, else L S / |S| (3).
+        With the inertia M, the velocity v, the step h and the other effects' forces F: the
+        simulator's own force is estimated from the last step, P = M (v - v_before) / h_before -
+        F_before (1), zero in the first step. The stopping force is S = -(M v / h + P + F) (2), and
+        friction is S where |S| <= L, else L S / |S| (3).
 
         Shapes: D coordinates.
 
         Args:
             moment: state of the simulator.
             force: (D,) sum of the other effects' forces.
-            seconds: length of the step.
+            seconds: length of the step, s.
         """
         inertia = get_checked_inertia(self.world)
         v = moment.v[0]
-        passive_force = np.zeros_like(force)
+        own_force = np.zeros_like(force)
         if self._last is not None:
             last_velocity, applied, last_seconds = self._last
-            passive_force = np.dot(inertia, v - last_velocity) / last_seconds - applied  # (1)
+            own_force = np.dot(inertia, v - last_velocity) / last_seconds - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(np.dot(inertia, v) / seconds + passive_force + force)  # (2)
+        stop = -(np.dot(inertia, v) / seconds + own_force + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds

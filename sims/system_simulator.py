@@ -41,6 +41,8 @@ MAX_STORED_TIME_GRIDS = 8
 """Maximum number of sets of scenarios whose steps and inputs are stored."""
 MAX_STORED_NUMBERS = 2_000_000
 """Maximum number of steps, and of each input's values, of a set that is stored (16 MB)."""
+_StepsAndInputs = tuple[TimeGrid, dict[str, Array]]
+"""Time grid, and applied inputs (L, S) by name."""
 
 
 class SystemSimulator(Simulator):
@@ -68,8 +70,8 @@ class SystemSimulator(Simulator):
     ) -> None:
         """Create engine and effects, and append the effects' coefficients to the parameters.
 
-        Effects that are fitted (`effects`) have coefficients that vary between batch elements;
-        those of known effects (`fixed`) are the same in all.
+        Effects that are fitted (`effects`) have coefficients that vary between simulations of one
+        batch; those of known effects (`fixed`) are the same in all.
 
         Args:
             constants: Values of `constants` that differ from their defaults.
@@ -83,7 +85,7 @@ class SystemSimulator(Simulator):
         """
         super().__init__(constants, observe)
         self._declared = self.system()
-        self._stored_steps: dict[tuple[object, ...], tuple[TimeGrid, dict[str, Array]]] = {}
+        self._stored_steps: dict[tuple[object, ...], _StepsAndInputs] = {}
         self.engine = self._make_engine(engine, settings)
         check_effect_types(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
@@ -92,11 +94,9 @@ class SystemSimulator(Simulator):
             for name, value in (fixed or {}).items()
         ]
         effect_names = [effect.name for effect in self.effects]
-        doubled = [
-            name for name in effect_names if name in (fixed or {}) or effect_names.count(name) > 1
-        ]
-        if doubled:
-            raise InputError(f"effect {doubled[0]} is named twice")
+        for name in effect_names:
+            if name in (fixed or {}) or effect_names.count(name) > 1:
+                raise InputError(f"effect {name} is named twice")
         for effect, values in self.fixed:
             names = [c.name for c in effect.on(self.system)]
             if not 1 <= len(values) <= len(names):
@@ -134,7 +134,7 @@ class SystemSimulator(Simulator):
             InputError: the effect is unknown or not supported; the message states the reason.
         """
         effect = library.find_effect(named, self.system) if isinstance(named, str) else named
-        # Effects at a place are made by the system itself and need no check.
+        # Effects at a place of a robot are made by the system itself and need no check.
         if effect.of:
             return effect()
         if reason := effect.misses(self.system):
@@ -218,15 +218,15 @@ class SystemSimulator(Simulator):
         runs = group_scenarios(scenarios)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
-            plan, inputs = self._compute_steps_and_inputs(
+            grid, inputs = self._compute_steps_and_inputs(
                 runs, commands, _select_effects(active_effects, (Input, Sensor))
             )
             sensors = tuple(
                 (effect, c) for effect, c in _select_effects(active_effects, Sensor) if c.any()
             )
             # A sensor filter needs every step; other sensor effects need the samples only.
-            filtered = any(needs_every_step(effect) for effect, _ in sensors)
-            steps_per_state = 1 if filtered else plan.steps_per_sample
+            is_filtered = any(needs_every_step(effect) for effect, _ in sensors)
+            steps_per_state = 1 if is_filtered else grid.steps_per_sample
             base_theta = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._collect_known_values(scenarios, initial)
             forces = _select_effects(
@@ -238,14 +238,15 @@ class SystemSimulator(Simulator):
                 constants,
                 x,
                 v,
-                plan.steps,
+                grid.steps,
                 inputs,
                 forces,
                 steps_per_state,
             )
-            clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
+            start_stamps = np.array([s.times[0] for s in runs.unique_scenarios])
+            clock = start_stamps[runs.scenario_index, None]
             motion = self.engine.integrate(batch)
-            observations = self._read(motion, batch, plan, sensors, clock)
+            observations = self._read(motion, batch, grid, sensors, clock)
         # Readings of a shorter run while it waits at its end are not samples.
         sizes = np.array([s.times.size for s in runs.unique_scenarios])
         if sizes.min() < sizes.max():
@@ -254,11 +255,12 @@ class SystemSimulator(Simulator):
 
     def _compute_steps_and_inputs(
         self, runs: ScenarioGroups, commands: Commands, acting: ActiveEffects
-    ) -> tuple[TimeGrid, dict[str, Array]]:
+    ) -> _StepsAndInputs:
         """Return the time grid, and the applied inputs (L, S) by name.
 
         A search simulates the same runs thousands of times. Without effects on inputs and without
-        shifts of time, steps and inputs depend only on the scenarios, and are stored.
+        shifts of time, steps and inputs depend only on the scenarios. Then they are computed once
+        for each distinct scenario, stored, and repeated for its batch elements.
 
         Shapes: L batch elements, S steps.
 
@@ -267,33 +269,35 @@ class SystemSimulator(Simulator):
             commands: Inputs of each distinct scenario.
             acting: Effects on inputs and sensors.
         """
-        input_effects = _select_effects(acting, Input)
-        is_plain = not any(
+
+        def compute(groups: ScenarioGroups, effects: ActiveEffects) -> _StepsAndInputs:
+            grid = build_time_grid(groups, commands, effects, self.engine.largest_step)
+            if not self.inputs:
+                return grid, {}
+            input_effects = _select_effects(effects, Input)
+            return grid, compute_applied_inputs(grid, groups, commands, input_effects)
+
+        has_effect = any(
             c.any() and (isinstance(effect, Input) or shifts_time(effect)) for effect, c in acting
         )
         has_shift = any(scenario.offset for scenario in runs.unique_scenarios)
-        if not is_plain or has_shift or not runs.contents:
-            plan = build_time_grid(runs, commands, acting, self.engine.largest_step)
-            return plan, (
-                compute_applied_inputs(plan, runs, commands, input_effects) if self.inputs else {}
-            )
+        if has_effect or has_shift or not runs.contents:
+            return compute(runs, acting)
         stored = self._stored_steps.get(runs.contents)
         if stored is None:
-            rows = runs.one_each
-            plan = build_time_grid(rows, commands, (), self.engine.largest_step)
-            stored = plan, compute_applied_inputs(plan, rows, commands, ()) if self.inputs else {}
-            if len(self._stored_steps) >= MAX_STORED_TIME_GRIDS:
+            grid, _ = stored = compute(runs.one_each, ())
+            if len(self._stored_steps) >= MAX_STORED_TIME_GRIDS:  # the oldest makes room
                 del self._stored_steps[next(iter(self._stored_steps))]
-            if plan.steps.size <= MAX_STORED_NUMBERS:
+            if grid.steps.size <= MAX_STORED_NUMBERS:
                 self._stored_steps[runs.contents] = stored
-        plan, inputs = stored
-        expanded_plan = replace(
-            plan,
-            steps=runs.expand_rows(plan.steps),
-            ends=runs.expand_rows(plan.ends),
-            rows=runs.expand_rows(plan.rows),
+        grid, inputs = stored
+        expanded_grid = replace(
+            grid,
+            steps=runs.expand_rows(grid.steps),
+            ends=runs.expand_rows(grid.ends),
+            rows=runs.expand_rows(grid.rows),
         )
-        return expanded_plan, {name: runs.expand_rows(values) for name, values in inputs.items()}
+        return expanded_grid, {name: runs.expand_rows(values) for name, values in inputs.items()}
 
     def close(self) -> None:
         """Release the resources of the engine."""
@@ -307,16 +311,17 @@ class SystemSimulator(Simulator):
         Shapes: L batch elements, K coefficients.
         """
         active_effects = []
-        place = len(self.system.parameters)
+        # The coefficients follow the parameters of the system.
+        first = len(self.system.parameters)
         for effect in self.effects:
             count = len(effect.on(self.system))
-            rows = theta[:, place : place + count].T
-            active_effects.append((effect, _expand_coefficients(effect, rows)))
-            place += count
+            tuned = theta[:, first : first + count].T
+            active_effects.append((effect, _expand_coefficients(effect, tuned)))
+            first += count
         for effect, values in self.fixed:
             column = np.array(values)[:, None]
-            rows = np.repeat(column, len(theta), axis=1)
-            active_effects.append((effect, _expand_coefficients(effect, rows)))
+            repeated = np.repeat(column, len(theta), axis=1)
+            active_effects.append((effect, _expand_coefficients(effect, repeated)))
         return tuple(active_effects)
 
     def _collect_known_values(
@@ -344,7 +349,7 @@ class SystemSimulator(Simulator):
         self,
         motion: Trajectories,
         batch: IntegrationBatch,
-        plan: TimeGrid,
+        grid: TimeGrid,
         sensors: ActiveEffects,
         clock: Array,
     ) -> Array:
@@ -355,7 +360,7 @@ class SystemSimulator(Simulator):
         Args:
             motion: Result of the engine.
             batch: Batch that the engine integrated.
-            plan: Time grid.
+            grid: Time grid.
             sensors: Active sensor effects.
             clock: (L, 1) first time stamp of each run, s.
 
@@ -364,25 +369,31 @@ class SystemSimulator(Simulator):
         """
         channels = self._declared.observe(motion.x, motion.v, motion.a, batch.constants)
         names = [c.name for c in self.channels]
-        valued = self.system.reading(names)
-        times = plan.compute_state_times(batch.steps_per_sample)
+        # A gain or bias affects one channel only, a filter all of them.
+        affected_name = self.system.reading(names)
+        times = grid.compute_state_times(batch.steps_per_sample)
         steps = np.diff(times, axis=1, prepend=0.0)
-        # Convert the rows: with a sensor filter, more states than the samples are stored.
-        sample_steps = plan.rows * (plan.steps_per_sample // batch.steps_per_sample)
-        observations = np.empty((*sample_steps.shape, len(names)))
-        for place, name in enumerate(names):
+        # Numbers of the samples' states: with a filter, more states than the samples are stored.
+        sample_rows = grid.rows * (grid.steps_per_sample // batch.steps_per_sample)
+        observations = np.empty((*sample_rows.shape, len(names)))
+        for column, name in enumerate(names):
             values = channels[name]
-            # A gain or bias affects one channel only.
-            reading = tuple((e, c) for e, c in sensors if needs_every_step(e) or name == valued)
-            if reading:
-                values = apply_sensor_effects(reading, values, steps, times, clock)
-            observations[:, :, place] = _select_rows(values, sample_steps)
+            acting = tuple(
+                (e, c) for e, c in sensors if needs_every_step(e) or name == affected_name
+            )
+            if acting:
+                values = apply_sensor_effects(acting, values, steps, times, clock)
+            observations[:, :, column] = _select_rows(values, sample_rows)
         observations += 0.0  # turn negative zeros into positive ones
         return observations
 
 
 def _select_rows(values: Array, rows: Indices) -> Array:
-    """Return values[l, rows[l, t]], without a copy if the first values are selected in order."""
+    """Return values[l, rows[l, t]], (L, T), of values (L, R) and rows (L, T).
+
+    There is no copy if the first values are selected in order in all L batch elements. Rows that
+    share their memory (stride zero) are equal.
+    """
     in_order = (rows[:1] == np.arange(rows.shape[1])).all()
     if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
         return values[:, : rows.shape[1]]
@@ -404,17 +415,16 @@ def _stack_states(states: Mapping[str, Array], names: Sequence[str], count: int)
     return result
 
 
-def _expand_coefficients(effect: Effect, rows: Array) -> Array:
-    """Extend coefficients to (K, L, 1) with zeros.
-
-    Shapes: L batch elements.
+def _expand_coefficients(effect: Effect, values: Array) -> Array:
+    """Extend coefficients of L batch elements to (K, L, 1), with zeros for missing ones.
 
     Args:
         effect: the effect, with K coefficients.
-        rows: (k, L) its first coefficients.
+        values: (k, L) its first coefficients; a kind of system may lack the last ones.
     """
-    result = np.zeros((len(effect.coefficients), rows.shape[1], 1))
-    result[: len(rows), :, 0] = rows
+    count, batch_size = values.shape
+    result = np.zeros((len(effect.coefficients), batch_size, 1))
+    result[:count, :, 0] = values
     return result
 
 

@@ -171,6 +171,7 @@ def _bind_arguments(
     try:
         return signature.bind(*args, **kwargs)
     except TypeError as error:
+        # A required argument is missing: say what is expected for it.
         for name, parameter in signature.parameters.items():
             required = parameter.default is parameter.empty
             if required and "missing" in str(error) and f"'{name}'" in str(error):
@@ -178,6 +179,7 @@ def _bind_arguments(
                 raise InputError(
                     f"{function_name}: expected {name}, {expected}; found none"
                 ) from None
+        # Otherwise, there are too many arguments without a name.
         max_count = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
         plural = "" if max_count == 1 else "s"
         problem = f"expected at most {max_count} argument{plural} without a name, found {len(args)}"
@@ -200,6 +202,7 @@ def _convert_value(place: str, value: Any, hint: Any) -> Any:
         return _convert_annotated(place, value, hint)
     if origin in (Union, UnionType):
         return _convert_to_union(place, value, hint)
+    # A generic type such as Sequence[str]; ``type[Effect]`` is treated as a single type.
     if origin is not None and origin is not type:
         converted = _CONVERTERS[origin](place, value, hint)
     elif hint is Any:
@@ -227,6 +230,7 @@ def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
     try:
         converted = _convert_value(place, value, annotated_type)
     except _MismatchError as error:
+        # An entry of the value is wrong: its own error says more.
         if error.place != place:
             raise
         raise _MismatchError(place, expected.words, value) from None
@@ -316,6 +320,7 @@ def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
         parts = [value]
     else:
         return _NO_MATCH
+    # A wrong part of a text has no position in a list: the whole text is reported.
     if isinstance(value, str) and not all(_is_convertible(part, element_hint) for part in parts):
         return _NO_MATCH
     return [
@@ -401,7 +406,7 @@ def _describe_type(hint: Any) -> str:
     """
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return str(arguments[1].words)
+        return str(arguments[1].words)  # of ``Annotated[TYPE, Expected(...)]``
     if origin in (Union, UnionType):
         # Text is accepted for a path, too.
         implied_types = {NoneType, str} if Path in arguments else {NoneType}
@@ -428,12 +433,12 @@ def _format_value(value: object) -> str:
 
 
 def check_positive(name: str, value: Any, expected: str = "a positive number of seconds") -> float:
-    """Return a setting of an engine as a float.
+    """Check that a setting of an engine is a positive number, and return it as a float.
 
     Args:
         name: Name of the setting, for messages.
-        value: Its value.
-        expected: Words for the expected value.
+        value: Value that the user has given.
+        expected: Description of the expected value for messages.
 
     Raises:
         InputError: The value is not a positive number.

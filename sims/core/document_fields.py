@@ -37,7 +37,10 @@ class Document:
 
 
 def to_plain_values(value: Any) -> Any:
-    """Convert dataclasses, mappings and sequences to dicts and lists; copy other values."""
+    """Convert dataclasses, mappings and sequences to dicts and lists; copy other values.
+
+    The key of a field is left out where the field is marked `OPTIONAL` and has its default.
+    """
     if is_dataclass(value):
         named_values = [(field, getattr(value, field.name)) for field in fields(value)]
         return {
@@ -62,12 +65,13 @@ def _restore(kind: Any, value: Any) -> Any:
     if is_dataclass(kind):
         return _restore_dataclass(kind, value)
     origin, parts = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):
+    if origin in (Union, UnionType):  # one type, or None
         return _restore(next(part for part in parts if part is not NoneType), value)
-    if origin is tuple:
+    if origin is tuple:  # of any length, with entries of one type
         return tuple(_restore(parts[0], part) for part in value)
     if origin in (dict, Mapping):
-        return {key: _restore(parts[1], part) for key, part in value.items()}
+        _, value_kind = parts
+        return {key: _restore(value_kind, part) for key, part in value.items()}
     is_named_tuple = isinstance(kind, type) and issubclass(kind, tuple)
     return kind(*value) if is_named_tuple else value
 

@@ -80,10 +80,14 @@ class Coefficient:
     def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
         """Return the unit on this system; None if the effect does not exist there.
 
+        If `of` names the input or the reading, its unit replaces that word: ``input/s`` becomes
+        ``N/s`` for a force as input.
+
         Args:
             system: System on which the effect acts.
             observed: Names of the recorded channels (default: all).
         """
+        # The coefficients at the places of a robot have the units of their own places.
         if system.has_model:
             return self.unit(system.kind)
         if self.of.startswith(("input", "error")) and system.inputs:
@@ -180,12 +184,14 @@ class Effect(metaclass=EffectType):
         return ((self, c),)
 
     def taking(self, c: Array, simpler: str, given: Array) -> Array:  # noqa: ARG002
-        """Return coefficients that include a simpler effect, which this effect replaces.
+        """Return coefficients with which this effect also does the work of a simpler one.
+
+        It is called where this effect replaces the simpler one in a model.
 
         Args:
             c: (k,) coefficients of this effect.
             simpler: Name of the simpler effect, one of `contains`.
-            given: Coefficients of the simpler effect.
+            given: (m,) coefficients of the simpler effect.
 
         Returns:
             Coefficients (k,); the default implementation returns `c` unchanged.
@@ -218,8 +224,8 @@ class Effect(metaclass=EffectType):
     def misses(cls, system: System | type[System]) -> str:
         """Return why the system cannot have this effect; empty if it can.
 
-        `needs` is the property that the effect requires. Conditions are checked in this order: the
-        property, coefficients defined for this kind of system, and the system's own refusal.
+        The reason is the first of these that applies: the system lacks the property `needs` of the
+        effect; no coefficient is defined for this kind of system; the system itself refuses it.
 
         Args:
             system: System, or class of a system.

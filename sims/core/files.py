@@ -324,9 +324,9 @@ def open_locked(path: Path, folder: Path) -> IO[str]:
 
 @lru_cache(maxsize=256)
 def hash_file(path: Path, _changed: int, _size: int) -> bytes:
-    """Return the hash of a file; cached, as many logs may use the same file.
+    """Return the SHA-256 hash of a file; cached, as many logs may use the same file.
 
-    The unused arguments are part of the cache key, so a changed file is hashed again.
+    Time of change and size are only part of the cache key, so that a changed file is hashed again.
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:

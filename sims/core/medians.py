@@ -10,11 +10,12 @@ from sims.core.simulator import Array
 
 def compute_median(values: Array) -> float:
     """Return the median; numpy's own takes ten times as long for a few numbers."""
-    k = len(values) // 2
-    sorted_there = np.partition(values, (k - 1, k))
+    middle = len(values) // 2
+    # A partition has the values of a sorted array at these two positions only.
+    partitioned = np.partition(values, (middle - 1, middle))
     if len(values) % 2:
-        return float(sorted_there[k])
-    return float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
+        return float(partitioned[middle])
+    return float(0.5 * (partitioned[middle - 1] + partitioned[middle]))
 
 
 def compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -213,6 +213,7 @@ class Registry(Generic[T]):
         source = f"plugin {path}: " if path else ""
         name = _name_of(part, source)
         existing = self._stubs.get(name) or self._added.get(name)
+        # A stub may be announced again for the same file.
         is_taken = existing is not None and existing.path != path
         if is_taken or (path is not None and name in self._entry_points):
             raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")
@@ -251,12 +252,9 @@ class Registry(Generic[T]):
         old = self._added.get(name)
         # Only classes from Python: files of the same name in two folders give equal qualified
         # names.
-        from_python = old is not None and old.path is None and path is None
-        return (
-            old is not None
-            and from_python
-            and _get_qualified_name(old.part) == _get_qualified_name(part)
-        )
+        if old is None or old.path is not None or path is not None:
+            return False
+        return _get_qualified_name(old.part) == _get_qualified_name(part)
 
     def paths(self) -> set[Path]:
         """Return the plugin files of all loaded parts."""

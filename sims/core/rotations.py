@@ -24,6 +24,7 @@ def compute_yaw_pitch_roll(quaternions: Array, reference: Array) -> Array:
         quaternions: (T, 4) orientations (w, x, y, z); NaN where a sample is missing.
         reference: (4,) orientation in the model file, a unit quaternion.
     """
+    # The inverse of a unit quaternion is its conjugate.
     inverse_reference = reference * np.array([1.0, -1.0, -1.0, -1.0])
     w, x, y, z = multiply_quaternions(quaternions, inverse_reference[None]).T
     with np.errstate(invalid="ignore"):

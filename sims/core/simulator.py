@@ -57,7 +57,9 @@ MAX_LISTED_NAMES = 10
 
 
 def make_unknown_name_error(kind: str, name: str, known_names: Sequence[str]) -> InputError:
-    """Make the error for an unknown name, which lists the most similar or all known names.
+    """Make the error for an unknown name, which proposes similar names.
+
+    It also lists all known names, unless they are many and some are similar.
 
     Args:
         kind: Kind of the name in the message.
@@ -88,9 +90,9 @@ def similar(name: str, known_names: Iterable[str]) -> str:
     # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
     names = {known_name.lower(): known_name for known_name in known_names}
     lower_name = name.lower()[:MAX_QUOTED_NAME_LENGTH]
-    similar = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
-    similar = similar or get_close_matches(lower_name, names, cutoff=_MIN_NAME_SIMILARITY)
-    similar_names = [names[key] for key in similar[:3]]
+    matches = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
+    matches = matches or get_close_matches(lower_name, names, cutoff=_MIN_NAME_SIMILARITY)
+    similar_names = [names[key] for key in matches[:3]]
     return f"; did you mean {' or '.join(similar_names)}?" if similar_names else ""
 
 
@@ -242,8 +244,8 @@ class Scenario:
         """
         # Read-only copies, because batch elements and methods share scenarios.
         times = make_read_only(self.times)
-        row = times.ndim == 1 and times.size > 0
-        if not row or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        is_series = times.ndim == 1 and times.size > 0
+        if not is_series or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
                 "a scenario's times must be finite and increasing, at least one sample"
             )
@@ -288,9 +290,10 @@ class UnitCube:
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
-        """Compute the bounds of the unit cube, as logarithms for log-scaled parameters.
+        """Store the bounds of the parameters, as logarithms for those that are log-scaled.
 
-        Tuners work in the unit cube [0, 1]^dim; each parameter is mapped to it by its bounds.
+        `training` has the training ranges (2, dim) in coordinates of the cube: lower ends, then
+        upper ends.
 
         Args:
             parameters: Parameters with bounds and training range.
@@ -516,12 +519,12 @@ def apply_parameter_changes(
     changed_parameters = []
     for p in parameters:
         change = changes.get(p.name, {})
-        new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
-        changed = replace(p, **new)  # this also checks the new parameter
+        new_values: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
+        changed = replace(p, **new_values)  # this also checks the new parameter
         # Parameters that are positive by nature, such as masses, must stay positive.
-        low, lowest = p.bounds[0], changed.bounds[0]
-        if low >= 0 and (lowest < 0 or (low > 0 and lowest == 0)):
-            condition = "more than 0" if low > 0 else "at least 0"
+        (old_low, _), (new_low, _) = p.bounds, changed.bounds
+        if old_low >= 0 and (new_low < 0 or (old_low > 0 and new_low == 0)):
+            condition = "more than 0" if old_low > 0 else "at least 0"
             raise InputError(
                 f"parameter {p.name}: bounds must be {condition}, found {changed.bounds}"
             )

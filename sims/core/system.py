@@ -290,7 +290,9 @@ class System(ABC):
         states: Mapping[str, float],
         measured: Collection[str],  # noqa: ARG003
     ) -> dict[str, float]:
-        """Return states in which the loops of the system are closed; without loops, the same.
+        """Return states that satisfy the constraints of closed loops, such as a four-bar linkage.
+
+        By default, a system has no loops, and the states are returned unchanged.
 
         Args:
             states: States by name.
@@ -389,6 +391,7 @@ class System(ABC):
             a: (L, S, D) accelerations.
             constants: Constants (L, 1) by name.
         """
+        # Transposed, the last axis comes first: one array (S, L) for each coordinate.
         motion = dict(zip(self.coordinates + self.rates, [*x.T, *v.T], strict=True))
         return {channel.name: motion[channel.name].T for channel in self.channels}
 

@@ -98,10 +98,8 @@ def make_error(source: Source, where: str, wanted: str, value: object) -> InputE
         wanted: Description of the expected value.
         value: Value that was found.
     """
-    place = (
-        f"{truncate_text(where, MAX_TITLE_LENGTH)}: " if where else ""
-    )  # no entry if the whole file is meant
-    return InputError(f"{source}: {place}expected {wanted}, found {format_value(value)}")
+    entry = f"{truncate_text(where, MAX_TITLE_LENGTH)}: " if where else ""
+    return InputError(f"{source}: {entry}expected {wanted}, found {format_value(value)}")
 
 
 def check_known_names(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
@@ -122,7 +120,9 @@ def check_known_names(kind: str, given: Iterable[str], allowed: Iterable[str]) -
 
 
 def check_type(source: Source, where: str, value: Any, wanted: type, words: str = "") -> Any:
-    """Check the type of a value; integers are accepted as floats.
+    """Check the type of a value, and the size of an integer; return the value unchanged.
+
+    Integers are accepted as floats, and tuples as lists.
 
     Args:
         source: File or name with which the message begins.
@@ -132,12 +132,12 @@ def check_type(source: Source, where: str, value: Any, wanted: type, words: str 
         words: Description of the expected value; that of the type if empty.
 
     Raises:
-        InputError: The value has another type.
+        InputError: The value has another type, or is an integer of implausible size.
     """
-    kinds = _ACCEPTED_TYPES.get(wanted, (wanted,))
+    accepted_types = _ACCEPTED_TYPES.get(wanted, (wanted,))
     # In Python, booleans are integers.
     is_wrong_bool = isinstance(value, bool) and wanted is not bool
-    if is_wrong_bool or not isinstance(value, kinds):
+    if is_wrong_bool or not isinstance(value, accepted_types):
         raise make_error(source, where, words or _TYPE_DESCRIPTIONS[wanted], value)
     size: Any = value
     if wanted is int and not -MAX_INTEGER <= size <= MAX_INTEGER:  # TOML integers are unbounded
@@ -305,11 +305,12 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
         return check_annotation(source, where, value, _choose_union_member(value, arguments))
     if declared == Range:  # before other tuples, which may have any length
         return check_range(source, where, value)
-    if origin is tuple:
+    if origin is tuple:  # of any length, with items of one type
         items = check_type(source, where, value, list)
         return tuple(check_annotation(source, where, item, arguments[0]) for item in items)
-    if origin is not None:
-        return _check_table(source, where, value, arguments[1])
+    if origin is not None:  # a mapping from names
+        _, value_type = arguments
+        return _check_table(source, where, value, value_type)
     if isinstance(declared, type) and is_dataclass(declared):
         return declared(**check_entries(source, where, value, get_type_hints_of(declared)))
     if is_typeddict(declared):

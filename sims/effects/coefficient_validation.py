@@ -18,6 +18,10 @@ MAX_COEFFICIENT_FACTOR = 1e6
 def check_effect_types(effects: object, fixed: object) -> None:
     """Check the types of effects and fixed coefficients, which may come from an experiment's file.
 
+    Args:
+        effects: Effects to be fitted: a list of names or effect classes.
+        fixed: Coefficients of known effects by name, or None; numbers are not checked here.
+
     Raises:
         InputError: A type is wrong.
     """
@@ -40,10 +44,9 @@ def read_coefficients(name: str, value: Any) -> tuple[float, ...]:
         value: a number, or a list of numbers.
 
     Raises:
-        InputError: a coefficient is not a finite number.
+        InputError: a coefficient is not a finite number of plausible size.
     """
-    is_sequence = isinstance(value, list | tuple)
-    values = tuple(value) if is_sequence else (value,)
+    values = value if isinstance(value, list | tuple) else (value,)
     if not all(map(is_plausible_number, values)):
         raise InputError(
             f"effect {name}: expected finite coefficients, found {format_value(value)}"
@@ -52,16 +55,17 @@ def read_coefficients(name: str, value: Any) -> tuple[float, ...]:
 
 
 def check_coefficient_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
-    """Check that coefficients have plausible sizes.
+    """Check that no coefficient is larger than its plausible range by `MAX_COEFFICIENT_FACTOR`.
 
     Args:
         effect: effect of the library: a force, friction, input, sensor or contact law.
         system: the system on which it acts.
-        values: its coefficients in order.
+        values: its first coefficients in order.
 
     Raises:
-        InputError: A coefficient is too large.
+        InputError: A coefficient is too large; the message states the limit with its unit.
     """
+    # Coefficients that are not given are zero.
     for coefficient, value in zip(effect.on(system), values, strict=False):
         largest = max(map(abs, coefficient.range(system.kind)))
         if abs(value) > MAX_COEFFICIENT_FACTOR * largest:

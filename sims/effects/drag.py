@@ -43,7 +43,7 @@ class LinearDrag(Force):
         """Return the force (L, D), opposite to the velocity.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) coefficient.
             moment: state snapshot of L batch elements.
         """
         return -c[0] * moment.v  # (1)
@@ -64,7 +64,7 @@ class QuadraticDrag(Force):
         """Return the force (L, D), opposite to the velocity.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) coefficient.
             moment: state snapshot of L batch elements.
         """
         return -c[0] * moment.speed * moment.v  # (2)
@@ -86,8 +86,10 @@ class Wind(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the velocity relative to the air.
 
+        F = -c |v - w| (v - w) (3), with the velocity v and that of the air w.
+
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: drag, and wind speed along x and along y, m/s.
             moment: state snapshot of L batch elements.
         """
         return -c[0] * _compute_signed_square(moment.v - _compute_air_velocity(c, moment))  # (3)
@@ -107,8 +109,8 @@ def _compute_air_velocity(c: Array, moment: StateSnapshot) -> Array:
         c: (3, L, 1) coefficients of the effect: drag, wind along x, and wind along y.
         moment: state of the batch.
     """
-    # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
-    # the axis
+    # `push` is the generalised force that accelerates the system by 1 m/s^2 along an axis. Divided
+    # by the mass, it is this axis in the system's coordinates.
     mass = moment.system.mass(moment.theta, moment.constants)
     return (c[1] * moment.push("x") + c[2] * moment.push("y")) / mass
 
@@ -134,13 +136,15 @@ class MagnusLift(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the force (L, D), perpendicular to the velocity, so that it does no work.
+        """Return the force (L, 3) of a spinning body: vector product of spin axis and velocity.
 
-        Shapes: D coordinates, K coefficients.
+        It is perpendicular to the velocity, so that it does no work. With the coefficients b
+        (backspin) and u (upright), F = (-b vz - u vy, u vx, b vx) (1).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: lift by backspin (about -y), and by spin about the vertical
+                z.
             moment: state snapshot of L batch elements.
         """
-        (level, upright), (vx, vy, vz) = c[:, :, 0], moment.v.T
-        return np.stack([-level * vz - upright * vy, upright * vx, level * vx], axis=1)  # (1)
+        (backspin, upright), (vx, vy, vz) = c[:, :, 0], moment.v.T
+        return np.stack([-backspin * vz - upright * vy, upright * vx, backspin * vx], axis=1)  # (1)

@@ -57,7 +57,7 @@ class ForceBias(Force):
         """Return the force (L, D), equal to the coefficient along the primary coordinate.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) force.
             moment: state snapshot of L batch elements.
         """
         return moment.along_primary(c[0])  # (1)
@@ -79,17 +79,14 @@ class ForceRipple(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), periodic in the primary coordinate.
 
-        Shapes: D coordinates, K coefficients.
-
         F = a sin(2 pi x / period) + b cos(2 pi x / period) (2), with the primary coordinate x.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: a, b and the period in m or rad.
             moment: state snapshot of L batch elements.
         """
-        return moment.along_primary(
-            _compute_wave(c, moment.primary / np.maximum(c[2], _MIN_PERIOD))
-        )  # (2)
+        cycles = moment.primary / np.maximum(c[2], _MIN_PERIOD)
+        return moment.along_primary(_compute_wave(c, cycles))  # (2)
 
 
 class PeriodicForce(Force):
@@ -106,10 +103,12 @@ class PeriodicForce(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the force (L, D), periodic in time.
+        """Return the force (L, D) along the primary coordinate, periodic in the time t of the run.
+
+        F = a sin(2 pi frequency t) + b cos(2 pi frequency t) (3).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: a, b and the frequency in Hz.
             moment: state snapshot of L batch elements.
         """
         return moment.along_primary(_compute_wave(c, moment.t * c[2]))  # (3)
@@ -144,10 +143,10 @@ class LinearSpring(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the force (L, D), towards zero.
+        """Return the force (L, D) along the primary coordinate x, towards zero: F = -c x (1).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) stiffness c.
             moment: state snapshot of L batch elements.
         """
         return moment.along_primary(-c[0] * moment.primary)  # (1)
@@ -166,12 +165,12 @@ class CubicSpring(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), towards zero for c > 0.
 
-        Shapes: D coordinates, K coefficients.
+        Shapes: D coordinates.
 
         F = -c x^3 (2), with the primary coordinate x.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) cubic stiffness c.
             moment: state snapshot of L batch elements.
         """
         x = moment.primary
@@ -198,7 +197,7 @@ class GravityScale(Force):
         """Return the force (L, D), a fraction of the weight.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) relative change of gravity.
             moment: state snapshot of L batch elements.
         """
         return c[0] * moment.weight  # (1): the system's own force already contains the weight
@@ -218,10 +217,10 @@ class GravityTilt(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the force (L, D) of gravity along the horizontal axes.
+        """Return the force (L, D) of gravity along the horizontal axes, on tilted ground.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) horizontal gravity along x and along y, as shares of g.
             moment: state snapshot of L batch elements.
         """
         return moment.gravity * (c[0] * moment.push("x") + c[1] * moment.push("y"))  # (2)

@@ -97,7 +97,7 @@ class CoulombFriction(Friction):
         """Return the limit (L, 1), equal to the coefficient.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) limit.
             moment: state snapshot of L batch elements.
         """
         return np.maximum(c[0], 0.0)  # (1)
@@ -119,8 +119,10 @@ class StribeckFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1): `coulomb` in fast motion, `coulomb` + `extra` at rest.
 
+        The limit is coulomb + extra exp(-(v / speed)^2) (2), or zero if that is negative.
+
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: coulomb, extra and speed.
             moment: state snapshot of L batch elements.
         """
         return np.maximum(c[0] + c[1] * _compute_stribeck_factor(moment.speed, c[2]), 0.0)  # (2)
@@ -137,10 +139,10 @@ class LoadFriction(Friction):
     coefficients = (_LOAD_COEFFICIENT,)
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the limit (L, 1), proportional to the load.
+        """Return the limit (L, 1), proportional to the load |drive - external load|.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) limit as a share of the load.
             moment: state snapshot of L batch elements.
         """
         return np.maximum(c[0], 0.0) * moment.load  # (3)
@@ -162,15 +164,14 @@ class DirectionalLoadFriction(Friction):
     )
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the limit (L, 1): absolute weighted sum of drive and external load.
+        """Return the limit (L, 1) from the loads by the motor and from outside.
 
-        Shapes: K coefficients.
-
-        The limit is |motor drive - external load|, each load with its own coefficient by direction
-        (4).
+        The limit is |motor drive - external load| (4), each force counted in the direction in which
+        it pushes the joint. `moment.sides` has the external load with the opposite sign, so that
+        both are added.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: motor and external.
             moment: state snapshot of L batch elements.
         """
         drive, external_load = moment.sides
@@ -189,13 +190,11 @@ class QuadraticLoadFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1) from the load and the square of the transmitted force.
 
-        Shapes: K coefficients.
-
-        The limit is c |drive - load| + quadratic through^2, where `through` is the smaller of drive
-        and load if they pull against each other (5).
+        The limit is c |drive - load| + quadratic through^2 (5). The gears transmit the force
+        `through`: the smaller of drive and load if they pull against each other, else zero.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: c and quadratic.
             moment: state snapshot of L batch elements.
         """
         through = _limit_to_opposing(*moment.sides)
@@ -214,13 +213,11 @@ class PositionFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), periodic in the primary coordinate.
 
-        Shapes: K coefficients.
-
         The limit is least + a + sine sin(2 pi x / period) + cosine cos(2 pi x / period), with the
         amplitude a = (sine^2 + cosine^2)^(1/2) (6).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (4, L, 1) coefficients: least, sine, cosine and period.
             moment: state snapshot of L batch elements.
         """
         angle = 2 * np.pi * moment.primary / np.maximum(c[3], _MIN_DIVISOR)
@@ -243,13 +240,11 @@ class WarmingFriction(Friction):
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the remaining limit (L, 1); the viscous part is zero at rest.
 
-        Shapes: K coefficients.
-
         The limit is (dry + viscous |v|) exp(-t / time), with the time t since the start of the run
         (7).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: dry, viscous and time (s).
             moment: state snapshot of L batch elements.
         """
         remaining_share = np.exp(-moment.t / np.maximum(c[2], _MIN_DIVISOR))
@@ -273,14 +268,15 @@ class DirectionalViscousFriction(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), proportional to speed, with a coefficient per direction.
 
-        Shapes: D coordinates, K coefficients.
+        Shapes: D coordinates.
 
         F = -viscous+ v where v > 0, -viscous- v where v < 0 (8).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: viscous+ and viscous-.
             moment: state snapshot of L batch elements.
         """
+        # One of them is zero.
         forward_velocity, backward_velocity = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
         return -c[0] * forward_velocity - c[1] * backward_velocity  # (8)
 
@@ -334,17 +330,16 @@ class FrictionHysteresis(HiddenStateEffect):
     coefficients = _DAHL_COEFFICIENTS
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
-        """Return the force (L, D), and the rate (L, 1) of the hidden state.
+        """Return the friction force (L, D), and the rate (L, 1) of the hidden state w (Dahl model).
 
-        Shapes: D coordinates, K coefficients.
-
-        The friction is -F w with the limit F; w' = r - |r| w with r = v / d and the deflection d
-        (1).
+        The force is -F w with the limit F. w approaches the sign of the velocity v over a distance
+        of about the deflection d: w' = r - |r| w, r = v / d (1). |r| is limited, so that (1) can be
+        integrated.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: limit F and deflection d.
             moment: state snapshot of L batch elements.
-            state: hidden state w, as the velocity of the hidden coordinate.
+            state: hidden state; its `v` is w.
         """
         ratio = moment.v[:, :1] / np.maximum(c[1], _MIN_DEFLECTION)
         rate = np.clip(ratio, -MAX_STATE_RATE, MAX_STATE_RATE)

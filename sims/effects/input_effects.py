@@ -32,7 +32,8 @@ _MIN_TIME_CONSTANT = 1e-12
 def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     """Return the remaining weight of an old value at the end of each step and in its mean.
 
-    They are exp(-h / T) at the end, and its mean m over the step (3).
+    A first-order lag lets a value decay in a step: to exp(-h / T) at its end, and to
+    m = (1 - exp(-h / T)) T / h in the mean over it.
 
     Shapes: L batch elements, S steps.
 
@@ -41,7 +42,7 @@ def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
         lag: (L, 1) time constants T in seconds.
 
     Returns:
-        Both weights (L, S).
+        Weights (L, S) at the end and in the mean, both 1 for a step of zero length.
     """
     ratio = steps / np.maximum(lag, _MIN_TIME_CONSTANT)
     # a step of zero length, where an element waits, keeps the old value: the limit of m is 1
@@ -122,7 +123,7 @@ class InputGain(Input):
         """Return the scaled input (L, S).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) relative change of the gain.
             signal: signal (L, S) over the steps.
         """
         return signal.values * (1.0 + c[0])  # (1)
@@ -141,7 +142,7 @@ class InputBias(Input):
         """Return the shifted input (L, S).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) bias.
             signal: signal (L, S) over the steps.
         """
         return signal.values + c[0]  # (2)
@@ -162,7 +163,7 @@ class InputDelay(Input):
         """Return the earlier times (L, S) whose command is applied.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) delay, s; negative for a lead.
             t: (L, S) times in seconds.
         """
         return t - c[0]  # (3)
@@ -182,12 +183,12 @@ class InputLag(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the lagged input over each step.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         The applied input w follows the command u by c dw/dt = u - w (4).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) time constant c, s; no lag if not above zero.
             signal: signal (L, S) over the steps.
         """
         # (4); without a lag the command itself, bit for bit
@@ -206,15 +207,15 @@ class InputDeadBand(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the excess (L, S) over the half width.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         w = u - clip(u, -c, c) (5).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) half width c; no dead band if not above zero.
             signal: signal (L, S) over the steps.
         """
-        half_width = np.abs(c[0])
+        half_width = np.abs(c[0])  # np.clip needs a positive width also where it is not used
         # the excess, not the whole value: the applied input is continuous at the border
         excess = signal.values - np.clip(signal.values, -half_width, half_width)  # (5)
         return np.where(c[0] > 0, excess, signal.values)
@@ -232,15 +233,15 @@ class InputSaturation(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the limited input (L, S).
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         w = clip(u, -c, c) (6).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) limit c; none if not above zero.
             signal: signal (L, S) over the steps.
         """
-        limit = np.abs(c[0])
+        limit = np.abs(c[0])  # np.clip needs a positive limit also where it is not used
         limited = np.clip(signal.values, -limit, limit)  # (6)
         # a limit of zero is off, as the zero of every effect, and does not set the input to zero
         return np.where(c[0] > 0, limited, signal.values)
@@ -258,10 +259,10 @@ class InputBacklash(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) on the load side of the backlash.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) full width; no backlash if not above zero.
             signal: signal (L, S) over the steps.
         """
         load_side_input = _apply_play(signal, c[0] / 2)
@@ -284,16 +285,17 @@ class InputPower(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) to a power; an input of one unit changes only by the gain.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         w = (1 + gain) sign(u) |u|^(1 + power) (8).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: gain and power.
             signal: signal (L, S) over the steps.
         """
         size = np.abs(signal.values)
         power = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _MIN_EXPONENT)
+        # without a power the input itself, bit for bit
         return (1.0 + c[0]) * np.where(c[1] != 0, power, signal.values)  # (8)
 
 
@@ -311,10 +313,10 @@ class InputRateLimit(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the rate-limited input over each step.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) limit per second; none if not above zero.
             signal: signal (L, S) over the steps.
         """
         limit = np.where(c[0] > 0, c[0], np.inf)
@@ -332,16 +334,17 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
         signal: input before the effect: values (L, S) and times of the steps.
         lag: (L, 1) time constants in seconds.
     """
-    # the command is constant over a step, so (2) of sims.effects.input_effects gives the value at
-    # its end
+    # For a constant command, w(end) = decay w(start) + (1 - decay) u.
     decay, mean = compute_lag_response(signal.steps, lag)
     additions = (1.0 - decay) * signal.values
     step_end_values = run_recursion(LINEAR, decay, additions, signal.start)
-    # engines hold the input over a step: the mean transfers the same momentum as the lagged input
-    return signal.values + (shift_by_one_step(step_end_values, signal.start) - signal.values) * mean
+    # Engines hold the input over a step. The mean of w, u + (w(start) - u) m, transfers the same
+    # momentum as the lagged input.
+    step_start_values = shift_by_one_step(step_end_values, signal.start)
+    return signal.values + (step_start_values - signal.values) * mean
 
 
-def _apply_play(signal: Signal, half: Array) -> Array:
+def _apply_play(signal: Signal, half_width: Array) -> Array:
     """Return the input (L, S) after backlash (7).
 
     The output is constant while it is within the clearance of the input; otherwise the nearer flank
@@ -351,10 +354,11 @@ def _apply_play(signal: Signal, half: Array) -> Array:
 
     Args:
         signal: input before the effect: values (L, S) and times of the steps.
-        half: (L, 1) clearance to either side, in the unit of the input.
+        half_width: (L, 1) clearance to either side, in the unit of the input.
     """
-    # the position within the backlash is not recorded: the centre favours neither direction
-    return run_recursion(CLAMP, signal.values - half, signal.values + half, signal.start)  # (7)
+    # The position within the backlash is not recorded: the centre favours neither direction.
+    low, high = signal.values - half_width, signal.values + half_width
+    return run_recursion(CLAMP, low, high, signal.start)  # (7)
 
 
 def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
@@ -368,11 +372,12 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
         signal: input before the effect: values (L, S) and times of the steps.
         limit: (L, 1) largest rate, infinite for no limit.
     """
-    # An infinite limit times a step of zero length counts as zero.
-    reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0)
-    step_end_values = run_recursion(RATE_LIMIT, signal.values, reach, signal.start)
+    # Largest change in each step; an infinite limit times a step of zero length counts as zero.
+    has_length = signal.steps > 0
+    max_changes = np.where(has_length, limit * np.where(has_length, signal.steps, 1.0), 0.0)
+    step_end_values = run_recursion(RATE_LIMIT, signal.values, max_changes, signal.start)
     changes = step_end_values - shift_by_one_step(step_end_values, signal.start)
-    # It rises until it reaches the command, and is constant for the rest of the step.
-    rising = np.abs(changes) / np.where(reach > 0, reach, np.inf)
-    mean_values = step_end_values - 0.5 * rising * changes
-    return np.where(np.isfinite(reach), mean_values, signal.values)
+    # w changes linearly until it reaches the command, and is constant for the rest of the step.
+    moving_share = np.abs(changes) / np.where(max_changes > 0, max_changes, np.inf)
+    mean_values = step_end_values - 0.5 * moving_share * changes
+    return np.where(np.isfinite(max_changes), mean_values, signal.values)

@@ -232,27 +232,30 @@ class PayloadMass(ModelValueEffect):
     def probe_points(self) -> Sequence[Array]:
         """Return coefficients at which a search compares the effect with the data, (4,) each.
 
-        The first point is a small mass at the middle of the link; each of the others moves it along
-        one observable axis. The coefficients are the mass, then the position along x, y and z. An
-        axis whose limits are equal is not observable.
+        The coefficients are the mass (kg), then the position along x, y and z (m) from the body's
+        centre of mass. The first point is a small mass in the middle of the plausible range; each
+        of the others moves it along one observable axis, to three quarters of the range. Along an
+        axis whose bounds `least` and `most` are equal, the position cannot be observed and is zero.
         """
-        limits = np.array([c.plausible[0] for c in self.coefficients])
-        middle = limits.mean(axis=1)
-        middle[0] = _SMALL_MASS * limits[0, 1]
-        observable_axes = [k for k, c in enumerate(self.coefficients) if k and c.least != c.most]
-        middle[[k for k in range(1, len(middle)) if k not in observable_axes]] = 0.0
+        # The ranges are equal for all kinds of system: (4, 2), lower and upper end.
+        ranges = np.array([c.plausible[0] for c in self.coefficients])
+        is_observable = np.array([c.least != c.most for c in self.coefficients])
+        middle = np.where(is_observable, ranges.mean(axis=1), 0.0)
+        middle[0] = _SMALL_MASS * ranges[0, 1]
         points = [middle]
-        for k in observable_axes:
+        for axis in np.flatnonzero(is_observable[1:]) + 1:
             point = middle.copy()
-            point[k] = 0.5 * (limits[k].mean() + limits[k, 1])
+            point[axis] = 0.5 * (ranges[axis].mean() + ranges[axis, 1])
             points.append(point)
         return points
 
     def combine(self, points: Array, weights: Array) -> Array:
-        """Return the sum of point masses (n, 4), at their centre of mass.
+        """Return the point mass (4,) that replaces several: their sum, at their centre of mass.
+
+        A sum that is not positive gives a mass of zero at the origin.
 
         Args:
-            points: masses and positions.
+            points: (n, 4) masses (kg) and positions x, y and z (m).
             weights: (n,) multiple of each mass.
         """
         masses = weights * points[:, 0]

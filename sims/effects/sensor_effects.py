@@ -80,7 +80,7 @@ class SensorGain(Sensor):
         """Return the scaled reading (L, S).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) relative change of the gain.
             signal: signal (L, S) over the steps.
         """
         return signal.values * (1.0 + c[0])  # (1)
@@ -99,7 +99,7 @@ class SensorBias(Sensor):
         """Return the shifted reading (L, S).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) bias.
             signal: signal (L, S) over the steps.
         """
         return signal.values + c[0]  # (2)
@@ -120,7 +120,7 @@ class SensorDelay(Sensor):
         """Return the earlier times (L, S) of the recorded values.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) delay, s.
             t: (L, S) times in seconds.
         """
         return t - c[0]  # (3)
@@ -141,12 +141,12 @@ class SensorLag(Sensor):
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the lagged reading (L, S), exact for a reading that is linear over each step.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         The reading r follows the true value y by c dr/dt = y - r (4).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) time constant c, s; no lag if not above zero.
             signal: signal (L, S) over the steps.
         """
         # (4); without a lag the reading itself, bit for bit
@@ -166,7 +166,7 @@ class SensorDrift(Sensor):
         """Return the reading (L, S) with an error proportional to time.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) drift per second.
             signal: signal (L, S) over the steps.
         """
         return signal.values + c[0] * signal.times  # (5)
@@ -185,12 +185,12 @@ class EncoderEccentricity(Sensor):
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the reading (L, S) with an error periodic in the angle.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         r = y + a sin y + b cos y, with the angle y in rad (7).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients a and b, rad.
             signal: signal (L, S) over the steps.
         """
         y = signal.values
@@ -212,7 +212,7 @@ class EncoderSlip(Sensor):
         """Return the reading (L, S) with a constant error after the slip.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) error after the slip, and time of the slip on the clock of the stamps, s.
             signal: signal (L, S) over the steps.
         """
         return signal.values + c[0] * _smooth_step(c[1], signal.clock + signal.times)  # (8)
@@ -232,7 +232,7 @@ class ClockSkew(Sensor):
         """Return the times (L, S) on the true clock.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) relative slowness of the clock.
             t: (L, S) times in seconds.
         """
         return t * (1.0 + c[0])  # (6)
@@ -265,7 +265,7 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     """
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)
-    # (4) of sims.effects.input_effects without its first term, which is the recursion
+    # A signal that goes from `old` to `values` in a step gives r(end) = decay r(start) + increment.
     increments = signal.values - decay * old - mean * (signal.values - old)
     return run_recursion(LINEAR, decay, increments, signal.start)
 
@@ -275,9 +275,10 @@ def apply_sensor_effects(
 ) -> Array:
     """Apply sensor effects one after another to a channel.
 
-    Each effect gets the output of the previous one, also for the value at the start.
+    Each effect gets the output of the previous one. So does the value at the start of the run, as
+    a signal of one step without length: effects with a memory begin with it.
 
-    Shapes: L batch elements.
+    Shapes: L batch elements, R values.
 
     Args:
         sensors: Sensor effects with their coefficients.
@@ -297,13 +298,11 @@ def apply_sensor_effects(
         # An effect may be active in few of the batch elements; evaluate only these.
         elements = np.flatnonzero(is_active(c))
         coefficients, start_values = c[:, elements], start[elements]
-        zeros = np.zeros_like(start_values)
-        first = clock[elements]
+        zeros, first = np.zeros_like(start_values), clock[elements]
         signal = Signal(values[elements], steps[elements], start_values, times[elements], first)
+        start_signal = Signal(start_values, zeros, start_values, zeros, first)
         values[elements] = effect.read(coefficients, signal)
-        start[elements] = effect.read(
-            coefficients, Signal(start_values, zeros, start_values, zeros, first)
-        )
+        start[elements] = effect.read(coefficients, start_signal)
     return values
 
 

@@ -71,13 +71,13 @@ class ServoDeadBand(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D) that is missing in comparison with the proportional law.
 
-        Shapes: D coordinates, K coefficients.
+        Shapes: D coordinates.
 
         The force is K (dz(e) - e), dz(e) = e - clip(e, -c, c), with the stiffness K and the error e
         = set point - position (1).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) half width c of the dead zone.
             moment: state snapshot of L batch elements.
         """
         width = np.maximum(c[0], 0.0)
@@ -97,12 +97,13 @@ class ServoDerivativeAction(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the set point (L, S) plus its change in the last c seconds.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
-        The force is K (u(t) - u(t - c)), with the set point u (2).
+        The set point u(t) becomes u(t) + u(t) - u(t - c), so that a servo of stiffness K exerts K
+        (u(t) - u(t - c)) in addition (2). Values are means over each step.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) ratio c of D gain to P gain, s.
             signal: signal (L, S) over the steps.
         """
         lead = np.maximum(c[0], 0.0)
@@ -126,13 +127,13 @@ class ServoMotionProfile(Input):
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the limited set point over each step.
 
-        Shapes: L batch elements, S steps, K coefficients.
+        Shapes: L batch elements, S steps.
 
         The servo follows p instead of the set point u, with d2p/dt2 = c sign(u - p - |dp/dt| dp/dt
         / (2 c)) until it arrives (3).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) limit c of the acceleration; none if not above zero.
             signal: signal (L, S) over the steps.
         """
         limit = np.maximum(c[0], 0.0)
@@ -144,7 +145,9 @@ class ServoMotionProfile(Input):
 def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
 
-    Before the run, the signal has its initial value.
+    Before the run, the signal has its initial value. A mean is the difference of the signal's
+    integral at both ends of the delayed step, divided by the step. Values remain unchanged where
+    the delay is not above zero, and in steps without length.
 
     Shapes: L batch elements, S steps.
     """
@@ -153,7 +156,8 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
     averages = signal.values.copy()
     for batch_index in np.flatnonzero(delay[:, 0] > 0):
-        # integral of the signal, beginning long before the run
+        # The integral is linear between the ends of steps. It begins 1 s before the run, from where
+        # `_integrate_signal` extends it to earlier times.
         knots = np.concatenate(
             [
                 [step_starts[batch_index, 0] - 1.0, step_starts[batch_index, 0]],
@@ -203,10 +207,8 @@ class SupplySag(Force):
         With the forces U_i of all drives that share the supply and D = sum |U_i|, the lost force is
         U_i c D / (1 + c D) (2).
 
-        Shapes: K coefficients.
-
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) share c of the voltage lost per unit of force.
             moment: state snapshot of L batch elements.
         """
         drive, _ = moment.sides
@@ -228,12 +230,12 @@ class SupplyBrakingLoss(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), in the direction of motion.
 
-        Shapes: D coordinates, K coefficients.
+        Shapes: D coordinates.
 
         The drive exerts U where U v >= 0, and (1 - c) U where U v < 0 (3).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) lost share c of a braking force.
             moment: state snapshot of L batch elements.
         """
         drive, _ = moment.sides

@@ -29,7 +29,6 @@ With the parameters of a contact of two geoms in a robot's model file:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -77,7 +76,7 @@ class LevelOverflow(Level):
         """Return the level (L, 1), limited by the rim.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) rim; none if not above zero.
             level: (L, 1) level before the overflow.
         """
         return np.where(c[0] > 0, np.minimum(level, c[0]), level)  # (1)
@@ -95,13 +94,13 @@ class EndStop(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), which pushes away from the stop and never towards it.
 
-        Shapes: D coordinates, K coefficients.
+        Shapes: D coordinates.
 
         F = -k d (d / D)^(1/2) (1 + a s v), with the stiffness k, its sign s, the penetration d =
         max(s (x - p), 0) beyond the place p, the depth D of 1 cm or 0.01 rad, and the loss a (2).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: stiffness k, place p and loss a.
             moment: state snapshot of L batch elements.
         """
         side = np.sign(c[0])
@@ -134,18 +133,20 @@ class SpeedDependentRestitution(Contact):
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
         """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
 
-        Shapes: L batch elements, K coefficients.
+        It is at most 1, so that no energy is created.
+
+        Shapes: L batch elements.
 
         e = e0 |vn|^c, with the simulator's restitution e0 and the normal speed vn in m/s before the
         impact (1).
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (1, L, 1) power c of the impact speed.
             restitution: (L, 1) restitution without the effect.
             speed: (L, 1) impact speed in m/s.
         """
         scaled = restitution * np.maximum(speed, _MIN_IMPACT_SPEED) ** c[0]  # (1)
-        # a restitution above 1 without the effect stays: c = 0 is off
+        # A restitution above 1 without the effect stays above 1, since c = 0 must change nothing.
         return np.minimum(scaled, np.maximum(restitution, 1.0))
 
 
@@ -233,10 +234,12 @@ def _convert_to_level_size(c: Coefficient, unit: str, scale: float) -> Coefficie
 
 
 def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
-    """Return the effect with a name such as ``state.overflow@upper``; None if it is not on levels.
+    """Return the effect on a level with a name such as ``state.overflow@upper``.
+
+    The result is None if the effect does not act on levels, or the system has none.
 
     Args:
-        name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        name: Name of the effect, with the level after ``@`` if the system has several levels.
         system: System of a user-defined simulator.
 
     Raises:
@@ -252,14 +255,11 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
         return None
     if reason := effect.misses(system):
         raise InputError(f"system {system.name} cannot have effect {name}: {reason}")
-    effects_by_name = {
-        effect_class.name: effect_class for effect_class in make_level_effects(effect, system)
-    }
-    if name in effects_by_name:
-        return effects_by_name[name]
-    places: Sequence[str] = [effect_class.place for effect_class in effects_by_name.values()]
+    level_effects = {one.name: one for one in make_level_effects(effect, system)}
+    if name in level_effects:
+        return level_effects[name]
     if not separator:
-        alternatives = ", ".join(f"{effect_name}@{place_name}" for place_name in places)
+        alternatives = ", ".join(level_effects)
         raise InputError(
             f"effect {effect_name} of simulator {system.name} needs a place: {alternatives}"
         )

@@ -155,26 +155,26 @@ class DrivenLoad(HiddenStateEffect):
 
         Shapes: D coordinates, K coefficients.
 
-        With the drive's position x, the load's y, the inertia M, the share s of the load, the other
-        forces U and the weight W: (1 - s) M x'' = U + (1 - s) W(x) - T (1), s M y'' = T + s W(y)
-        (2).
+        With the drive's position x, the load's y, the inertia M of both, the share s of the load,
+        the other forces U, the weight W of both, and the force T between drive and load:
+        (1 - s) M x'' = U + (1 - s) W(x) - T (1), s M y'' = T + s W(y) (2).
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
-        pull, share = self.compute_coupling_force(c, moment, state), self.behind(c)
-        # The load carries its share of the weight.
-        reaction_force = (
-            -share * moment.inertia * (pull + _compute_gravity_acceleration(moment, moment.primary))
-        )  # (1)
-        return moment.along_primary(reaction_force), pull + _compute_gravity_acceleration(
-            moment, state.x
-        )  # (2)
+        pull = self.compute_coupling_force(c, moment, state)  # T / (s M)
+        fall = _compute_gravity_acceleration(moment, moment.primary)
+        # The system's own weight W includes that of the load, which is subtracted here.
+        reaction_force = -self.behind(c) * moment.inertia * (pull + fall)  # (1)
+        load_acceleration = pull + _compute_gravity_acceleration(moment, state.x)  # (2)
+        return moment.along_primary(reaction_force), load_acceleration
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the load under an acceleration of gravity.
+
+        By default it is zero; NaN stays NaN.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -206,21 +206,19 @@ class JointFlexibility(DrivenLoad):
         """Return the static deflection (L, 1) of the spring.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: share s, frequency w (rad/s) and damping ratio z.
             fall: (L, 1) acceleration by gravity.
         """
         return fall / (c[1] * c[1])
 
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
-        """Return the force (L, 1) of spring and damper per unit of load inertia.
+        """Return the force of spring and damper per unit of load inertia, T / (s M), (L, 1).
 
-        It is T = s M (w^2 (x - y) + 2 z w (x' - y')) (3), with the inertia M of drive and load, the
-        share s of the load, the drive's position x and the load's y.
-
-        Shapes: K coefficients.
+        T = s M (w^2 (x - y) + 2 z w (x' - y')) (3), with the inertia M of drive and load, the share
+        s of the load, the drive's position x and the load's y.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (3, L, 1) coefficients: share s, frequency w (rad/s) and damping ratio z.
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
@@ -248,17 +246,15 @@ class JointBacklash(DrivenLoad):
     share, fastest = 1, CONTACT_FREQUENCY
 
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
-        """Return the force (L, 1) of the flanks per unit of load inertia.
+        """Return the force of the flanks per unit of load inertia, T / (s M), (L, 1).
 
-        Damping increases with the penetration, so that the force is continuous.
-
-        It is T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with d the excess of
-        x - y over the gap, the inertia M, the share s of the load, and the contact's frequency k.
-
-        Shapes: K coefficients.
+        T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with d the excess of x - y
+        over the half gap to either side, the inertia M, the share s of the load, and the contact's
+        frequency k. Damping increases with the penetration |d|, so that the force is continuous.
+        Flanks push and never pull.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (2, L, 1) coefficients: gap and share s.
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """

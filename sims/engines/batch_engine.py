@@ -56,6 +56,9 @@ class BatchEngine:
                 for stiff systems.
             patience: Largest number of steps per planned step, after which an element fails.
             jobs: Number of threads.
+
+        Raises:
+            InputError: A setting is not positive, or `jobs` is not a whole number.
         """
         self.largest_step = check_positive("engine batch: time_step", time_step)
         for name, value in (("turn", turn), ("patience", patience)):

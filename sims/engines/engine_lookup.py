@@ -32,6 +32,7 @@ def describe_stepping() -> str:
     Returns:
         ``machine code``, or ``none`` if no declared system is in use.
     """
+    # Systems are declared by importing this module.
     if "sims.system_simulator" not in sys.modules:
         return "none"
     from sims.engines.compiled import kernel
@@ -72,8 +73,7 @@ def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) ->
             f"engine {name} needs {', '.join(missing)}, not installed"
             f" (pip install {' '.join(missing)})"
         )
-    # An engine's settings are the keyword-only arguments of its factory, so that they are declared
-    # once.
+    # An engine's settings are the keyword-only arguments of its factory, which declares them once.
     parameters = inspect.signature(module.make_engine).parameters
     setting_names = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
     for setting in settings:

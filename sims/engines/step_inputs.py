@@ -14,6 +14,7 @@ Where a scenario states linear interpolation between samples, A is piecewise qua
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,18 +73,20 @@ def compute_applied_inputs(
     effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
     starts, ends, steps = _step_begins(plan.ends), plan.ends, plan.steps
     input_name, *other_names = commands[0]
+    # Inputs without effects: their means over the steps.
     applied = {}
     for name in other_names if effects else (input_name, *other_names):
         applied[name] = _average_command(runs, name, commands, starts, ends, plan.has_uniform_steps)
     if not effects:
         return applied
-    lead_in = _build_lead_in_steps(
-        runs, input_name, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
-    )
-    if lead_in[0].size:
-        parts = zip(lead_in, (starts, ends, steps), strict=True)
+    # Effects with a memory need the steps before the run, too.
+    largest_step = max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
+    lead_in = _build_lead_in_steps(runs, input_name, largest_step)
+    _, lead_in_count = lead_in.steps.shape
+    if lead_in_count:
         starts, ends, steps = (
-            np.hstack([lead_part[runs.scenario_index], run_part]) for lead_part, run_part in parts
+            np.hstack([lead_part[runs.scenario_index], run_part])
+            for lead_part, run_part in zip(lead_in, (starts, ends, steps), strict=True)
         )
     step_ends = ends
     # Backwards from the plant to the command: map the times through the effects.
@@ -116,12 +119,18 @@ def compute_applied_inputs(
     result = _apply_input_effects(
         effects, steps, step_ends, means, initial_values[runs.scenario_index, None]
     )
-    return {input_name: result[:, lead_in[0].shape[1] :], **applied}
+    return {input_name: result[:, lead_in_count:], **applied}
 
 
-def _build_lead_in_steps(
-    runs: ScenarioGroups, name: str, largest: float
-) -> tuple[Array, Array, Array]:
+class _LeadInSteps(NamedTuple):
+    """Beginnings, ends and lengths (N, K) of the steps before the runs of N scenarios, s."""
+
+    starts: Array
+    ends: Array
+    steps: Array
+
+
+def _build_lead_in_steps(runs: ScenarioGroups, name: str, largest: float) -> _LeadInSteps:
     """Build the steps before the runs in which the history of an input is known.
 
     Effects with a memory, such as delay and lag, begin a run in the state that earlier commands
@@ -133,21 +142,22 @@ def _build_lead_in_steps(
         largest: Maximum length of a step, s.
 
     Returns:
-        Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
-        unknown.
+        Steps of each distinct scenario; their length is zero where the history is unknown, and
+        there are none if no history is known.
     """
-    event_times = [get_history_times(s, name) for s in runs.unique_scenarios]
-    event_times = [np.append(row[row < 0], 0.0) for row in event_times]
-    size = max(row.size for row in event_times)
+    history_times = [get_history_times(s, name) for s in runs.unique_scenarios]
+    # The steps end at the beginning of the run.
+    event_times = [np.append(times[times < 0], 0.0) for times in history_times]
+    size = max(times.size for times in event_times)
     if size == 1:
         no_steps = np.empty((len(event_times), 0))
-        return no_steps, no_steps, no_steps
-    first = np.array([[row[0]] for row in event_times])
+        return _LeadInSteps(no_steps, no_steps, no_steps)
+    first = np.array([[times[0]] for times in event_times])
     steps, step_ends, _, _ = divide_intervals(
-        np.stack([pad_with_last(row, size) for row in event_times]) - first, largest
+        np.stack([pad_with_last(times, size) for times in event_times]) - first, largest
     )
     step_ends = step_ends + first
-    return np.hstack([first, step_ends[:, :-1]]), step_ends, steps
+    return _LeadInSteps(np.hstack([first, step_ends[:, :-1]]), step_ends, steps)
 
 
 def _apply_input_effects(
@@ -253,14 +263,11 @@ def _average_command(
     for elements in np.split(sorted_elements, borders):
         run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
-        average_signal = (
-            _average_linear_signal
-            if (name in scenario.linear) != is_other_interpolation
-            else _average_held_signal
-        )
-        target_rows, source_rows = (
-            (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
-        )
+        is_linear = (name in scenario.linear) != is_other_interpolation
+        average_signal = _average_linear_signal if is_linear else _average_held_signal
+        target_rows, source_rows = elements, elements
+        if has_uniform_steps:  # one row for the scenario, from its first element
+            target_rows, source_rows = np.array([run]), elements[:1]
         instants = np.concatenate([get_history_times(scenario, name), get_command_times(scenario)])
         signal = _get_command_values(scenario, name, commands[run][name])
         averages[target_rows] = average_signal(
@@ -277,16 +284,17 @@ def _average_held_signal(times: Array, values: Array, starts: Array, end: Array)
     Args:
         times: (T,) times from which the values hold, s.
         values: (T,) values.
-        starts: Beginnings of the intervals, s.
-        end: Ends of the intervals, s.
+        starts: Beginnings of the intervals, s, of any shape.
+        end: Ends of the intervals, s, of the same shape.
     """
-    index = np.searchsorted(times, starts, side="right") - 1
-    index = np.clip(index, 0, times.size - 1)
-    value: Array = values[index]
+    # Samples that hold at the beginning of each interval, and at its end.
+    first = np.searchsorted(times, starts, side="right") - 1
+    first = np.clip(first, 0, times.size - 1)
+    value: Array = values[first]
     last = np.searchsorted(times, end, side="left") - 1
     last = np.clip(last, 0, times.size - 1)
     # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
-    crossing = last > index
+    crossing = last > first
     if crossing.any():
         areas = values[:-1] * np.diff(times)
         area = np.concatenate([[0.0], np.cumsum(areas)])
@@ -309,8 +317,8 @@ def _average_linear_signal(times: Array, values: Array, starts: Array, end: Arra
     Args:
         times: (T,) sample times, s.
         values: (T,) values.
-        starts: Beginnings of the intervals, s.
-        end: Ends of the intervals, s.
+        starts: Beginnings of the intervals, s, of any shape.
+        end: Ends of the intervals, s, of the same shape.
     """
     halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
     area = np.concatenate([[0.0], np.cumsum(halves)])

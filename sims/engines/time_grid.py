@@ -185,7 +185,7 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
         if steps_per_interval.any()
         else 1
     )
-    blocks = -(-steps_per_interval // steps_per_block)
+    blocks = -(-steps_per_interval // steps_per_block)  # blocks of each interval, rounded up
     block_ends = np.cumsum(blocks, axis=1)
     max_blocks = max(int(block_ends[:, -1].max()), 1)
     # Arrays with one entry per block: its interval, its number in the batch element, and the
@@ -209,6 +209,7 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
     inner_times = interval_starts.ravel()[interval, None] + (step_numbers + 1) * step_lengths
     interval_ends = instants.ravel()[interval, None]
     step_ends[element, block] = np.where(step_numbers + 1 < step_counts, inner_times, interval_ends)
+    # The state is stored after each block, so the number of blocks is that of the stored state.
     return steps.reshape(elements, -1), step_ends.reshape(elements, -1), steps_per_block, block_ends
 
 

@@ -94,6 +94,8 @@ class BallSystem(System):
     ) -> dict[str, Array]:
         """Return the position, and the vertical reading of an accelerometer on the ball.
 
+        An accelerometer shows zero in free fall, and gravity at rest.
+
         Shapes: L batch elements, S steps, D coordinates.
 
         Args:

@@ -147,8 +147,9 @@ class ShotSystem(System):
     ) -> dict[str, Array]:
         """Return the position of the centre in the world frame by channel.
 
-        With the incline's angle a, x = along cos a + away sin a (3) and z = r / cos a + H - along
-        sin a + away cos a (4).
+        The displacement is given down the slope (along), across it, and away from it. With the
+        incline's angle a, the radius r and the drop height H, x = along cos a + away sin a (3) and
+        z = r / cos a + H - along sin a + away cos a (4).
 
         Shapes: L batch elements, T samples.
 
@@ -160,13 +161,12 @@ class ShotSystem(System):
         """
         cos = np.cos(constants["incline_angle"])
         sin = np.sin(constants["incline_angle"])
-        tangential = x[:, :, 0]
-        normal = x[:, :, 2]
-        height = constants["radius"] / cos + constants["drop_height"]
+        along, across, away = np.moveaxis(x, 2, 0)
+        release_height = constants["radius"] / cos + constants["drop_height"]
         return {
-            "x": tangential * cos + normal * sin,  # (3)
-            "y": x[:, :, 1],
-            "z": height - tangential * sin + normal * cos,  # (4)
+            "x": along * cos + away * sin,  # (3)
+            "y": across,
+            "z": release_height - along * sin + away * cos,  # (4)
         }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:

@@ -205,12 +205,12 @@ class ServoSystem(PendulumSystem):
         return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
 
     def drive(self, moment: StateSnapshot) -> Array:
-        """Return the motor's torque (L, 1), including its back electromotive force.
+        """Return the motor's torque (L, 1), reduced by its back electromotive force.
 
         Shapes: L batch elements.
 
-        With K = kt / R, the torque is clip(K voltage kp error_gain (goal - q), -K voltage, K
-        voltage).
+        With duty = clip(kp error_gain (goal - q), -1, 1) (2), the torque is
+        kt (duty voltage - kt q') / resistance (3), and zero unless the input `torque_enable` is 1.
         """
         k = moment.constants
         kt = moment.theta[:, _TORQUE_CONSTANT]

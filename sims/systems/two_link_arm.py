@@ -152,7 +152,7 @@ class TwoLinkArm(OwnSimulator):
         pybullet = self._world
         pybullet.resetSimulation()
         pybullet.setGravity(0.0, 0.0, -constants["gravity"])
-        # All rounds, whatever the residual: what friction holds must stand still.
+        # Do all rounds, whatever the residual: a joint that friction holds must stand still.
         pybullet.setPhysicsEngineParameter(
             numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0
         )
@@ -165,7 +165,7 @@ class TwoLinkArm(OwnSimulator):
             )
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
-        # Looked up once: a run has thousands of each.
+        # Functions of Bullet, looked up once: a run calls each of them thousands of times.
         self._place = pybullet.resetJointState
         self._push = pybullet.setJointMotorControl2
         self._state = pybullet.getJointState
@@ -213,7 +213,8 @@ class TwoLinkArm(OwnSimulator):
         """
         torques = (inputs["u1"], inputs["u2"])
         state_before = (self._q, self._v)
-        # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
+        # Bullet fixes the direction of friction for a step: where it changes, repeat the step in
+        # short parts.
         if self._step_heun(torques, seconds):
             self._q, self._v = state_before
             for _ in range(_FRICTION_SUBSTEPS):

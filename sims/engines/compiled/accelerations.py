@@ -85,6 +85,7 @@ def begin_step(block: Block) -> None:
         compute_frictionless_acceleration(block, K1)
         return
     friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
+    # The faster version does not know the ground, which may support an element.
     if friction_coordinate_count == 1 and block.flags[BOUNCES] == 0:
         begin_step_1d(block)
         return
@@ -137,8 +138,10 @@ def begin_step_1d(block: Block) -> None:
         force_size = abs(force)
         excess = force_size - limit
         is_still = v == 0.0
+        # (1) and (3): along the motion, or at rest along the pulling force.
         direction_source = force if is_still else v
-        divisor = (force_size if force_size > 0.0 else 1.0) if is_still else abs(v)
+        rest_divisor = force_size if force_size > 0.0 else 1.0
+        divisor = rest_divisor if is_still else abs(v)
         direction = direction_source / divisor
         friction = limit * direction
         slip_acceleration = (force - friction) / a[MASS, i]
@@ -157,7 +160,9 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
 
     The registers hold the time, positions and velocities of that stage. The force program runs for
     all slots together, then dry friction is subtracted: `begin_step` determined which elements
-    stick, and the direction of friction for the others.
+    stick, and the direction of friction for the others. There are three cases: no dry friction;
+    dry friction on one coordinate of a system without ground, computed for all slots together; and
+    any other, computed for one element after the other.
 
     Args:
         block: force program, batch elements and their buffers. Slot i holds one element: its
@@ -228,7 +233,8 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
     """Compute one element's acceleration if friction acts on several coordinates, or with ground.
 
     Friction points against the velocity of this stage, unless that has reversed since the beginning
-    of the step; then it keeps its side. An element that sticks has zero acceleration.
+    of the step; then friction keeps its side. An element that sticks has zero acceleration along
+    the coordinates with dry friction.
 
     Args:
         block: force program, batch elements and their buffers. Slot i holds one element: its
@@ -250,12 +256,13 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
     for k in range(friction_coordinate_count):
         squared_speed += block.r[velocity + k, i] * block.r[velocity + k, i]
     speed = np.sqrt(squared_speed)
+    # The rows of friction hold the unit vector of the velocity first.
     projection = 0.0
     for k in range(friction_coordinate_count):
         direction = a[DIRECTION + k, i]
-        unit = block.r[velocity + k, i] / speed if speed > 0.0 else direction
-        a[friction_row + k, i] = unit
-        projection += unit * direction
+        component = block.r[velocity + k, i] / speed if speed > 0.0 else direction
+        a[friction_row + k, i] = component
+        projection += component * direction
     sign = -1.0 if projection < 0.0 else 1.0
     for k in range(friction_coordinate_count):
         friction = limit * (a[friction_row + k, i] * sign)

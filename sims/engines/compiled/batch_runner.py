@@ -56,11 +56,12 @@ def integrate_batch(
     COMPILED.load()
     all_elements = _make_arrays(batch, [], max_phase, patience)
     count, record_count, _ = all_elements.records.shape
+    # A record is position, velocity and acceleration, one after the other.
     trajectories = all_elements.records.reshape(count, record_count, 3, -1)
     for elements, effects in _group_by_effects(batch):
         arrays = all_elements._replace(order=elements.astype(np.int64))
         hidden = [(e, c[:, elements]) for e, c in effects if isinstance(e, HiddenStateEffect)]
-        if hidden:
+        if hidden:  # records of another width, of which the system's own coordinates are copied
             arrays = _make_arrays(batch.select(elements), hidden, max_phase, patience)
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
         columns = [batch.theta[elements], *(c[elements] for c in batch.constants.values())]
@@ -70,7 +71,6 @@ def integrate_batch(
         if hidden:
             records = arrays.records.reshape(len(elements), record_count, 3, -1)
             trajectories[elements] = records[..., : batch.x.shape[1]]
-    # A record is position, velocity and acceleration, one after the other.
     return Trajectories(*np.moveaxis(trajectories, 2, 0))
 
 

@@ -62,7 +62,7 @@ class CompiledFunctions:
         shapes = self._shapes[function]
         sizes = measure_arrays(shapes[: len(arguments)], arguments)
         results = [
-            np.zeros([int(a) if a.isdigit() else sizes[a] for a in shape])
+            np.zeros([int(size) if size.isdigit() else sizes[size] for size in shape])
             for shape in shapes[len(arguments) :]
         ]
         self._bind(function, sizes, (*arguments, *results))()
@@ -146,7 +146,7 @@ class CompiledFunctions:
                 for k, shape in enumerate(shapes, 1 + len(letters))
             )
             parameters = list(inspect.signature(function).parameters.values())
-            if len(parameters) < len(shapes):
+            if len(parameters) < len(shapes):  # it takes all arguments as one tuple of a class
                 kind = parameters[0].annotation
                 space[kind] = getattr(sys.modules[function.__module__], kind)
                 arguments = f"{kind}({arguments})"

@@ -187,7 +187,8 @@ BLOCK_SHAPES = (
 )
 """Shapes of the arrays of `Block`, see `measure_arrays`.
 
-d coordinates, s of l elements, t steps, u inputs, p parameters, w slots; k and j are 1 or l.
+d coordinates, s of l elements, t steps, u inputs, p parameters, w slots, y records of z numbers, r
+registers, q entries of `rows`, i instructions, a and n rows of the buffers; k and j are 1 or l.
 """
 CONSTANTS, FORCES, IMPACTS = range(3)
 """Parts of a force program; part k begins at entry k of `ProgramArrays.ends`."""
@@ -270,9 +271,11 @@ def check_block(block: Block) -> None:
     Raises:
         ValueError: an array is not as specified.
     """
+    # Sizes by the letters of `BLOCK_SHAPES`.
     sizes = measure_arrays(BLOCK_SHAPES, block)
     d, elements, steps, rows = sizes["d"], sizes["l"], sizes["t"], block.rows
-    # Numbers of registers for positions, inputs and parameters. They are consecutive groups.
+    # Numbers of registers for positions, inputs and parameters. They are consecutive groups, and
+    # `rows` has the first register of each.
     register_counts = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
     record_sizes = steps // block.steps_per_record + 1, 3 * d
     if (

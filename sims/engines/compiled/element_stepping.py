@@ -96,13 +96,13 @@ def step_elements(block: Block) -> None:
     loaded_count = 0
     active_count = 0
     for i in range(block.w):
-        block.n[ORDER_INDEX, i] = -1
         if loaded_count < block.order.size:
             load_element(block, i, loaded_count)
             loaded_count += 1
             active_count += 1
         else:
-            # There are more slots than elements: this one computes valid numbers, but is not used.
+            # There are more slots than elements: this one computes valid numbers, but is not used,
+            # which an index of -1 marks.
             load_element(block, i, block.order.size - 1)
             block.n[ORDER_INDEX, i] = -1
     has_new_elements = True
@@ -118,6 +118,7 @@ def step_elements(block: Block) -> None:
         for i in range(block.w):
             block.n[IS_IDLE, i] = block.n[ORDER_INDEX, i] < 0
             is_used = block.n[ORDER_INDEX, i] >= 0
+            # A finished element leaves its slot, which makes its next step in the next turn.
             if is_used and not record_and_check_remaining(block, i):
                 active_count -= 1
                 block.n[ORDER_INDEX, i] = -1
@@ -163,6 +164,7 @@ def resolve_initial_ground_contact(block: Block) -> None:
             any_on_ground |= a[height_row, i] <= floor and a[rate_row, i] <= 0.0
     if not any_on_ground:
         return
+    # `handle_impact` needs the acceleration before the impact, which `begin_step` writes to K1.
     evaluate_forces(block)
     begin_step(block)
     for i in range(block.w):
@@ -175,7 +177,7 @@ def resolve_initial_ground_contact(block: Block) -> None:
 
 
 def is_newly_loaded(block: Block, i: int) -> bool:
-    """Return whether an element has just been loaded into a slot.
+    """Return whether a slot holds an element at the beginning of its run.
 
     Args:
         block: buffers of the elements that are integrated together.
@@ -203,6 +205,7 @@ def try_step(block: Block) -> None:
     d = block.flags[DIMENSIONS]
     t = block.rows[IN_T]
     for stage in range(1, 4):
+        # Time of the stage as a share of the step, and the acceleration of the previous stage.
         share = 0.5 if stage < 3 else 1.0
         acceleration_row = K1 + (stage - 1) * MAX_COORDINATES
         for i in range(block.w):
@@ -213,11 +216,11 @@ def try_step(block: Block) -> None:
             if stage == 1:
                 for i in range(block.w):
                     r[x, i] = a[X + k, i] + 0.5 * a[H, i] * a[V + k, i]  # (2)
-            elif stage == 2:
+            elif stage == 2:  # the register still has x + h/2 v
                 for i in range(block.w):
                     half_step = 0.5 * a[H, i]
                     r[x, i] = r[x, i] + (half_step * half_step) * a[K1 + k, i]  # (3)
-            else:
+            else:  # the register of the velocity still has v + h/2 k2
                 for i in range(block.w):
                     r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
             for i in range(block.w):
@@ -265,6 +268,7 @@ def accept_or_retry(block: Block, i: int) -> None:
     a[REMAINING_TIME, i] = nan_maximum(a[REMAINING_TIME, i] - h, 0.0)
     if n[PENDING_EVENT, i] != NO_EVENT:
         handle_event(block, i)
+    # An element that moves up has left the ground.
     if n[IS_RESTING, i] != 0 and not a[V + d - 1, i] <= 0.0:
         n[IS_RESTING, i] = 0
     if a[REMAINING_TIME, i] <= 0.0:

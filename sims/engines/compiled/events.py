@@ -84,7 +84,7 @@ def dot(a: FloatArray, first_vector: int, second_vector: int, d: int, i: int) ->
     """Return the inner product of two vectors.
 
     Args:
-        a: numbers of the slots.
+        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
         first_vector: first row of the first vector.
         second_vector: first row of the second vector.
         d: number of dimensions.
@@ -100,7 +100,7 @@ def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
     """Return the magnitude of a vector.
 
     Args:
-        a: numbers of the slots.
+        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
         first_vector: first row of the vector.
         d: number of dimensions.
         i: index of the slot, the column of the batch element.
@@ -132,7 +132,9 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
 
 
 def has_no_pending_event(block: Block, i: int) -> bool:
-    """Return whether the element has no pending event and not too many events in its step.
+    """Return whether an event of the element may be sought in the present step.
+
+    It may unless the step leads to a scheduled event already, or has had too many events.
 
     Args:
         block: buffers of the elements that are integrated together.
@@ -211,6 +213,7 @@ def schedule_event(block: Block, i: int, seconds: float, event: int) -> None:
         seconds: seconds from the beginning of the step to the event.
         event: kind of event: IMPACT, STANDSTILL or BREAK_AWAY.
     """
+    # Without a scheduled event, the delay is infinite.
     if seconds < block.a[EVENT_DELAY, i]:
         block.a[EVENT_DELAY, i] = min(max(seconds, 0.0), block.a[H, i])
         block.n[PENDING_EVENT, i] = event
@@ -267,9 +270,9 @@ def shift_time(block: Block, i: int, seconds: float) -> float:
 def handle_impact(block: Block, i: int, k: int) -> None:
     """Apply an impact with the ground, which the element has nearly reached.
 
-    First the element moves exactly to the ground: with the remaining distance d, its rate r and
-    acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (10). Then its velocity
-    becomes that of the rebound.
+    First the element moves exactly to the ground: with its height d above the ground, the rate r of
+    d and the upward acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (10).
+    Then its velocity becomes that of the rebound.
 
     Args:
         block: force program, batch elements and their buffers. Slot i holds one element: its
@@ -350,8 +353,10 @@ def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -
         square = 0.0
         for j in range(d - 1):
             square += a[V + j, i] * a[V + j, i]
+        # The root of a square would be rounded.
         tangential_speed = abs(a[V, i]) if d == 2 else np.sqrt(square)
         share = 1.0 - lost_speed / (tangential_speed if tangential_speed > 0.0 else 1.0)
+        # The ground leaves at least this share, such as where the body begins to roll.
         remaining_share = nan_maximum(share, block.ground[MIN_REMAINING_SHARE, element])
         for j in range(d - 1):
             a[V + j, i] *= remaining_share

@@ -106,15 +106,16 @@ def get_force_program(
         if key in _traced_forces:
             return _traced_forces[key]
         program = _find_program(batch, elements[:1], names, effects)
+        # Registers of the outputs: force and limit of dry friction; restitution and friction.
         (_, limit), impact = program.outputs
         rows = [*program.function.input_ends[:-1], *np.concatenate([limit, *impact])]
         flags = _make_flags(system, names, effects)
-        found = ForceProgram(program, np.array(rows, dtype=np.int64), flags)
+        force_program = ForceProgram(program, np.array(rows, dtype=np.int64), flags)
         if program.is_traced:
             if len(_traced_forces) == MAX_CACHED_PROGRAMS:
                 _traced_forces.clear()
-            _traced_forces[key] = found
-        return found
+            _traced_forces[key] = force_program
+        return force_program
 
 
 def _find_program(
@@ -241,7 +242,9 @@ def _count_hidden_states(effects: Sequence[Effect]) -> int:
 def _make_samples(
     batch: IntegrationBatch, first: Indices, effects: Sequence[Effect]
 ) -> list[Array]:
-    """Return inputs (n, 1) of a program at the initial state of an element, and at another one.
+    """Return inputs (n, 1) of a program at the initial state of an element, and at a shifted one.
+
+    Hidden states are zero at the first. A traced program is compared with NumPy at both.
 
     Args:
         batch: whole batch.
@@ -254,13 +257,13 @@ def _make_samples(
     inputs = [values[first[0], 0] for values in batch.inputs.values()]
     hidden = np.zeros(_count_hidden_states(effects))
     x, v = (np.append(state[first[0]], hidden) for state in (batch.x, batch.v))
-    impact = _TEST_RESTITUTION, _TEST_FRICTION
-    return [
-        np.concatenate([[t], x + shift, v - 2.0 * shift, inputs, parameters, [*impact, speed]])[
-            :, None
-        ]
-        for t, shift, speed in _TEST_STATES
-    ]
+    samples = []
+    for t, shift, impact_speed in _TEST_STATES:
+        impact = _TEST_RESTITUTION, _TEST_FRICTION, impact_speed
+        # In the order of the groups of inputs of `_make_function`.
+        groups = [t], x + shift, v - 2.0 * shift, inputs, parameters, impact
+        samples.append(np.concatenate(groups)[:, None])
+    return samples
 
 
 def _make_flags(system: System, names: _InputNames, effects: Sequence[Effect]) -> IntTable:

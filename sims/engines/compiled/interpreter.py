@@ -91,6 +91,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -
         k = (x * TWO_OVER_PI + ROUNDING_OFFSET) - ROUNDING_OFFSET  # rounded to an integer
         y = ((x - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
         z = y * y
+        # Coefficients of fdlibm, from S6 to S1 and from C6 to C1.
         s = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
         s = -1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * s)
         s = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * s)
@@ -104,6 +105,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -
         is_odd = half_quarters != (half_quarters + ROUNDING_OFFSET) - ROUNDING_OFFSET
         quarter = k - 4.0 * ((0.25 * k + ROUNDING_OFFSET) - ROUNDING_OFFSET)  # -2 to 2
         value = cosine if is_odd else sine
+        # The signs of sin (y + k pi/2): negative in the third and fourth quarter turn.
         flips = quarter == 2.0 or quarter == -2.0 or quarter == -1.0
         r[o, i] = -value if flips else value
         is_large |= not abs(x) <= MAX_REDUCED_ANGLE
@@ -134,6 +136,7 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
         low = k * LN_2_LOW
         y = high - low
         z = y * y
+        # Coefficients of fdlibm, from P5 to P1.
         c = -1.65339022054652515390e-06 + z * 4.13813679705723846039e-08
         c = -2.77777777770155933842e-03 + z * (6.61375632143793436117e-05 + z * c)
         c = y - z * (1.66666666666666019037e-01 + z * c)

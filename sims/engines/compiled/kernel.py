@@ -49,6 +49,7 @@ def integrate_elements(
     Raises:
         ValueError: an array is not as specified.
     """
+    # `Block` has its integers last, and `steps_per_record` is the last field of `arrays`.
     fields: tuple[Any, ...] = *program, *arrays[:-1], *buffers, arrays.steps_per_record, w
     block = Block(*fields)
     check_block(block)

@@ -96,6 +96,7 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
     space = _compile_functions(numba, entry_function, constants)
     types = numba.types
     arguments = [types.CPointer(types.int64)] * pointers
+    # The function's code with the compiled functions in place of its global names.
     bound = FunctionType(entry_function.__code__, space, "integrate")
     compiled = numba.cfunc(types.void(*arguments), error_model="numpy")(bound)
     code = machine_code.compile_llvm(compiled.inspect_llvm(), compiled.native_name)

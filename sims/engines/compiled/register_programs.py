@@ -167,10 +167,11 @@ class PreparedProgram:
     def _evaluate_part(self, part: int, width: int) -> None:
         """Evaluate one part of the program for the first `width` slots (called by machine code).
 
-        Values that depend on parameters alone are not separated here, so that part has nothing to
-        do. An exception cannot pass through machine code: it is stored, all results are NaN from
+        Values that depend on parameters alone are not separated here, so that part 0 does nothing.
+        An exception cannot pass through machine code: it is stored, all results are NaN from
         then on, and the caller raises it afterwards.
         """
+        # Part 0 has the values that depend on parameters alone.
         if not 0 < part <= len(self.program.outputs):
             return
         outputs = self.program.outputs[part - 1]
@@ -192,15 +193,19 @@ class PreparedProgram:
 
 
 def make_numpy_program(function: ArrayFunction) -> Program:
-    """Return a program whose instructions call the function."""
+    """Return a program whose instructions call the function, one for each part.
+
+    Its registers are the inputs, followed by the values of each output. `PreparedProgram` makes the
+    instructions, which contain an address of this process.
+    """
     ends = np.cumsum([function.input_ends[-1], *(n for part in function.outputs for n in part)])
-    places = iter(pairwise(ends.tolist()))
+    output_bounds = iter(pairwise(ends.tolist()))
     return Program(
         function,
         is_traced=False,
         code=np.zeros((PART_COUNT, 5), dtype=np.int64),
         ends=np.arange(PART_COUNT + 1),
-        outputs=[[np.arange(*next(places)) for _ in part] for part in function.outputs],
+        outputs=[[np.arange(*next(output_bounds)) for _ in part] for part in function.outputs],
         registers=int(ends[-1]),
         constants=np.zeros(0),
     )
@@ -220,6 +225,7 @@ def trace_program(function: ArrayFunction) -> Program:
     """
     graph = ExpressionGraph()
     inputs = [make_input_vector(graph, size, changes) for size, changes in function.groups]
+    # Nodes of each output, of each evaluation and then of each impact.
     parts = [
         [_collect_output(graph, value, size) for value, size in zip(evaluate(), sizes, strict=True)]
         for evaluate, sizes in zip(function.bind(*inputs), function.outputs, strict=True)
@@ -234,7 +240,7 @@ def trace_program(function: ArrayFunction) -> Program:
         if node.args:
             registers[node] = len(registers)
             args = [registers[arg] for arg in node.args]
-            args += [args[0]] * (3 - len(args))
+            args += [args[0]] * (3 - len(args))  # registers that the operation does not read
             by_frequency[node.change_frequency].append(
                 [OPERATION_CODES[node.operation], registers[node], *args]
             )

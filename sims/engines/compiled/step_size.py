@@ -91,7 +91,7 @@ def choose_step_divisions(block: Block) -> None:
         for instant in range(instants):
             if instants > 1:
                 set_inputs_at(block, instant)
-            for at_rest in range(2):
+            for at_rest in range(2):  # the initial state first
                 compute_stiffness_and_damping(block, at_rest == 1)
                 for i in range(min(block.w, block.order.size - first_order_index)):
                     element = block.n[ELEMENT, i]

@@ -318,8 +318,8 @@ class TracedArray(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: Any, method: str, *args: Any, **kwargs: Any) -> TracedArray:
         """Trace a NumPy ufunc; NumPy calls this method for an operation on a traced array.
 
-        Sums, maxima and minima along an axis are traced too; other methods and options are
-        not.
+        Sums, maxima and minima along an axis are traced too (``numpy.add.reduce``); other methods
+        and options are not. An argument ``out`` gets the result.
         """
         if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
             axis = kwargs.get("axis", 0)
@@ -411,9 +411,9 @@ def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -
     if name == "reciprocal":
         return _apply_elementwise(graph, "divide", (1.0, args[0]))
     if name == "power" and not isinstance(args[1], TracedArray) and np.ndim(args[1]) == 0:
-        short = _simplify_power(graph, args[0], float(args[1]))
-        if short is not None:
-            return short
+        simplified = _simplify_power(graph, args[0], float(args[1]))
+        if simplified is not None:
+            return simplified
     if name in SWAPPED_COMPARISONS:
         return _apply_elementwise(graph, SWAPPED_COMPARISONS[name], args[::-1])
     name = OPERATION_ALIASES.get(name, name)
@@ -492,7 +492,7 @@ def _trace_where(condition: Any, *values: Any) -> TracedArray:
 
 
 def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
-    """Trace numpy.clip as a maximum and a minimum; a limit may be None.
+    """Trace numpy.clip as a maximum and a minimum; at least one argument is traced.
 
     Args:
         x: values to clip.
@@ -500,14 +500,12 @@ def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
         high: upper limit; None for no limit.
     """
     graph = _find_graph(x, low, high)
-    result = x
+    result: TracedArray = x
     if low is not None:
         result = _apply_elementwise(graph, "maximum", (result, low))
     if high is not None:
         result = _apply_elementwise(graph, "minimum", (result, high))
-    return (
-        result if isinstance(result, TracedArray) else TracedArray(graph, _to_nodes(graph, result))
-    )
+    return result
 
 
 def _fill_like(x: TracedArray, value: float) -> TracedArray:

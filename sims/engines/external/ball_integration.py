@@ -70,11 +70,13 @@ def get_gravity(element: ElementWork) -> Vector:
 
 
 def make_trajectory(element: ElementWork, rows: list[tuple[float, ...]]) -> Trajectory:
-    """Split rows of position, velocity and acceleration; all NaN if rows are missing.
+    """Split recorded states into positions, velocities and accelerations.
+
+    If a state is missing, because the integration failed, all numbers are NaN.
 
     Args:
         element: integrated batch element.
-        rows: nine numbers for each recorded state.
+        rows: position, velocity and acceleration, nine numbers for each recorded state.
 
     Returns:
         Positions, velocities and accelerations (N, 3).
@@ -297,21 +299,21 @@ class BallRollout:
     def _time_to_ground(self) -> float:
         """Return the seconds until the ball meets the ground with its present acceleration.
 
-        It is 0 for a ball on the ground that moves down, and inf for one that rests on it, or
-        never meets it.
-
-        From height H with upward speed u and upward acceleration l, it is (u + r) / -l = 2 H / (r -
-        u), r = sqrt(u^2 - 2 l H) (5); the form without cancellation is used.
+        From height H with upward speed u and upward acceleration l, it is (u + r) / -l =
+        2 H / (r - u), r = sqrt(u^2 - 2 l H) (5). Of these equal forms, the one without cancellation
+        is used. It is inf for a ball that never meets the ground, and for one at rest on it.
         """
         gap = max(self.x[2] - self._floor, 0.0)
         rate = self.v[2]
         lift = self.a[2]
         discriminant = rate * rate - 2.0 * lift * gap
-        # (5): of the two forms, the one without cancellation is used.
-        if rate > 0.0 or (rate == 0.0 and lift < 0.0):  # It rises first, or begins to fall.
+        # It rises, or is still and begins to fall.
+        if rate > 0.0 or (rate == 0.0 and lift < 0.0):
             return (rate + math.sqrt(discriminant)) / -lift if lift < 0.0 else math.inf
+        # It sinks, but turns above the ground; or it stays still, or is still and begins to rise.
         if discriminant < 0.0 or (rate == 0.0 and lift >= 0.0):
             return math.inf
+        # It sinks to the ground: at once if it is there.
         return 2.0 * gap / (math.sqrt(discriminant) - rate)
 
     def _apply_impact(self) -> None:
@@ -441,6 +443,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     positions, v, effect_forces = make_trajectory(element, recorded_states)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
     a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (6)
+    # A ball that rests on the ground has no vertical acceleration.
     for i in np.flatnonzero(np.abs(v[:, 2]) < _MAX_RESTING_SPEED):
         if ball.is_near_contact(positions[i, 2] - floor):
             a[i, 2] = 0.0

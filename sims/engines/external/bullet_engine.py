@@ -265,7 +265,7 @@ class BulletBall(_BulletMover):
         self.set_contact_parameters(restitution, friction)
         self.set_step(_IMPACT_STEP_SECONDS)
         # Bullet adds gravity's velocity change of the step before it solves the contact. This is
-        # compensated, so that the solver sees v.
+        # compensated, so that the solver gets v.
         contact_position = x[0], x[1], self._floor - ball_integration.CONTACT_PENETRATION
         self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT_STEP_SECONDS))
         self._set_contact(True)
@@ -312,7 +312,8 @@ class BulletNativeBall(_BulletMover):
             ball_friction = self._lateral_friction**2 + friction
             ground_friction = 1.0
         pybullet = bullet_world.import_pybullet()
-        if friction or self._contact[1]:
+        _, previous_friction = self._contact
+        if friction or previous_friction:  # NaN before the first call
             floor = pybullet.getBodyUniqueId(0, self._client)
             for body, value in ((floor, ground_friction), (self._body, ball_friction)):
                 pybullet.changeDynamics(

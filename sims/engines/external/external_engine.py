@@ -117,11 +117,13 @@ def integrate_batch(
         if element_index == 0 or not np.array_equal(
             batch.steps[element_index], batch.steps[element_index - 1]
         ):
-            timing = _compute_timing(batch.steps[element_index], batch.steps_per_sample)
-        element = _make_element(batch, element_index, *timing[:3])
+            moving, steps, recorded_steps, output_rows = _compute_timing(
+                batch.steps[element_index], batch.steps_per_sample
+            )
+        element = _make_element(batch, element_index, moving, steps, recorded_steps)
         # A rollout that is certain to fail would cost the engine its world.
         if all(np.isfinite(values).all() for values in _list_numbers(element)):
-            work.append((element_index, element, timing[3]))
+            work.append((element_index, element, output_rows))
 
     def integrate_share(k: int) -> None:
         """Integrate every n-th element from the k-th on with rollout k of n, in its own thread.
@@ -129,7 +131,7 @@ def integrate_batch(
         A failed element stays NaN, and the world is discarded, because it may be in any
         state.
         """
-        for element_index, element, output_rows in work[k :: len(rollouts)]:
+        for element_index, element, rows in work[k :: len(rollouts)]:
             trajectory = rollouts[k](element)
             if not is_finite(trajectory):
                 discard()
@@ -137,7 +139,7 @@ def integrate_batch(
             for result, values in zip(
                 (trajectories.x, trajectories.v, trajectories.a), trajectory, strict=True
             ):
-                result[element_index] = values[output_rows]
+                result[element_index] = values[rows]
 
     try:
         if len(rollouts) == 1:
@@ -169,10 +171,10 @@ def _compute_timing(steps: Array, steps_per_sample: int) -> tuple[Indices, Array
         Indices of the steps with length > 0, their lengths, the step counts at which a state is
         recorded, and for each record the index of its state.
     """
-    # A step of zero length does not change the state: its record uses the same row as the previous
-    # one.
     moves = steps > 0
     moving = np.flatnonzero(moves)
+    # Steps with length before each record. Records between which the element only waited have the
+    # same number, and use the same state.
     step_counts = np.concatenate([[0], np.cumsum(moves)])[::steps_per_sample]
     recorded, rows = np.unique(step_counts, return_inverse=True)
     return moving, equalise_steps(steps[moving], steps_per_sample), recorded, rows
@@ -327,7 +329,7 @@ class ElementForces:
         numbers = self._numbers
         numbers[self._t] = t
         numbers[self._x], numbers[self._x + 1], numbers[self._x + 2] = x
-        vx, vy, vz = numbers[self._v], numbers[self._v + 1], numbers[self._v + 2] = v
+        numbers[self._v], numbers[self._v + 1], numbers[self._v + 2] = vx, vy, vz = v
         self._run_moment()
         fx, fy, fz = (numbers[k] for k in self._force)
         limit = self.limit

@@ -167,13 +167,13 @@ def integrate_velocity(
         duration: time in seconds.
     """
     if velocity and limit:
-        slope = subtract_dry_friction(velocity, force, limit) * inverse
-        final_velocity = velocity + slope * duration
+        acceleration = subtract_dry_friction(velocity, force, limit) * inverse
+        final_velocity = velocity + acceleration * duration
         # A product of both would underflow to zero for the remainder of a rounding error.
         if (final_velocity < 0) == (velocity < 0):
             return final_velocity
-        # The body stops at time -v / slope; the remaining time begins there.
-        duration += velocity / slope
+        # The body stops at the time -velocity / acceleration; the remaining time begins there.
+        duration += velocity / acceleration
         velocity = 0.0
     return velocity + subtract_dry_friction(velocity, force, limit) * inverse * duration
 

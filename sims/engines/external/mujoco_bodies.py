@@ -310,7 +310,7 @@ class MujocoSoftBall(MujocoMover):
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set friction, and the damping with which the contact has this restitution.
 
-        The contact is a spring and a damper, so it is so only if the steps are short.
+        The contact is a spring and a damper, which have this restitution only if steps are short.
         """
         if (restitution, friction) != self._contact_values:
             self._contact_values = restitution, friction
@@ -328,8 +328,8 @@ class MujocoSoftBall(MujocoMover):
         MuJoCo's own contact is frictionless here. Friction opposes the horizontal velocity, and is
         proportional to the normal force of the last step.
         """
-        friction = self._contact_values[1]
-        if friction and self._data.nefc:
+        _, friction = self._contact_values
+        if friction and self._data.nefc:  # the contact is active
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
             normal = float(self._data.efc_force[0])
@@ -362,7 +362,7 @@ def compute_damping_ratio(
 
 
 def _compute_restitution(ratio: float) -> float:
-    """Return the restitution of a spring and damper with this damping ratio."""
+    """Return the restitution of a spring and damper that only push, with this damping ratio."""
     if ratio >= 1.0:
         root = math.sqrt(ratio * ratio - 1.0)
         return math.exp(-2.0 * ratio * math.acosh(ratio) / root) if root else math.exp(-2.0)

@@ -137,6 +137,7 @@ def _accepts_arguments(member: Any, protocol: Callable[..., Any]) -> bool:
     if not callable(member):
         return False
     parameters = list(inspect.signature(protocol).parameters.values())[1:]  # the first is self
+    # Only the number and the names of arguments count, so the parameters themselves are passed.
     by_place = [p for p in parameters if p.kind is p.POSITIONAL_ONLY]
     by_name = {p.name: p for p in parameters if p.kind is not p.POSITIONAL_ONLY}
     try:
