@@ -142,7 +142,7 @@ class OwnSimulatorEngine:
         for step_index, seconds in enumerate(steps.tolist()):
             if seconds > 0:
                 inputs = {name: float(u[0, step_index]) for name, u in batch.inputs.items()}
-                if forces.any:
+                if forces.acts:
                     world.apply_force(forces.at(time, inputs, seconds))
                 world.step(inputs, seconds)
                 level_limits.keep()
@@ -298,17 +298,19 @@ class _Forces:
     def __init__(self, batch: IntegrationBatch, world: SteppableSimulator) -> None:
         """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
 
-        `_last` holds velocity, forces and length of the previous step, from which (1) estimates
-        the simulator's own force; None at the first step.
+        `_last` holds velocity, forces and length (s) of the previous step, from which the
+        simulator's own force is estimated; it is None before the first step.
 
-        Shapes: K coefficients.
+        Args:
+            batch: Batch of this element alone, with effects of K coefficients each.
+            world: Simulator to which the forces are applied.
         """
         active_effects = [(effect, c) for effect, c in batch.effects if c.any()]
         self.forces = [(effect, c) for effect, c in active_effects if isinstance(effect, Force)]
         self.frictions = [
             (effect, c) for effect, c in active_effects if isinstance(effect, Friction)
         ]
-        self.any = bool(self.forces or self.frictions)
+        self.acts = bool(self.forces or self.frictions)
         self.world = world
         self.batch = batch
         self._last: tuple[Array, Array, float] | None = None

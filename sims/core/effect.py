@@ -171,15 +171,13 @@ class Effect(metaclass=EffectType):
     pairs: ClassVar[tuple[str, ...]] = ()
 
     def parts(self, c: Array) -> ActiveEffects:
-        """Return the effect as the sum of effects at one place each.
+        """Return the effects of which this effect is the sum, with their coefficients.
 
-        Shapes: L batch elements.
+        A family, such as friction in all joints of a robot, returns its members; other effects
+        return themselves.
 
         Args:
-            c: Coefficients (K, L, 1).
-
-        Returns:
-            The effects with their coefficients.
+            c: (K, L, 1) coefficients of L batch elements.
         """
         return ((self, c),)
 

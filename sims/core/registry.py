@@ -68,6 +68,7 @@ class Registry(Generic[T]):
         """
         self.kind, self.group, self.base = kind, group, base
         self._added: dict[str, AddedPart[T]] = {}
+        # Placeholders of plugin classes whose code is not loaded into this process.
         self._stubs: dict[str, AddedPart[T]] = {}
         self._imported: dict[str, Any] = {}
 

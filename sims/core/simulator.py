@@ -408,8 +408,7 @@ class Simulator(ABC):
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
         """Simulate each parameter vector in one scenario.
 
-        A batch element whose simulation fails numerically is filled with NaN and does not affect
-        the others.
+        If a simulation fails numerically, its observation is NaN, and the others are not affected.
 
         Shapes: T samples, C channels.
 

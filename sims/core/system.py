@@ -333,7 +333,7 @@ class System(ABC):
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the generalised inertia (L, 1); 1 for a system that counts force per unit mass.
 
-        A system whose engine computes inertia and gravity itself does not define it.
+        There is no default: a system does not define it if its engine computes inertia and gravity.
 
         Shapes: L batch elements.
 

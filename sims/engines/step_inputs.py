@@ -47,7 +47,8 @@ def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
     """
     if name not in scenario.before:
         return values
-    return np.concatenate([scenario.before[name][1], values])
+    _, history = scenario.before[name]  # times and values
+    return np.concatenate([history, values])
 
 
 def compute_applied_inputs(

@@ -229,7 +229,8 @@ def get_history_times(scenario: Scenario, name: str) -> Array:
     """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
-    history_times: Array = scenario.before[name][0] + scenario.offset
+    times, _ = scenario.before[name]  # and values
+    history_times: Array = times + scenario.offset
     return history_times
 
 

@@ -8,7 +8,11 @@ from collections.abc import Mapping
 def model(constants: Mapping[str, float]) -> str:
     """Return the MuJoCo model (MJCF) of the ball and the ground.
 
-    The joints are x, y, z, with zero at the origin; the contact uses the parameters of the ball.
+    The joints are x, y, z, with zero at the origin. Contact is frictionless (``condim`` 1), and its
+    parameters are those of the ball, which has the higher priority.
+
+    Args:
+        constants: radius (m), mass (kg) and gravity (m/s^2) by name.
     """
     size = constants["radius"]
     mass = constants["mass"]

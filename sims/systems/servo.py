@@ -55,6 +55,9 @@ def render_model_file(numbers: Mapping[str, float]) -> RenderedModelFile:
     MuJoCo has no motor with a voltage. A position actuator with a force range is equivalent: its
     largest force is the stall torque (the torque at full voltage and standstill), and damping takes
     the place of the voltage that the motor itself generates.
+
+    Args:
+        numbers: Parameters and constants of the servo by name, SI units.
     """
     stall_torque = numbers["torque_constant"] * numbers["voltage"] / numbers["resistance"]
     text = SERVO_MJCF_TEMPLATE.format(
@@ -74,7 +77,11 @@ def render_model_file(numbers: Mapping[str, float]) -> RenderedModelFile:
         "forcerange is the stall torque at this supply",
     )
     return RenderedModelFile(
-        text, "joint", "motor", {"q": "q.joint", "goal": "u.motor"}, assumptions
+        text,
+        joint="joint",
+        actuator="motor",
+        signals={"q": "q.joint", "goal": "u.motor"},
+        notes=assumptions,
     )
 
 

@@ -50,9 +50,10 @@ def evaluate_forces(block: Block) -> None:
     Afterwards register `block.out[k]` has the force on coordinate k, without dry friction.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     d = block.flags[DIMENSIONS]
     rows = block.rows
@@ -77,9 +78,10 @@ def begin_step(block: Block) -> None:
     have faster versions.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     if block.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(block, K1)
@@ -117,15 +119,17 @@ def begin_step(block: Block) -> None:
 
 
 def begin_step_1d(block: Block) -> None:
-    """Do the work of `begin_step` if dry friction acts only on the first coordinate.
+    """Compute the accelerations of all slots at the beginning of a step, in rows K1.
 
-    There is no ground. The numbers are the same. All cases are computed and one is selected,
-    without branches, so that the compiler can vectorise the loop over slots.
+    This is the version of `begin_step` for dry friction on the first coordinate only, without
+    ground; the numbers are the same. All cases are computed and one is selected, without branches,
+    so that the compiler can vectorise the loop over slots.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     a = block.a
     r = block.r
@@ -165,9 +169,10 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
     any other, computed for one element after the other.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         row_of_result: first row of `block.a` for the accelerations, one of K2, K3 and K4.
         friction_row: first row of `block.a` for the dry friction, one of F2, F3 and F4.
     """
@@ -183,15 +188,18 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
 
 
 def compute_acceleration_1d(block: Block, row_of_result: int, friction_row: int) -> None:
-    """Do the work of `compute_acceleration` if friction acts only on the first coordinate.
+    """Compute the accelerations of all slots at a later stage of a Runge-Kutta step.
 
-    This is for systems without ground. It also stores the excess of the pulling force over the
-    friction limit at the end of the step, from which a break-away is detected.
+    This is the version for dry friction on the first coordinate only, without ground. The direction
+    of friction, and which elements stick, are those of the beginning of the step. It also stores
+    the excess of the force without dry friction over the friction limit, from which a break-away is
+    detected.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
@@ -214,9 +222,10 @@ def compute_further_coordinates(block: Block, row_of_result: int, friction_row: 
     """Compute the accelerations of the coordinates after the first, which have no dry friction.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
@@ -237,9 +246,10 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
     the coordinates with dry friction.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
@@ -281,9 +291,10 @@ def compute_acceleration_without_friction(
     rows of friction and of its direction are zero for the others.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations, which contains the forces before.
         friction_row: first row of dry friction.
@@ -301,9 +312,10 @@ def compute_force_without_friction(block: Block, i: int, row_of_result: int) -> 
     If the element rests on the ground, which balances its weight, a downward force counts as zero.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the forces.
     """
@@ -322,9 +334,10 @@ def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
     If an element rests on the ground, which balances its weight, a downward force counts as zero.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         row_of_result: first row of the accelerations.
     """
     a = block.a

@@ -117,7 +117,10 @@ class CompiledFunctions:
             InputError: the compiler or its machine code cannot be used.
         """
         if self._compiled is None:
-            self._compiled = load_stored(self._module, "COMPILED", self._description, 1, {})
+            # `COMPILED` is the name of this object in its module.
+            self._compiled = load_stored(
+                self._module, "COMPILED", self._description, pointers=1, constants={}
+            )
         return self._compiled
 
     def make_entry(self) -> FunctionType:

@@ -41,9 +41,10 @@ def load_element(block: Block, i: int, order_index: int) -> None:
     except the few that have another initial value.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         order_index: index of the element in `block.order`.
     """
@@ -79,9 +80,10 @@ def set_inputs(block: Block, i: int) -> None:
     After the last step, they are those of the last step.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     first = block.rows[IN_U]
@@ -99,9 +101,10 @@ def record_and_check_remaining(block: Block, i: int) -> bool:
     abandoned: its last record becomes NaN, by which the caller recognises the failure.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
 
     Returns:
@@ -128,9 +131,10 @@ def record_state(block: Block, i: int, record: int) -> None:
     """Record position, velocity and acceleration of the element in slot i.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         record: index of the record.
     """
@@ -151,9 +155,10 @@ def next_step(block: Block, i: int) -> None:
     the last planned step, the remaining time is zero.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

@@ -86,9 +86,10 @@ def step_elements(block: Block) -> None:
     it is shortened and repeated in the next turn.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     # Elements that move fast get shorter steps.
     choose_step_divisions(block)
@@ -147,9 +148,10 @@ def resolve_initial_ground_contact(block: Block) -> None:
     the height.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     a = block.a
     n = block.n
@@ -196,9 +198,10 @@ def try_step(block: Block) -> None:
     accepted.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     a = block.a
     r = block.r
@@ -244,9 +247,10 @@ def accept_or_retry(block: Block, i: int) -> None:
     contains. An accepted step that leads to a scheduled event is followed by that event.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

@@ -154,9 +154,10 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
     only the time of a break-away is refined until it is accurate enough.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -164,6 +165,7 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
     h = a[H, i]
     has_no_event = has_no_pending_event(block, i)
     has_event = False
+    # Impact: the height, which is the last coordinate, falls below the ground.
     if has_no_event and block.flags[BOUNCES] != 0:
         floor = block.ground[FLOOR, block.n[ELEMENT, i]]
         end_value = a[NEXT_X + d - 1, i]
@@ -174,6 +176,7 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
             has_event = True
     if block.flags[HAS_FRICTION] != 0:
         is_sticking = block.n[IS_STICKING, i] != 0
+        # Standstill: the speed along the direction of motion at the beginning becomes negative.
         if has_no_event and not is_sticking:
             end_value = dot(a, NEXT_V, DIRECTION, d, i)
             if end_value < 0.0:
@@ -181,6 +184,7 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
                 rate = dot(a, K1, DIRECTION, d, i)
                 schedule_event(block, i, find_event_time(speed, rate, end_value, h), STANDSTILL)
                 has_event = True
+        # Break-away of an element that dry friction holds.
         awaits_break_away = block.n[PENDING_EVENT, i] == BREAK_AWAY
         if is_sticking and (has_no_event or awaits_break_away):
             # Pulling force minus friction limit at both ends of the step.
@@ -206,9 +210,10 @@ def schedule_event(block: Block, i: int, seconds: float, event: int) -> None:
     If two events are in a step, the earlier one is scheduled; the other is found again later.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         seconds: seconds from the beginning of the step to the event.
         event: kind of event: IMPACT, STANDSTILL or BREAK_AWAY.
@@ -227,9 +232,10 @@ def handle_event(block: Block, i: int) -> None:
     break-away. The step was shortened to end there.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     event = block.n[PENDING_EVENT, i]
@@ -249,9 +255,10 @@ def shift_time(block: Block, i: int, seconds: float) -> float:
     much, and moves the state by the same time. Later steps have correspondingly less time left.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         seconds: time correction in seconds; NaN counts as zero.
 
@@ -275,9 +282,10 @@ def handle_impact(block: Block, i: int, k: int) -> None:
     Then its velocity becomes that of the rebound.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         k: first row of the acceleration before the impact.
     """
@@ -319,9 +327,10 @@ def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -
     impacts at once.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         upward_acceleration: upward acceleration before the impact; negative under gravity.
     """
@@ -373,9 +382,10 @@ def count_bounce_and_check_end(
     shorter than `SHORT_FLIGHT_SECONDS`. Without downward acceleration, the element flies away.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
         rebound_speed: upward speed after the impact.
         downward_acceleration: downward acceleration.
@@ -397,9 +407,10 @@ def handle_standstill(block: Block, i: int) -> None:
     is negligible, the velocity becomes exactly zero.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

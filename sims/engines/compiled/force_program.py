@@ -167,7 +167,20 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
     def bind(
         t: Any, x: Any, v: Any, u: Any, parameters: Any, e: Any, mu: Any, speed: Any
     ) -> tuple[Evaluator, Evaluator]:
-        """Return the functions that evaluate forces and impacts; see `ArrayFunction.bind`."""
+        """Return the functions that evaluate forces and impacts for these L elements.
+
+        Shapes: L elements, d coordinates, of which the last ones are hidden states of effects.
+
+        Args:
+            t: (L, 1) time since the start of the run, s.
+            x: (L, d) positions.
+            v: (L, d) velocities.
+            u: (L, U) inputs.
+            parameters: (L, P) parameters of the system, its constants, and coefficients of effects.
+            e: (L, 1) restitution without effects.
+            mu: (L, 1) friction coefficient of the ground without effects.
+            speed: (L, 1) impact speed, m/s.
+        """
         theta, *columns = np.split(parameters, np.cumsum(sizes)[:-1], axis=1)
         constants = dict(zip(names.constants, columns, strict=False))
         coefficients = [c.T[:, :, None] for c in columns[len(constants) :]]

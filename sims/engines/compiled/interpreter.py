@@ -221,9 +221,10 @@ def run_part(block: Block, part: int) -> None:
     Entries `part` and `part + 1` of `block.ends` are the bounds of its instructions.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         part: `CONSTANTS`, `FORCES` or `IMPACTS`.
     """
     run_instructions(block.code, block.ends[part], block.ends[part + 1], block.r, block.w)

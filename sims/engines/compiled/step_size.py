@@ -75,9 +75,10 @@ def choose_step_divisions(block: Block) -> None:
     with time, at the initial state and at rest. Elements are loaded in groups of one block.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     longest_steps = block.max_steps
     divisions = block.divisions
@@ -106,12 +107,13 @@ def choose_step_divisions(block: Block) -> None:
 
 
 def divide_steps(block: Block) -> None:
-    """Divide the longest step of each element by its number of parts.
+    """Divide the longest step of each element by its number of parts, `block.divisions`.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
     """
     for element in block.order:
         division = block.divisions[element]
@@ -120,7 +122,8 @@ def divide_steps(block: Block) -> None:
             # last one.
             block.max_steps[element] = block.max_steps[element] / division * (1.0 + 1e-9)
         if block.flags[HAS_HIDDEN_STATES] != 0:
-            # The fine steps that hidden states need count as planned steps.
+            # The number of steps of an element is limited to a multiple of the planned ones. The
+            # fine steps that hidden states need count as planned steps.
             block.planned_counts[element] *= division
 
 
@@ -131,28 +134,31 @@ def select_sampled_steps(block: Block, i: int) -> None:
     length do not count. If all elements have the same steps, those of slot 0 are copied.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     n = block.n
-    shared = block.steps.shape[0] == 1
-    if shared and i > 0:
+    are_steps_shared = block.steps.shape[0] == 1
+    if are_steps_shared and i > 0:
         for k in range(SAMPLED_INSTANTS):
             n[SAMPLED_STEP + k, i] = n[SAMPLED_STEP + k, 0]
         return
-    row = 0 if shared else n[ELEMENT, i]
-    steps = block.steps.shape[1]
-    total = 0
-    for s in range(steps):
-        total += block.steps[row, s] > 0.0
+    row = 0 if are_steps_shared else n[ELEMENT, i]
+    step_count = block.steps.shape[1]
+    nonzero_count = 0
+    for s in range(step_count):
+        nonzero_count += block.steps[row, s] > 0.0
     passed_count = 0
     k = 0
-    for s in range(steps):
+    for s in range(step_count):
         passed_count += block.steps[row, s] > 0.0
+        # Selection k is after the share k / (SAMPLED_INSTANTS - 1) of the steps; in a short run,
+        # several selections are one step.
         while k < SAMPLED_INSTANTS and passed_count >= np.ceil(
-            k * (1.0 / (SAMPLED_INSTANTS - 1)) * total
+            k * (1.0 / (SAMPLED_INSTANTS - 1)) * nonzero_count
         ):
             n[SAMPLED_STEP + k, i] = s
             k += 1
@@ -162,9 +168,10 @@ def set_inputs_at(block: Block, instant: int) -> None:
     """Set the inputs of every element to those of one of its selected steps.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         instant: index of the selected step.
     """
     first = block.rows[IN_U]
@@ -182,9 +189,10 @@ def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
     MAX_FRICTION. These rows are free before the integration begins.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
@@ -199,6 +207,7 @@ def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
             a[X + k, i] = 0.0 * x if at_rest else x
             a[V + k, i] = 0.0 * v if at_rest else v
     evaluate_forces(block)
+    # Rows K1 hold the forces at this state, from which those at changed states are subtracted.
     for k in range(d):
         for i in range(block.w):
             a[K1 + k, i] = block.r[block.out[k], i]
@@ -214,9 +223,10 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
     and the former value is restored.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         k: index of the coordinate.
         register: first register of the positions or velocities.
         row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities. The row
@@ -274,9 +284,10 @@ def shorten_if_nonlinear(block: Block, i: int) -> bool:
     allowed step, is reduced after a rejection, and doubles after an accepted step of that length.
 
     Args:
-        block: force program, batch elements and their buffers. Slot i holds one element: its
-            numbers are `block.a[ROW, i]`, its integers `block.n[ROW, i]`, and the registers of
-            the force program, inputs and forces among them, `block.r[REGISTER, i]`.
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

@@ -564,12 +564,12 @@ _FUNCTIONS: dict[str, Callable[..., TracedArray]] = {
 
 
 def make_input_vector(graph: ExpressionGraph, size: int, changes: int) -> Any:
-    """Return a traced array (1, size) of new inputs with this change frequency.
+    """Return a traced array (1, size) of new inputs, whose values are not known.
 
     Args:
         graph: graph that contains the nodes.
         size: number of inputs.
-        changes: change frequency.
+        changes: how often the values change: `PER_ELEMENT`, `PER_EVALUATION` or `PER_IMPACT`.
     """
     nodes = np.empty((1, size), dtype=object)
     for k in range(size):

@@ -59,7 +59,10 @@ BallState = tuple[Vector, Vector]
 
 
 def get_gravity(element: ElementWork) -> Vector:
-    """Return the acceleration of gravity, a vector, as the system computes it; it is constant."""
+    """Return the acceleration of gravity (x, y, z) of a system of kind ``point``, m/s^2.
+
+    It is constant, so that it is evaluated at the origin, at rest and without inputs.
+    """
     start = np.zeros((1, 1))
     zeros = np.zeros((1, 3))
     moment = StateSnapshot(
@@ -334,7 +337,10 @@ class BallRollout:
     def _compute_impact(self, speed: float, down: float) -> tuple[float, float, bool]:
         """Return the parameters of an impact, and whether bouncing ends with it.
 
-        The friction of the last impact includes the friction of all omitted bounces.
+        With restitution e, friction mu and normal speed n, the ball rebounds with n' = e n and
+        flies for 2 n' / down seconds. Bouncing ends if this is too short, or after many short
+        flights. Then the ball does not rebound, and this impact removes the tangential speed that
+        it and all omitted ones would remove: mu (1 + e) n and mu (1 + e) n' / (1 - e).
 
         Args:
             speed: normal speed before the impact in m/s.
@@ -343,18 +349,15 @@ class BallRollout:
         Returns:
             Restitution, friction coefficient, and whether bouncing is finished.
         """
-        # Equation numbers refer to `sims.engines.ground_contact`.
         restitution, friction = self._forces.compute_impact(speed)
-        rebound_speed = restitution * speed  # (1)
-        flight = 2.0 * rebound_speed / down if down > 0.0 else math.inf  # (3)
+        rebound_speed = restitution * speed
+        flight = 2.0 * rebound_speed / down if down > 0.0 else math.inf
         self._short_flights = self._short_flights + 1 if flight < SHORT_FLIGHT_SECONDS else 0
         if flight >= MIN_FLIGHT_SECONDS and self._short_flights <= MAX_SHORT_FLIGHTS:
             return restitution, friction, False
-        # Engines remove mu (1 + e) |vn| with the returned e, which is 0. Therefore all of (4) and
-        # the factor 1 + e of this impact are included in the friction.
-        omitted_speed = (
-            rebound_speed / (1.0 - restitution) if restitution < 1.0 else 0.0
-        )  # (4), divided by mu (1 + e)
+        # Engines remove mu (1 + e) n with the returned e, which is 0. Therefore the factor 1 + e,
+        # and the sum n' / (1 - e) of the speeds of omitted impacts, are included in the friction.
+        omitted_speed = rebound_speed / (1.0 - restitution) if restitution < 1.0 else 0.0
         total = friction * (1.0 + restitution) * (1.0 + omitted_speed / speed) if speed else 0.0
         return 0.0, total, True
 

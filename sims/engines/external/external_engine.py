@@ -299,9 +299,9 @@ class ElementForces:
     def evaluate_at_velocities(
         self, t: float, x: float, velocities: tuple[float, float]
     ) -> tuple[float, float]:
-        """Return the generalised forces of a one-coordinate element at two velocities.
+        """Return the generalised forces of an element with one coordinate at two velocities.
 
-        Dry friction is not included.
+        Dry friction is not included; `limit` is its limit at the first velocity.
 
         Args:
             t: time in seconds.
@@ -309,6 +309,7 @@ class ElementForces:
             velocities: the two velocities.
         """
         numbers = self._numbers
+        # Each register has two numbers, one for each velocity.
         numbers[self._t] = numbers[self._t + 1] = t
         numbers[self._x] = numbers[self._x + 1] = x
         numbers[self._v], numbers[self._v + 1] = velocities

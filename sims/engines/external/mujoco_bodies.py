@@ -47,20 +47,20 @@ _CONTACT_IMPEDANCE = 0.9999
 class CompiledWorld:
     """MuJoCo model and its state, compiled on first use and again when the constants change."""
 
-    def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
+    def __init__(self, write_model: Callable[[Mapping[str, float]], str]) -> None:
         """Store the function that writes the MJCF; nothing is compiled before the first use.
 
         Args:
-            model: function from constants to MJCF.
+            write_model: function from constants to MJCF.
         """
-        self._compile = model
+        self._write_model = write_model
         self._built_for: dict[str, float] | None = None
         self._model: Any = None
         self._data: Any = None
 
     def __reduce__(self) -> tuple[type[CompiledWorld], tuple[Callable[[Mapping[str, float]], str]]]:
         # A copy of a simulator, in this or in another process, gets its own world.
-        return CompiledWorld, (self._compile,)
+        return CompiledWorld, (self._write_model,)
 
     def get_reset_world(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
         """Return model and data in their initial state, for these constants.
@@ -73,7 +73,7 @@ class CompiledWorld:
         """
         if self._built_for != constants:
             mujoco = import_mujoco()
-            self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
+            self._model = mujoco.MjModel.from_xml_string(self._write_model(constants))
             disabled = mujoco.mjtDisableBit
             # Joint damping is explicit, as in Bullet and as `external.joint_integration` assumes.
             self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
@@ -270,9 +270,10 @@ class MujocoBall(MujocoMover):
             if tangential_speed
             else 0.0
         )
-        deceleration = removed_share * self._inverse_step
+        # Deceleration divided by the speed, 1/s.
+        rate = removed_share * self._inverse_step
         self._set_contact(True)
-        _, velocity = self.advance((-deceleration * v[0], -deceleration * v[1], self._gravity))
+        _, velocity = self.advance((-rate * v[0], -rate * v[1], self._gravity))
         self._set_contact(False)
         return velocity
 
@@ -333,9 +334,10 @@ class MujocoSoftBall(MujocoMover):
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
             normal = float(self._data.efc_force[0])
-            # Friction must not do more than stop the slip within the step.
-            share = min(friction * normal / self._mass / slip, self._inverse_step) if slip else 0.0
-            force = force[0] - share * vx, force[1] - share * vy, force[2]
+            # Deceleration divided by the speed, 1/s: friction must not do more than stop the slip
+            # within the step.
+            rate = min(friction * normal / self._mass / slip, self._inverse_step) if slip else 0.0
+            force = force[0] - rate * vx, force[1] - rate * vy, force[2]
         return super().advance(force)
 
 
