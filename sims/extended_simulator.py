@@ -191,8 +191,7 @@ def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> 
     import tomli_w
 
     if extended.robot is None:
-        engine = {"engine": extended.engine} if extended.engine else {}
-        base_entries: dict[str, Any] = {"system": extended.system, **engine}
+        base_entries = {"system": extended.system, **_get_engine_setting(extended)}
     else:
         base_entries = extended.robot.to_document(folder)
     document = {
@@ -428,10 +427,10 @@ def check_not_extended(kind: type[SystemSimulator]) -> None:
         InputError: The simulator is extended already.
     """
     if hasattr(kind, "extends"):
-        robot: Any = kind
-        advice = f"system it extends, {robot.extends}"
+        extended: Any = kind  # whose additional attributes are not typed
+        advice = f"system it extends, {extended.extends}"
         if kind.has_model:
-            advice = f"model file it extends, --model {robot.robot.path}"
+            advice = f"model file it extends, --model {extended.robot.path}"
         raise InputError(f"simulator {kind.name} is extended already; name the {advice}")
 
 

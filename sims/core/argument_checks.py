@@ -353,9 +353,9 @@ def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
     """
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         return _NO_MATCH
+    _, entry_hint = get_args(hint)
     return {
-        key: _convert_value(f"{place}[{key!r}]", entry, get_args(hint)[1])
-        for key, entry in value.items()
+        key: _convert_value(f"{place}[{key!r}]", entry, entry_hint) for key, entry in value.items()
     }
 
 

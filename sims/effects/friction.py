@@ -167,15 +167,14 @@ class DirectionalLoadFriction(Friction):
         """Return the limit (L, 1) from the loads by the motor and from outside.
 
         The limit is |motor drive - external load| (4), each force counted in the direction in which
-        it pushes the joint. `moment.sides` has the external load with the opposite sign, so that
-        both are added.
+        it pushes the joint.
 
         Args:
             c: (2, L, 1) coefficients: motor and external.
             moment: state snapshot of L batch elements.
         """
-        drive, external_load = moment.sides
-        return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * external_load)  # (4)
+        drive, passive = moment.sides  # the passive force is minus the external load
+        return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * passive)  # (4)
 
 
 class QuadraticLoadFriction(Friction):
@@ -281,19 +280,20 @@ class DirectionalViscousFriction(Force):
         return -c[0] * forward_velocity - c[1] * backward_velocity  # (8)
 
 
-def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
+def _limit_to_opposing(drive: Array, passive: Array) -> Array:
     """Return the smaller magnitude of two opposing forces (L, 1); zero where they do not oppose.
 
-    As in MuJoCo's equation of motion, M a = drive - external_load, forces of equal signs oppose
-    each other.
+    The equation of motion is M a = drive - passive. Therefore forces of equal signs oppose each
+    other.
 
     Shapes: L batch elements.
 
     Args:
         drive: (L, 1) force of the drive.
-        external_load: (L, 1) other forces on the joint.
+        passive: (L, 1) passive force, which the drive works against.
     """
-    low, high = np.minimum(drive, external_load), np.maximum(drive, external_load)
+    low, high = np.minimum(drive, passive), np.maximum(drive, passive)
+    # The first term is zero unless both are positive, the second unless both are negative.
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 

@@ -239,12 +239,12 @@ class ClockSkew(Sensor):
 
 
 def _smooth_step(instant: Array, times: Array) -> Array:
-    """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between.
+    """Return the progress (L, S) of the slip at time stamps: 0 before, 1 after, linear between.
 
     Shapes: L batch elements, S steps.
 
-    Over an interval h before a sample at t, it is linear from s = t - h / 2, where the slip has
-    happened, to s = t + h / 2, where it has not (8).
+    The time s of the slip within an interval h between samples is not known exactly. For a sample
+    at t after this interval, the progress is 1 for s <= t - h / 2, and 0 for s >= t + h / 2 (8).
 
     Args:
         instant: (L, 1) time of the slip, s.

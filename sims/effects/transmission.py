@@ -132,17 +132,14 @@ class DrivenLoad(HiddenStateEffect):
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
         stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _MIN_COMPLIANCE), 0.0)
         gap = np.maximum(coefficients.get("gap", zeros), 0.0)
-        return SeriesElement(
-            stiffness, coefficients.get("damping", zeros), gap, coefficients["rotor"]
-        )
+        damping = coefficients.get("damping", zeros)
+        return SeriesElement(stiffness, damping, gap, drive=coefficients["rotor"])
 
     def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:
-        """Return the initial state: moving with the drive, at the static deflection.
-
-        Shapes: K coefficients.
+        """Return the initial state of the load: moving with the drive, at the static deflection.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (K, L, 1) coefficients of the effect.
             moment: state snapshot of L batch elements.
         """
         deflection = self.compute_static_deflection(

@@ -114,6 +114,7 @@ def compute_applied_inputs(
             )
             means = np.where(is_acting, means + c[0] * (other_means - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
+    # The first value of the command, or of its history, also acts before it.
     initial_values = np.array(
         [_get_command_values(s, input_name, u[input_name])[0] for s, u in pairs]
     )
@@ -215,9 +216,9 @@ def _step_begins(ends: Array) -> Array:
 
 
 def _find_last_nonzero_step(steps: Array) -> Indices:
-    """Return the number (L, S) of each step, or of the last step before it with nonzero length.
+    """Return the index (L, S) of each step, or of the last step before it with nonzero length.
 
-    The input does not change while a batch element waits.
+    The input does not change in steps of zero length, in which a batch element waits for others.
 
     Shapes: L batch elements, S steps.
     """

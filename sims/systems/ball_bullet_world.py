@@ -47,7 +47,7 @@ def build(client: int, constants: Mapping[str, float]) -> int:
     """
     pybullet = bullet_world.import_pybullet()
     ground, ball = _create_ground_and_ball(client, constants)
-    # There is no push-out, s of (3) is zero, and slow impacts rebound as well.
+    # Bodies that overlap are not pushed apart, contact acts at the surface, slow impacts rebound.
     pybullet.setPhysicsEngineParameter(
         contactERP=0.0, contactSlop=0.0, restitutionVelocityThreshold=0.0, physicsClientId=client
     )

@@ -267,8 +267,8 @@ class TwoLinkArm(OwnSimulator):
 
     def _set_step_length(self, seconds: float) -> None:
         """Set the step length in seconds, and with it the joint friction, if the length changes."""
-        # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
-        # one length of step.
+        # Dry friction is a motor that holds the joint still with at most this torque. Bullet turns
+        # the torque into an impulse when the motor is set, which is valid for one step length.
         if seconds != self._step:
             pybullet = self._world
             pybullet.setTimeStep(seconds)
@@ -284,7 +284,9 @@ class TwoLinkArm(OwnSimulator):
             if torques[joint]:  # Bullet forgets them after each step
                 self._push(self._arm, joint, self._torque, force=torques[joint])
         self._go()
-        return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]
+        _, rate1, *_ = self._state(self._arm, 0)
+        _, rate2, *_ = self._state(self._arm, 1)
+        return rate1, rate2
 
 
 def _has_stopped_or_turned(rate_before: float, middle: float, rate_after: float) -> bool:

@@ -119,7 +119,7 @@ def step_elements(block: Block) -> None:
         for i in range(block.w):
             block.n[IS_IDLE, i] = block.n[ORDER_INDEX, i] < 0
             is_used = block.n[ORDER_INDEX, i] >= 0
-            # A finished element leaves its slot, which makes its next step in the next turn.
+            # A finished element gives its slot to the next one, which begins in the next turn.
             if is_used and not record_and_check_remaining(block, i):
                 active_count -= 1
                 block.n[ORDER_INDEX, i] = -1

@@ -115,7 +115,8 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
 
     It is the last root of the parabola p(s) = p + r s - b s^2 with b = (p + h r - q) / h^2 (8),
     which interpolates the value p and the rate r at the beginning of a step of length h, and the
-    value q at its end. The error is of third order in h; it is corrected when the root is reached.
+    value q at its end: s = (r + w) / (2 b) = 2 p / (w - r), w = sqrt(r^2 + 4 b p) (9). The error is
+    of third order in h; it is corrected when the root is reached.
 
     Args:
         value: value >= 0 at the beginning.
@@ -125,7 +126,7 @@ def find_event_time(value: float, rate: float, end_value: float, h: float) -> fl
     """
     curvature = (value + h * rate - end_value) / (h * h)  # (8)
     root = np.sqrt(rate * rate + 4.0 * curvature * value)
-    # (9): the form that adds numbers of equal sign is used.
+    # (9), in the form without cancellation.
     seconds = 2.0 * value / (root - rate) if rate < 0.0 else (root + rate) / (2.0 * curvature)
     # Without a root, which only rounding can cause, the event is at the end of the step.
     return float(seconds if abs(seconds) < np.inf else h)

@@ -75,7 +75,7 @@ class ForceProgram(NamedTuple):
     def prepare(self, width: int) -> tuple[PreparedProgram, ProgramArrays]:
         """Allocate registers of `width` slots, and return the layout for the compiled kernel."""
         prepared = PreparedProgram(self.program, width)
-        force = self.program.outputs[0][0]
+        (force, _), _ = self.program.outputs
         return prepared, ProgramArrays(
             prepared.code, self.program.ends, self.rows, force, self.flags
         )

@@ -44,7 +44,7 @@ class MachineCode(NamedTuple):
 
 
 def describe_processor() -> list[str]:
-    """Return what the code depends on in addition to its source.
+    """Return what machine code depends on in addition to its source.
 
     Returns:
         llvmlite's version, and name and features of the processor.

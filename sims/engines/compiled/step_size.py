@@ -96,7 +96,8 @@ def choose_step_divisions(block: Block) -> None:
                 compute_stiffness_and_damping(block, at_rest == 1)
                 for i in range(min(block.w, block.order.size - first_order_index)):
                     element = block.n[ELEMENT, i]
-                    # The two rows hold the stiffness and the damping here.
+                    # The stiffness is in row MAX_ACCELERATION, the damping in MAX_FRICTION. The
+                    # decay is scaled, so that its limit is that of the phase.
                     step = longest_steps[element]
                     phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * step
                     decay = block.a[MAX_FRICTION, i] * step * PHASE_TO_DECAY_RATIO

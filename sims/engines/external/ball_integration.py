@@ -216,7 +216,7 @@ class BallRollout:
         # A resting ball that is pulled upward takes off.
         if self.rests and self.lift > 0.0:
             self.rests = False
-            self.w = None
+            self.w = None  # the engine's state must be set again
             self._update_acceleration()
         if self.rests or self._time_to_ground() >= step:
             self._advance_without_impact(step)

@@ -211,8 +211,9 @@ class _BulletMover:
         newtons = mass * force[0], mass * force[1], mass * force[2]
         p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
         p.stepSimulation(self._client)
-        self._x = p.getBasePositionAndOrientation(self._body, self._client)[0]
-        return self._x, p.getBaseVelocity(self._body, self._client)[0]
+        self._x, _ = p.getBasePositionAndOrientation(self._body, self._client)
+        velocity, _ = p.getBaseVelocity(self._body, self._client)
+        return self._x, velocity
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set the ball's restitution and friction coefficient.
