@@ -46,6 +46,10 @@ _OFFSET_RANGES = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 _IDENTIFICATION = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002)"
 _MIN_RELATIVE_ERROR = -0.99
 """Smallest relative error of a number that must stay positive."""
+_RELATIVE_ERROR = Coefficient(
+    "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
+)
+"""Coefficient of an effect that scales a positive number."""
 
 
 class MassScale(ModelValueEffect):
@@ -56,11 +60,7 @@ class MassScale(ModelValueEffect):
     says = "the body is heavier or lighter than the model file states"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (
-        Coefficient(
-            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
-        ),
-    )
+    coefficients = (_RELATIVE_ERROR,)
 
 
 class CentreOfMassOffset(ModelValueEffect):
@@ -82,11 +82,7 @@ class InertiaScale(ModelValueEffect):
     says = "the body's moment of inertia differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (
-        Coefficient(
-            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
-        ),
-    )
+    coefficients = (_RELATIVE_ERROR,)
 
 
 class ArmatureOffset(ModelValueEffect):
@@ -110,11 +106,7 @@ class ActuatorStiffnessScale(ModelValueEffect):
     says = "the servo's proportional gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (
-        Coefficient(
-            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
-        ),
-    )
+    coefficients = (_RELATIVE_ERROR,)
 
 
 class ActuatorDampingScale(ModelValueEffect):
@@ -125,11 +117,7 @@ class ActuatorDampingScale(ModelValueEffect):
     says = "the servo's damping gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (
-        Coefficient(
-            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
-        ),
-    )
+    coefficients = (_RELATIVE_ERROR,)
 
 
 class ActuatorForceLimit(ModelValueEffect):
@@ -156,6 +144,8 @@ _PAYLOAD_OFFSET_RANGES = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 """Plausible distances of a payload from the centre of mass of its body, in metres."""
 _SMALL_MASS = 1e-4
 """Mass whose change of the motion is linear in it, as a share of the largest plausible one."""
+_LENGTH_ERROR_RANGES = ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3))
+"""Plausible relative errors of lengths and radii."""
 _MASS_RANGES = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 """Plausible mass of a payload in kg."""
 
@@ -194,11 +184,7 @@ class LinkLengthScale(ModelValueEffect):
     says = "the distance of the body from its parent differs from the model file"
     source = _CALIBRATION
     at = "body"
-    coefficients = (
-        Coefficient(
-            "coefficient", ("1", "1", "1"), ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3)), least=-0.99
-        ),
-    )
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _LENGTH_ERROR_RANGES, least=-0.99),)
 
 
 class GeomRadiusScale(ModelValueEffect):
@@ -209,11 +195,7 @@ class GeomRadiusScale(ModelValueEffect):
     says = "the radius of the wheel or foot differs from the model file"
     source = "R. Siegwart, I. R. Nourbakhsh, D. Scaramuzza, Autonomous Mobile Robots (2011), ch. 3"
     at = "geom"
-    coefficients = (
-        Coefficient(
-            "coefficient", ("1", "1", "1"), ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3)), least=-0.9
-        ),
-    )
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _LENGTH_ERROR_RANGES, least=-0.9),)
 
 
 class PayloadMass(ModelValueEffect):

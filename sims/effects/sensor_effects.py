@@ -31,6 +31,10 @@ from sims.engines.time_grid import is_active
 
 _SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
+_SHIFT_COEFFICIENT = Coefficient(
+    "coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2)), of="shift"
+)
+"""Coefficient of an effect by which a reading comes later, s."""
 _DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
 _GAIN_RANGES = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
@@ -112,9 +116,7 @@ class SensorDelay(Sensor):
     noun = "a sensor delay"
     says = "the sensor reading is late by a constant time"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
-    coefficients = (
-        Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2)), of="shift"),
-    )
+    coefficients = (_SHIFT_COEFFICIENT,)
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) of the recorded values.
@@ -134,9 +136,7 @@ class SensorLag(Sensor):
     says = "the sensor reading follows with a first-order lag"
     source = _VOCABULARY + ", 4.23"
     filters = True  # the lag evolves between samples, so every step is needed
-    coefficients = (
-        Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2)), of="shift"),
-    )
+    coefficients = (_SHIFT_COEFFICIENT,)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the lagged reading (L, S), exact for a reading that is linear over each step.
