@@ -569,7 +569,7 @@ class ConventionComparison:
             groups = selected.groups[:count]
             theta = evaluator.get_nominal_theta()
             for effect_group, coefficients in zip(
-                groups, selected.regression.solve(groups)[1], strict=True
+                groups, selected.regression.solve(groups).coefficients, strict=True
             ):
                 theta[evaluator.coefficient_slices[effect_group.effect]] = group_coefficients(
                     evaluator, probes, effect_group, coefficients

@@ -75,13 +75,21 @@ def run_filter(
     half: Array,
     w: Array,
 ) -> None:
-    """Filter B runs of T samples by (1) to (4) of `filter_and_smoother`.
+    """Filter B runs of T samples with Z states, C channels and E forces (Kalman filter).
 
-    For each sample: store the prediction, update the state by the reading, and predict the next
-    state. S = L Lᵀ is factorised, so that W = L⁻¹ whitens the innovations. A run whose covariance
-    exceeds the limit is lost: its covariance is reset to a wide prior. Results are written to
-    `predicted` and the five arguments after it; the last ten are buffers, so that no memory is
-    allocated.
+    With δ- and P- the predicted deviation of the state and its covariance, each sample has
+    ((1) to (4) of `filter_and_smoother`)
+
+        e = r - H δ-,    S = H P- Hᵀ + R = L Lᵀ,    W = L⁻¹,    K = P- Hᵀ Wᵀ W
+        log L -= log det L + |W e|² / 2
+
+    and an update by the reading and the prediction of the next sample after it, except the last:
+
+        δ = δ- + K e,    P = P- - K S Kᵀ,    δ- = A δ - d,    P- = A P Aᵀ + G Q Gᵀ + J
+
+    If a predicted covariance exceeds the limit, the state of an unstable motion is unknown, and its
+    covariance is reset to a wide prior. Results are written to `predicted` and the five arguments
+    after it; the last ten are buffers, so that no memory is allocated.
 
     Args:
         states: A (B, T - 1, Z, Z).
@@ -90,10 +98,10 @@ def run_filter(
         readings: H (B, T, C, Z).
         residuals: r (B, T, C).
         jumps: J (B, T - 1, Z), variances.
-        variances: variances of white noise (B, T, C).
+        variances: diagonal of R (B, T, C), variances of white noise.
         prior: (Z,) standard deviations of the first states.
-        deviations: (B, E) standard deviations of the missing forces.
-        limits: (1,) maximum covariance; a run with larger ones is treated as lost.
+        deviations: (B, E) standard deviations of the missing forces, whose squares are Q.
+        limits: (1,) maximum covariance.
         predicted: δ- (B, T, Z).
         covariances: P- (B, T, Z, Z).
         innovations: e (B, T, C).
@@ -125,7 +133,7 @@ def run_filter(
                 predicted[run, i, z] = x[z]
                 for y in range(size):
                     covariances[run, i, z, y] = p[z, y]
-            # crossed = P Hᵀ
+            # crossed = P Hᵀ; zeros of H are skipped.
             for z in range(size):
                 for c in range(channels):
                     crossed[z, c] = 0.0
@@ -135,7 +143,7 @@ def run_filter(
                     if factor != 0.0:
                         for z in range(size):
                             crossed[z, c] += p[z, y] * factor
-            # S = L Lᵀ, and W = L⁻¹
+            # Cholesky factor L of S, its inverse W, and half = P Hᵀ Wᵀ
             for c in range(channels):
                 for d in range(c + 1):
                     value = variances[run, i, c] if c == d else 0.0
@@ -156,7 +164,7 @@ def run_filter(
                     for d in range(c + 1):
                         value += crossed[z, d] * inverse[c, d]
                     half[z, c] = value
-            # Innovation, whitened innovation, and its share of the log-likelihood.
+            # Innovation, whitened innovation w = W e, and what they add to the log-likelihood.
             for c in range(channels):
                 value = residuals[run, i, c]
                 for z in range(size):
@@ -178,7 +186,7 @@ def run_filter(
                     gains[run, i, z, c] = value
             if i + 1 == samples:
                 break
-            # Update the state and its covariance by the reading.
+            # Update by the reading: K e = half w, and K S Kᵀ = half halfᵀ
             for z in range(size):
                 for c in range(channels):
                     x[z] += half[z, c] * w[c]
@@ -212,7 +220,6 @@ def run_filter(
                     if not abs(value) < limits[0]:
                         lost = True
             if lost:
-                # If the motion is unstable, the state after the step is unknown.
                 for z in range(size):
                     for y in range(size):
                         p[z, y] = prior[z] * prior[z] + 1.0 if z == y else 0.0
@@ -244,16 +251,24 @@ def run_smoother(
     closed: Array,
     weighed: Array,
 ) -> None:
-    """Smooth B runs by (5) and (6) of `filter_and_smoother`, backward from the last sample.
+    """Smooth B runs of T samples with Z states, C channels and E forces (Bryson and Frazier).
 
-    The adjoint λ and its information Λ collect what later readings say about the present state.
-    Results are written to `smoothed` and the three arguments after it; the last ten are buffers.
+    Backward from the last sample i, the adjoint λ and its information Λ collect what the readings
+    from this sample on say about its state. With C = I - K H and the whitener W of the filter
+    ((5) and (6) of `filter_and_smoother`),
+
+        λ_i = Cᵀ Aᵀ λ_{i+1} - Hᵀ Wᵀ W e,    Λ_i = Cᵀ Aᵀ Λ_{i+1} A C + Hᵀ Wᵀ W H
+        δ_i = δ- - P- λ_i,    f_{i-1} = - Q Gᵀ λ_i
+
+    Sums of (Gᵀ λ)² and of the diagonal of Gᵀ Λ G over all runs are the numerator and denominator of
+    (7). Results are written to `smoothed` and the three arguments after it; the last ten are
+    buffers, so that no memory is allocated.
 
     Args:
         states: A (B, T - 1, Z, Z).
         forces: G (B, T - 1, Z, E).
         readings: H (B, T, C, Z).
-        deviations: (B, E) standard deviations of the missing forces.
+        deviations: (B, E) standard deviations of the missing forces, whose squares are Q.
         predicted: δ- (B, T, Z), as written by the filter.
         covariances: P- (B, T, Z, Z), as written by the filter.
         innovations: e (B, T, C), as written by the filter.
@@ -323,7 +338,7 @@ def run_smoother(
                 smoothed[run, i, z] = value  # (6)
             if i == 0:
                 break
-            # Missing force between the previous sample and this one, and its share of (7).
+            # Missing force between the previous sample and this one, and what it adds to (7).
             g = forces[run, i - 1]
             for e in range(count):
                 pushed, known = 0.0, 0.0

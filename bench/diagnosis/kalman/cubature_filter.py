@@ -79,10 +79,10 @@ class FirstStates(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """Assumption about one run.
+    """Assumption with which one run is filtered.
 
     Attributes:
-        run: number of the run.
+        run: index of the run.
         theta: (P,) parameters of the model.
         share: standard deviation of the missing forces, as a share of the typical forces.
     """
@@ -93,7 +93,13 @@ class Hypothesis(NamedTuple):
 
 
 class SmoothedStart(NamedTuple):
-    """Result of a filter: log-likelihood, and mean and covariance of the first state."""
+    """Result of filter and smoother for one run: log-likelihood, and law of the first state.
+
+    Attributes:
+        log_likelihood: log-likelihood of the readings; -inf if the filter diverges.
+        mean: (2 D,) mean of the positions and velocities of D joints at the first sample.
+        covariance: (2 D, 2 D) their covariance.
+    """
 
     log_likelihood: float
     mean: Array
@@ -104,6 +110,9 @@ def estimate_first_states(
     evaluator: RunEvaluator, theta: Array, sigma: Array
 ) -> FirstStates | None:
     """Estimate the first states of all runs of a robot with contacts.
+
+    A filter and smoother estimate them, and simulations improve those that do not explain their
+    run.
 
     Args:
         evaluator: the runs.
@@ -142,12 +151,16 @@ def smooth_first_states(
     """
     if not can_filter(evaluator, theta):
         return None
-    runs, tried = range(len(evaluator.prepared_runs)), len(FORCE_SHARES)
+    runs, share_count = range(len(evaluator.prepared_runs)), len(FORCE_SHARES)
+    # The hypotheses of a run follow one another.
     results = filter_hypotheses(
         evaluator, sigma, [Hypothesis(run, theta, share) for run in runs for share in FORCE_SHARES]
     )
     best = [
-        max(results[tried * run : tried * (run + 1)], key=lambda smoothed: smoothed.log_likelihood)
+        max(
+            results[share_count * run : share_count * (run + 1)],
+            key=lambda smoothed: smoothed.log_likelihood,
+        )
         for run in runs
     ]
     is_finite = all(
@@ -170,8 +183,17 @@ def _refine_first_state(
 
     Where a contact begins to slide or to lift, the simulated run has kinks at which Gauss-Newton
     steps from the smoothed state end. The state is therefore searched at random within its
-    uncertainty, by the squares of the residual and of the change of the smoothed state. A run that
-    the smoothed state explains is not searched, and neither is one that the model cannot explain.
+    uncertainty, in rounds with a decreasing width about the best state so far. The cost is the sum
+    of the squared residual, in units of the noise, and the squared change of the smoothed state, in
+    units of its uncertainty. The search ends if the best state explains the run, or at once if the
+    residual is so large that the model cannot explain it.
+
+    Args:
+        evaluator: the runs.
+        theta: (P,) parameters of the model.
+        sigma: (C,) standard deviation of the noise of each channel.
+        run: index of the run.
+        smoothed: result of the smoother for this run.
     """
     is_recorded = np.isfinite(evaluator.observed[run])
     rng = np.random.default_rng(0)
@@ -181,6 +203,7 @@ def _refine_first_state(
     width, lowest = 1.0, np.inf
     for _ in range(SEARCH_ROUNDS):
         tried = deviates + width * rng.standard_normal((SEARCHED_STATES, deviates.size))
+        # The first one is the best so far, whose residual decides whether the search goes on.
         tried[0] = deviates
         states = smoothed.mean + tried @ root.T
         simulated = evaluator.simulate(
@@ -200,9 +223,11 @@ def _refine_first_state(
 
 
 def can_filter(evaluator: RunEvaluator, theta: Array) -> bool:
-    """Return whether positions and velocities of joints with one coordinate are the whole state.
+    """Return whether the cubature filter can follow the runs of a robot.
 
-    Effects that are evaluated in every step are excluded, too.
+    The state must consist of positions and velocities of joints with one coordinate: no activations
+    of actuators, no floating or ball joints, and no joints in series with others. Effects that are
+    evaluated in every step of the engine are excluded, too.
 
     Args:
         evaluator: the runs.
@@ -223,7 +248,7 @@ def filter_hypotheses(
     """Filter and smooth runs under several hypotheses, with as many as possible in one batch.
 
     A batch steps many states of one model at once, so its runs must have the same sample times, and
-    their effects must add the same elements to the model.
+    their effects must add the same elements (such as springs) to the model.
 
     Args:
         evaluator: the runs; `can_filter` must be true.
@@ -238,23 +263,23 @@ def filter_hypotheses(
     points = count_cubature_points(len(simulator.addresses.positions))
     width = max(LINEARISATION_BATCH_SIZE // points, 1)
     active_effects = simulator.get_active_effects(np.array([one.theta for one in hypotheses]))
+    # Indices of the hypotheses that may share a batch, by added elements and sample times.
     groups: dict[tuple[int, bytes], list[int]] = {}
-    # Batch elements with different elements of the model cannot share a batch.
-    for kind, elements in enumerate(
+    for added_elements, indices in enumerate(
         group_by_added_elements(active_effects, len(hypotheses)).values()
     ):
-        for number in elements:
-            times = evaluator.prepared_runs[hypotheses[number].run].scenario.times
-            groups.setdefault((kind, times.tobytes()), []).append(number)
+        for index in indices:
+            times = evaluator.prepared_runs[hypotheses[index].run].scenario.times
+            groups.setdefault((added_elements, times.tobytes()), []).append(index)
     results: dict[int, SmoothedStart] = {}
-    for numbers in groups.values():
-        for first in range(0, len(numbers), width):
-            part = numbers[first : first + width]
+    for group in groups.values():
+        for first in range(0, len(group), width):
+            part = group[first : first + width]
             batch_results = _CubatureFilters(
                 evaluator, sigma, [hypotheses[i] for i in part]
             ).smooth()
             results.update(zip(part, batch_results, strict=True))
-    return [results[number] for number in range(len(hypotheses))]
+    return [results[index] for index in range(len(hypotheses))]
 
 
 class _CubatureFilters:
@@ -265,8 +290,9 @@ class _CubatureFilters:
     ) -> None:
         """Compute the inputs over all steps, and find the recorded components of the state.
 
-        Each hypothesis gets its controls, forces, first state with prior, and readings. The batch
-        of the engine gets the effects of each hypothesis once per cubature point.
+        Each hypothesis gets its controls, forces, first state with prior, and readings. The first
+        state is the guess of the evaluator with velocities from the readings. The batch of the
+        engine gets the effects of each hypothesis once per cubature point.
 
         Args:
             evaluator: the runs.
@@ -307,6 +333,8 @@ class _CubatureFilters:
         self._controls, self._forces = np.array(controls), np.array(forces)
         self._start = np.array(starts)
         self._prior = np.hstack([np.full((len(starts), joints), POSITION_PRIOR), speed_priors])
+        # Sample times and added elements of all hypotheses are equal, so those of the last one
+        # serve.
         self._knots = np.rint(work.times / simulator.time_step).astype(np.intp)
         self._mujoco_batch = simulator.make_linearisation_batch(own_effects)
         # One hypothesis may need several batches, whose elements all have its effects.
@@ -316,6 +344,7 @@ class _CubatureFilters:
         written = slice_active_effects(select_model_field_effects(acting), elements)
         self._acting = pad_coefficients(written, elements.size, self._mujoco_batch.count)
         names = [*simulator.system.coordinates, *simulator.system.rates]
+        # Recorded components of the state: their channels, and their rows in the state.
         columns = [i for i, name in enumerate(evaluator.channels) if name in names]
         self._rows = [names.index(evaluator.channels[i]) for i in columns]
         data_of_runs = [evaluator.prepared_runs[h.run] for h in hypotheses]
@@ -329,6 +358,7 @@ class _CubatureFilters:
         moments are kept. Backward, the smoother of Rauch, Tung and Striebel, eq. (2), uses them. A
         filter that diverges has the log-likelihood -inf.
         """
+        # Components of the state, and of the state augmented by a force at each joint.
         size, component_count = self._size, self._point_count // 2
         mean = self._start.copy()
         covariance = np.square(self._prior)[:, :, None] * np.eye(size)
@@ -383,8 +413,8 @@ class _CubatureFilters:
                 ) @ gain.swapaxes(1, 2)
         log_likelihood[has_failed | ~np.isfinite(log_likelihood)] = -np.inf
         return [
-            SmoothedStart(float(value), *rest)
-            for value, *rest in zip(log_likelihood, mean, covariance, strict=True)
+            SmoothedStart(*smoothed)
+            for smoothed in zip(log_likelihood.tolist(), mean, covariance, strict=True)
         ]
 
     def _update(self, i: int, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
@@ -393,7 +423,7 @@ class _CubatureFilters:
         Readings are components of the state, so the observation matrix selects rows.
 
         Args:
-            i: number of the sample.
+            i: index of the sample.
             mean: (F, Z) predicted states.
             covariance: (F, Z, Z) their covariances.
 
@@ -433,6 +463,7 @@ class _CubatureFilters:
         Returns:
             (F, n, 2 D) states at the end; NaN where the simulation fails.
         """
+        # Two samples may lie in the same step.
         if end == begin:
             return states.copy()
         joints, mujoco_batch = self._joints, self._mujoco_batch
@@ -445,6 +476,7 @@ class _CubatureFilters:
             part = slice(first, first + mujoco_batch.count)
             part_states = flat_states[part]
             count = len(part_states)
+            # The robot has no floating joints, see `can_filter`.
             no_pose = FloatingState(np.zeros((count, 0)), np.zeros((count, 0)))
             mujoco_batch.set_initial_state(
                 part_states[:, :joints], part_states[:, joints:], no_pose
@@ -461,20 +493,22 @@ class _CubatureFilters:
 
 
 def count_cubature_points(joints: int) -> int:
-    """Return the number of points for positions, velocities and forces of some joints."""
+    """Return the number of points: two each for the position, velocity and force of a joint."""
     return 2 * 3 * joints
 
 
 def _compute_speed_deviation(evaluator: RunEvaluator, sigma: Array, joint: int) -> float:
-    """Return the prior standard deviation of a first velocity, that of a few readings.
+    """Return the prior standard deviation of the first velocity of a joint, in its unit per second.
 
-    A velocity that a contact stops within a sample interval leaves no trace in the readings.
+    It is a few times the noise of the velocity channel or, without one, that of positions per
+    sample interval. It is needed since a velocity that a contact stops within a sample interval
+    leaves no trace in the readings.
     """
     system, channels = evaluator.simulator.system, list(evaluator.channels)
-    position, rate = system.coordinates[joint], system.rates[joint]
+    coordinate, rate = system.coordinates[joint], system.rates[joint]
     if rate in channels:
         return SPEED_PRIOR * float(sigma[channels.index(rate)])
-    return SPEED_PRIOR * float(sigma[channels.index(position)]) / evaluator.sample_interval
+    return SPEED_PRIOR * float(sigma[channels.index(coordinate)]) / evaluator.sample_interval
 
 
 def _solve(matrices: Array, sides: Array) -> Array:
@@ -487,7 +521,8 @@ def compute_root(matrices: Array) -> Array:
     try:
         root = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
-        # Rounding may make an eigenvalue negative; a filter that diverges has no finite matrix.
+        # Rounding may make an eigenvalue negative, and a filter that diverges has matrices that are
+        # not finite; others of the batch must go on.
         values, vectors = np.linalg.eigh(np.nan_to_num(matrices))
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return root
@@ -496,7 +531,9 @@ def compute_root(matrices: Array) -> Array:
 def set_first_states_in_contact(
     evaluators: Sequence[RunEvaluator], theta: Array, sigma: Array
 ) -> None:
-    """Estimate the initial states of a robot whose geoms touch.
+    """Estimate the initial states of a robot whose geoms touch, and set them in the evaluators.
+
+    An evaluator keeps its initial states if the filter cannot follow its runs.
 
     Args:
         evaluators: runs for fitting, and held-out runs.
@@ -504,6 +541,6 @@ def set_first_states_in_contact(
         sigma: (C,) standard deviation of the noise of each channel.
     """
     for evaluator in evaluators:
-        found = estimate_first_states(evaluator, theta, sigma)
-        if found is not None:
-            evaluator.begin_at(found.states, FIRST_STATE_MARGIN * found.deviations)
+        first = estimate_first_states(evaluator, theta, sigma)
+        if first is not None:
+            evaluator.begin_at(first.states, FIRST_STATE_MARGIN * first.deviations)

@@ -9,9 +9,8 @@ h(x̄[i]),
     δ[i] = δ- + K_i e[i],            P[i] = P- - K_i S_i K_iᵀ                                  (3)
     log L = - Σ_i (log det S_i + e_iᵀ S_i⁻¹ e_i) / 2                                           (4)
 
-with Q the variances of missing forces and J_i those of jumps (`dynamics.servo_force_limits`). (R.
-E.
-Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737.) The smoother
+with Q the variances of missing forces and J_i those of jumps (`dynamics.servo_force_limits`; R. E.
+Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737). The smoother
 is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
 doi:10.1016/0005-1098(73)90076-9): backward, with C_i = I - K_i H_i,
 
@@ -49,7 +48,7 @@ IndexArray = NDArray[np.intp]
 AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
 LARGEST_CHANGE = 10.0
-"""Largest factor by which an iteration of (7) changes a variance."""
+"""Largest factor by which an iteration of (7) changes a standard deviation."""
 MAX_MAGNITUDE = 1e12
 """Maximum magnitude of derivatives and defects; larger ones come from divergence.
 
@@ -108,6 +107,7 @@ class LinearRuns:
         fewer steps.
         """
         run_count, samples, _ = self.residuals.shape
+        # Number of segments of a run, rounded up.
         count = -(-samples // length)
 
         def cut(values: Any) -> Any:
@@ -134,8 +134,8 @@ class LinearRuns:
         does not change. Numbers of a model that diverges are set to zero, too.
 
         Args:
-            maps: linear model of each run.
-            observed: (R, T, C), NaN where nothing was recorded.
+            maps: linear model of each run, whose arrays have the names `STACKED`.
+            observed: (R, T, C) readings, NaN where nothing was recorded.
             prior: (Z,) standard deviations of the first states.
         """
         runs, samples, _ = observed.shape
@@ -210,9 +210,9 @@ class Smoothed:
 def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, Array]:
     """Add states for autocorrelated AR(1) noise, because a Kalman filter expects white noise.
 
-    The noise n of a channel becomes a state: n[i+1] = φ n[i] + white innovation, and is added to
-    the reading of the channel. A small share of white noise remains, so that the filter stays well
-    conditioned.
+    The noise n of a channel with φ > 0 becomes a state: n[i+1] = φ n[i] + σ sqrt(1 - φ²) w[i] with
+    white noise w of variance one. It is added to the reading of the channel. A small share of white
+    noise remains, so that the filter stays well conditioned.
 
     Args:
         runs: the linear models.
@@ -273,9 +273,9 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     likelihood.
 
     Args:
-        runs: the linear models.
-        force: (E,) standard deviations of the missing forces, or (B, E) of each run; further
-            columns of G, those of coloured noise, have 1.
+        runs: the linear models of B runs.
+        force: (E,) standard deviations of the missing forces, or (B, E) of each run. Further
+            columns of the matrix G, which are those of coloured noise, have 1.
         white: R (C,) variances of white noise.
 
     Returns:
@@ -283,7 +283,7 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """
     if runs.states.shape[1] != runs.residuals.shape[1] - 1:
         raise ValueError(f"expected a step between two samples, got {runs.states.shape[1]} steps")
-    # A missing sample is replaced by a reading of zero with variance one.
+    # The residuals and rows of H of missing readings are zero already.
     variances = np.where(runs.recorded, white, 1.0)
     predicted, covariances, innovations, gains, whiteners, likelihood, *_ = COMPILED.call(
         run_filter,
@@ -300,11 +300,12 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
     """Smooth all runs backward, eqs. (5) and (6) of the module docstring (Bryson and Frazier).
 
     The smoothed states and forces are the most likely ones, given all samples of a run and not only
-    those before. The score says whether the assumed variances of the forces are too small, eq. (7).
+    those before. The score of a force, eq. (7), is the ratio of its measured to its expected mean
+    square: above one if its assumed variance is too small.
 
     Args:
         runs: the linear models.
-        filtered: results of the filter.
+        filtered: results of the filter for these runs.
         force: standard deviations of the missing forces, as for `filter_runs`.
     """
     states, forces, measured, expected, *_ = COMPILED.call(
@@ -332,10 +333,10 @@ def fit_process_noise(
         runs: the linear models.
         force: (E,) initial standard deviations.
         white: R (C,) variances of white noise.
-        typical: (E,) typical forces, which define the minimum standard deviations.
+        typical: (E,) typical forces in N or N·m; a small share of them is the minimum.
 
     Returns:
-        The standard deviations (E,), and the results of filter and smoother.
+        The standard deviations (E,), and the results of filter and smoother with them.
     """
     count = force.size
     # Short segments in parallel need fewer steps, and show the same process noise.
@@ -344,6 +345,7 @@ def fit_process_noise(
     for _ in range(MAX_ITERATIONS):
         filtered = filter_runs(fitted_runs, force, white)
         smoothed = smooth_runs(fitted_runs, filtered, force)
+        # Scores after the first `count` are those of coloured noise, whose variance is known.
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         new_force = np.maximum(force * ratio, SMALLEST_FORCE * typical)
         has_converged = bool((np.abs(new_force / force - 1.0) < CONVERGENCE_TOLERANCE).all())

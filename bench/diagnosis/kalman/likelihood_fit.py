@@ -64,14 +64,15 @@ def maximise_innovation_likelihood(
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
-    A step that does not increase the likelihood is halved a few times. The fit ends when a step
-    gains, or promises, less than `min_gain`.
+    A step that does not increase the likelihood is halved a few times. The fit ends when a step is
+    predicted to gain, or gains, less than `min_gain`.
 
     Args:
         followed: the runs, filtered with the initial parameters.
         bounds: bounds of the fitted parameters, by index.
         iterations: maximum number of steps.
-        follow: filters the runs with other parameters; its second argument is the best filter.
+        follow: filters the runs with other parameters (its first argument); its second argument is
+            the best filter so far, whose motion may be reused.
         min_gain: minimum gain in log-likelihood by a step for which another step follows.
 
     Returns:
@@ -104,23 +105,25 @@ def compute_likelihood_step(
 ) -> tuple[Array, float]:
     """Compute the Gauss-Newton step of some parameters on the innovations.
 
-    With derivatives J of the whitened innovations e, it solves J'J x = J'e. Columns are scaled to
-    unit length and a small ridge is added, which keeps the solution well conditioned.
+    The whitened innovations after a change x are e - J x, to first order, so x solves J'J x = J'e.
+    Columns of J are scaled to unit length and a small ridge is added, which keeps the solution well
+    conditioned.
 
     Args:
         followed: the runs, filtered with the present parameters.
-        bounds: bounds of the parameters that change, by index; they limit the step. A set
-            without effects has none.
+        bounds: bounds of the parameters that change, by index; they limit the step. It may be
+            empty: a set of effects without any has no such parameters.
 
     Returns:
-        The change of all parameters (P,), and the predicted gain in log-likelihood for linear
-        innovations.
+        The change of all parameters (P,), zero for those without bounds, and the gain in
+        log-likelihood, J'e x - x J'J x / 2, that is predicted for linear innovations.
     """
     indices = list(bounds)
     if not indices:
         return np.zeros_like(followed.theta), 0.0
-    derivatives, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
-    information, cross = derivatives.T @ derivatives, derivatives.T @ target.reshape(-1)
+    derivatives = _compute_derivatives(followed, bounds)
+    information = derivatives.T @ derivatives
+    cross = derivatives.T @ followed.filtered.whitened.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
     normal = information / scale / scale[:, None] + RIDGE * np.eye(len(indices))
     values = followed.theta[indices]
@@ -147,52 +150,52 @@ def compute_wald_statistics(
 ) -> dict[str, float]:
     """Return the loss in twice the log-likelihood without each effect of a set (Wald statistic).
 
-    It is c' V^-1 c for the k coefficients c of the effect and their covariance V, which contains
-    the uncertainty by all other parameters. So no fit without the effect is needed. Pseudo-inverses
-    allow parameters that the data do not determine.
+    It is c' V^-1 c for the k coefficients c of the effect and their covariance V, a block of the
+    inverse Fisher information, which contains the uncertainty by all other parameters. So no fit
+    without the effect is needed. Pseudo-inverses allow parameters that the data do not determine.
 
     Args:
         evaluator: the runs.
         theta: (P,) parameters of the set.
         names: its effects.
-        information: Fisher information of all parameters of the set.
+        information: Fisher information of all fitted parameters, also those of no effect.
     """
     covariance = np.linalg.pinv(information.matrix, hermitian=True)
     statistics = {}
     for name in names:
-        effect_places = evaluator.get_coefficient_indices(name)
-        effect_rows = [information.places.index(i) for i in effect_places]
-        inverse = np.linalg.pinv(covariance[np.ix_(effect_rows, effect_rows)], hermitian=True)
-        c = theta[effect_places]
-        statistics[name] = float(c @ inverse @ c)
+        indices = evaluator.get_coefficient_indices(name)
+        rows = [information.places.index(i) for i in indices]
+        inverse = np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True)
+        coefficients = theta[indices]
+        statistics[name] = float(coefficients @ inverse @ coefficients)
     return statistics
 
 
 def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
     """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters.
 
-    They are one-sided differences that stay within the bounds. A parameter without a range has no
-    derivative.
+    They are one-sided differences that stay within the bounds. The derivative by a parameter whose
+    bounds are equal is zero. Rows are the T samples of C channels of R runs.
 
     Args:
         followed: the runs, followed with the present parameters.
         bounds: lower and upper bound of each of the n parameters, by its index in theta.
     """
-    sizes = np.array(
+    differences = np.array(
         [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
     )
-    displaced = np.flatnonzero(sizes)
-    places = np.array(list(bounds), dtype=np.intp)[displaced]
-    responses = compute_parameter_responses(followed, places.tolist(), sizes[displaced])
+    columns = np.flatnonzero(differences)
+    parameters = np.array(list(bounds), dtype=np.intp)[columns]
+    responses = compute_parameter_responses(followed, parameters.tolist(), differences[columns])
     derivatives = np.zeros((*responses.shape[:3], len(bounds)))
-    derivatives[..., displaced] = responses
+    derivatives[..., columns] = responses
     return derivatives.reshape(-1, len(bounds))
 
 
 def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> float:
-    """Return the finite difference of a parameter, which stays within the bounds.
+    """Return the finite difference of a parameter, in its unit, which stays within the bounds.
 
-    It is zero if the parameter has no range.
+    It is zero if the bounds are equal, and negative if the parameter is decreased.
 
     Args:
         followed: the runs, followed with the present parameters.
@@ -205,6 +208,7 @@ def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> f
     if not size > 0:
         return 0.0
     value = float(followed.theta[index])
-    # Dry friction above that of the file has another form, so the difference stays on one side.
+    # More dry friction than in the model file (a positive value) acts otherwise than less of it, so
+    # the difference does not cross zero.
     is_up = value + size <= high and (value >= 0.0 or value - size < low)
     return size if is_up else -size

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.kalman.measured_states import track_joints
+from bench.diagnosis.kalman.measured_states import JointReadings, track_joints
 from bench.logs.quality.noise_estimation import estimate_noise
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
@@ -46,25 +46,26 @@ class JointForces(NamedTuple):
 def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
     """Return whether joint forces can be computed from the recorded positions.
 
-    All joints must be recorded, and have one coordinate each; none is coupled by an equality.
+    All joints must be recorded, and have one coordinate each. The model must have an actuator, and
+    no equality constraint, which would couple joints.
 
     Args:
         robot: model of the robot.
         recording: its recording; the channels of the first run count.
     """
     recorded = recording.runs[0].channels
-    singles = all(
+    are_recorded = all(
         joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
     )
-    return singles and not robot.compiled.neq and bool(robot.actuators)
+    return are_recorded and not robot.compiled.neq and bool(robot.actuators)
 
 
 def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
     """Compute the joint forces of a run by MuJoCo's inverse dynamics.
 
     They show whether a drive is active, without a fit. Positions, velocities and accelerations are
-    estimated from the recorded positions first. Recorded external forces are subtracted from the
-    required ones.
+    estimated from the readings first. Recorded external forces are subtracted from the required
+    ones.
 
     Args:
         robot: robot as read from its model file.
@@ -76,6 +77,7 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     """
     model = robot.compiled
     states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
+    # Positions, velocities and accelerations (T, D) of D joints.
     motion = np.transpose(states, (2, 1, 0))
     rest_motion = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
     controls, activations = _compute_controls(robot, run)
@@ -95,8 +97,8 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 
 
-def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
-    """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
+def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[JointReadings]:
+    """Return the recorded positions and velocities of each joint, with their noise.
 
     A velocity that is not recorded is NaN. Noise that is not stated is estimated.
 
@@ -111,22 +113,24 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tup
         for name in (f"q.{joint.name}", f"qd.{joint.name}"):
             values = run.channels.get(name, np.full(run.times.size, np.nan))
             columns.append(values)
-            # Zero stands for unknown noise.
+            # Noise is unknown if it is not stated, or stated as zero.
             sigma = recording.noise.get(name, 0.0)
             if not sigma > 0 and name in run.channels:
                 sigma = estimate_noise([(run.times, values)]).sigma
             noise.append(sigma if np.isfinite(sigma) and sigma > 0 else DEFAULT_SIGMA)
-        readings.append((np.stack(columns, axis=1), np.array(noise)))
+        readings.append(JointReadings(np.stack(columns, axis=1), np.array(noise)))
     return readings
 
 
 def _compute_mean_input(run: Run, name: str) -> Array:
     """Return an input (T,) at each sample: the mean of its values before and after the sample.
 
+    An input is held between samples, so that it jumps at a sample. It is returned as it is if the
+    run interpolates it linearly.
+
     Args:
         run: the run.
-        name: name of the input. It is held between samples, unless the run interpolates it
-            linearly.
+        name: name of the input.
     """
     values = run.inputs[name]
     if name in run.linear:
@@ -141,7 +145,7 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
 
     nu and na are MuJoCo's numbers of actuators and of activation states. Some actuators filter
     their control with a first-order lag; the activation is the output of this filter, stepped
-    exactly between samples.
+    exactly between samples. At the first sample it equals the control.
 
     Args:
         robot: model of the robot.
@@ -161,9 +165,9 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
             controls[:, activation_filter.actuator.control]
         )
         activation = float(clipped_controls[0])
-        for sample, decay in enumerate(
-            np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9)).tolist()
-        ):
+        # The last sample has no step after it; its decay is not used.
+        decays = np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9))
+        for sample, decay in enumerate(decays.tolist()):
             activations[sample, activation_filter.address] = activation
             activation = clipped_controls[sample] + decay * (activation - clipped_controls[sample])
     return controls, activations

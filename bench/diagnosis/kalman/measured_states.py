@@ -14,6 +14,7 @@ Positions, velocities and accelerations are estimated from the readings alone (`
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,7 +46,8 @@ def estimate_measured_states(
         run: index of the run.
 
     Returns:
-        States (T, 3) at the samples, by index of the joint.
+        Position, velocity and acceleration (T, 3) at the samples, by index of the joint. They are
+        cached in the evaluator.
     """
     if run not in evaluator.measured_states:
         evaluator.measured_states[run] = _compute_measured_states(evaluator, sigma, run)
@@ -57,8 +59,8 @@ def _compute_measured_states(
 ) -> Mapping[int, Array]:
     """Estimate the states of the joints of one run; `estimate_measured_states` caches the result.
 
-    Only joints whose position is recorded are estimated; a recorded velocity is used too. Joints
-    with fewer than three recorded positions are left out.
+    Only joints whose position is recorded, at three samples or more, are estimated; a recorded
+    velocity is used too.
 
     Args:
         evaluator: the runs.
@@ -72,16 +74,24 @@ def _compute_measured_states(
     run_data = evaluator.prepared_runs[run]
     times, observed = run_data.scenario.times, run_data.observed
     joints, readings = [], []
-    for joint, names in enumerate(zip(coordinates, rates, strict=True)):
-        if names[0] not in evaluator.channels:
+    for joint, (coordinate, rate) in enumerate(zip(coordinates, rates, strict=True)):
+        if coordinate not in evaluator.channels:
             continue
-        columns = [evaluator.channels.index(n) if n in evaluator.channels else -1 for n in names]
-        values = [observed[:, c] if c >= 0 else np.full(times.size, np.nan) for c in columns]
-        noise = [sigma[c] if c >= 0 else 1.0 for c in columns]
-        if np.isfinite(values[0]).sum() < 3:
+        position = evaluator.channels.index(coordinate)
+        if np.isfinite(observed[:, position]).sum() < 3:
             continue
+        # A velocity that is not recorded is NaN at all samples, so that its noise has no influence.
+        velocity_readings, velocity_sigma = np.full(times.size, np.nan), 1.0
+        if rate in evaluator.channels:
+            velocity = evaluator.channels.index(rate)
+            velocity_readings, velocity_sigma = observed[:, velocity], sigma[velocity]
         joints.append(joint)
-        readings.append((np.stack(values, axis=1), np.array(noise)))
+        readings.append(
+            JointReadings(
+                np.stack([observed[:, position], velocity_readings], axis=1),
+                np.array([sigma[position], velocity_sigma]),
+            )
+        )
     if not joints:
         return {}
     states = track_joints(times, readings)
@@ -91,8 +101,8 @@ def _compute_measured_states(
 def estimate_resting_position(readings: Array, sigma: float) -> float | None:
     """Estimate the position of a joint that rests at the beginning of a run.
 
-    It rests as long as the readings scatter about their mean no more than the noise does. Only the
-    first half of these readings counts, since a slow beginning of motion shows late.
+    It rests as long as the readings scatter about their mean no more than the noise does. The mean
+    is that of the first half of these readings, since a slow beginning of motion shows late.
 
     Args:
         readings: (T,) recorded positions; NaN where there are none.
@@ -102,31 +112,43 @@ def estimate_resting_position(readings: Array, sigma: float) -> float | None:
         The mean of the readings at rest; None if the joint does not rest for more than `2 *
         MIN_RESTING_READINGS` readings.
     """
-    present = readings[np.isfinite(readings)]
-    counts = np.arange(1, present.size + 1)
-    scaled = (present - present[:1]) / sigma
-    # Sums of squares about the mean of the first 1, 2, ... readings are chi-squared at rest.
+    recorded = readings[np.isfinite(readings)]
+    counts = np.arange(1, recorded.size + 1)
+    scaled = (recorded - recorded[:1]) / sigma
+    # Sums of squares about the mean of the first n = 1, 2, ... readings. At rest they are
+    # chi-squared, with mean n - 1 and standard deviation of about sqrt(2 n).
     squares = np.cumsum(scaled**2) - np.cumsum(scaled) ** 2 / counts
     moves = squares > counts - 1 + MAX_RESTING_DEVIATION * np.sqrt(2.0 * counts)
-    # One wrong reading is no motion.
+    # A single wrong reading among the first few is no motion.
     moves[: 2 * MIN_RESTING_READINGS] = False
-    resting = int(np.argmax(moves)) if moves.any() else present.size
-    if resting <= 2 * MIN_RESTING_READINGS:
+    resting_count = int(np.argmax(moves)) if moves.any() else recorded.size
+    if resting_count <= 2 * MIN_RESTING_READINGS:
         return None
-    return float(present[: resting // 2].mean())
+    return float(recorded[: resting_count // 2].mean())
 
 
-def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
+class JointReadings(NamedTuple):
+    """Readings of one joint.
+
+    Attributes:
+        values: (T, 2) positions and velocities, NaN where missing.
+        sigma: (2,) standard deviations of their noise.
+    """
+
+    values: Array
+    sigma: Array
+
+
+def track_joints(times: Array, readings: list[JointReadings]) -> list[Array]:
     """Estimate position, velocity and acceleration of joints with a Kalman filter and smoother.
 
     Each joint moves with a constant, unknown jerk between two samples, eq. (1) of the module
-    docstring. All joints are filtered with each size of the jerk in one batch, and the likeliest
-    size of each joint is used. Positions are relative to the first reading, in units of the noise.
+    docstring. All joints are filtered with each size of the jerk (`JERKS`) in one batch, and the
+    likeliest size of each joint is used.
 
     Args:
         times: (T,) times of the samples.
-        readings: for each joint, positions and velocities (T, 2), NaN where missing, and the
-            standard deviations of their noise (2,).
+        readings: readings of each joint; at least one position must be recorded.
 
     Returns:
         Positions, velocities and accelerations (T, 3) of each joint.
@@ -137,20 +159,21 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     transitions[:, 0, 1] = transitions[:, 1, 2] = steps
     transitions[:, 0, 2] = 0.5 * steps**2
     jerk_responses = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
-    values = np.stack([v for v, _ in readings])
-    # Use units of the noise, so that both channels have variance one.
-    scale = np.stack([n for _, n in readings])[:, None]
-    first_readings = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
-    residuals = values.copy()
-    residuals[:, :, 0] -= first_readings[:, None]
+    # The state is the deviation from a joint that rests at its first reading. Readings are in units
+    # of the noise, so that both channels have variance one.
+    residuals = np.stack([joint.values for joint in readings])
+    scale = np.stack([joint.sigma for joint in readings])[:, None]
+    positions = residuals[:, :, 0].copy()
+    first_positions = np.array([one[np.isfinite(one)][0] for one in positions])
+    residuals[:, :, 0] -= first_positions[:, None]
     recorded = np.isfinite(residuals)
     residuals = np.where(recorded, residuals, 0.0) / scale
     observation_matrices = np.zeros((count, samples, 2, 3))
     observation_matrices[..., 0, 0] = 1.0 / scale[..., 0]
     observation_matrices[..., 1, 1] = 1.0 / scale[..., 1]
     observation_matrices[~recorded] = 0.0
-    position_ranges = np.array(
-        [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
+    position_ranges = np.maximum(
+        np.nanmax(positions, axis=1) - np.nanmin(positions, axis=1), scale[:, 0, 0]
     )
     # The prior of position, velocity and acceleration is so wide that the readings decide. Its
     # scale is the range per second, or per duration of the run if that is shorter.
@@ -159,6 +182,7 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     prior = widths * max(float(position_ranges.max()), 1e-9)
     jerk_count = JERKS.size
     joint_indices, zeros = np.arange(count), np.zeros((count, samples - 1, 3))
+    # One "run" for each joint and size of the jerk, which acts like a missing force.
     runs = LinearRuns(
         states=np.tile(transitions, (count, 1, 1, 1)),
         defects=zeros,
@@ -170,12 +194,12 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
         prior=prior,
         jumps=zeros,
     ).subset(np.repeat(joint_indices, jerk_count))
-    force = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
-    filtered = filter_runs(runs, force, np.ones(2))
+    jerks = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
+    filtered = filter_runs(runs, jerks, np.ones(2))
     log_likelihoods = filtered.log_likelihood.reshape(count, jerk_count)
     likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joint_indices
     best_runs = runs.subset(likeliest)
-    smoothed = smooth_runs(best_runs, filtered.subset(likeliest), force[likeliest])
+    smoothed = smooth_runs(best_runs, filtered.subset(likeliest), jerks[likeliest])
     states = smoothed.states
-    states[:, :, 0] += first_readings[:, None]
+    states[:, :, 0] += first_positions[:, None]
     return list(states)

@@ -17,6 +17,7 @@ def precompile() -> None:
 
     Otherwise the first command would wait for the compiler.
     """
+    # One run of two samples, with one channel, two states and one force.
     states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
     runs = LinearRuns(
         states=states,

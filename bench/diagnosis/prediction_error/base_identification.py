@@ -203,8 +203,9 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
             continue
         tried.add(group.effect)
         theta = followed.theta.copy()
+        (solution,) = regression.solve([group]).coefficients
         theta[evaluator.coefficient_slices[group.effect]] = group_coefficients(
-            evaluator, columns.probes, group, regression.solve([group])[1][0]
+            evaluator, columns.probes, group, solution
         )
         bounds = get_bounds_by_index(evaluator, [group.effect])
         fitted = follow(theta, followed)

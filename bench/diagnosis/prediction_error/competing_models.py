@@ -236,7 +236,8 @@ def _find_competing_effects(
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
-            c = context.columns.coefficients(group, remaining.solve([group])[1][0])
+            (solution,) = remaining.solve([group]).coefficients
+            c = context.columns.coefficients(group, solution)
             competing_effects[effect] = _CompetingEffect(effect, c, loss)
     c = model.fit.theta[evaluator.coefficient_slices[name]]
     for effect in list_similar_shifts(evaluator, name):

@@ -135,7 +135,8 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     if not friction_groups:
         return None
     best_group = groups[friction_groups[0]]
-    (coefficient,) = columns.coefficients(best_group, regression.solve([best_group])[1][0])
+    (solution,) = regression.solve([best_group]).coefficients
+    (coefficient,) = columns.coefficients(best_group, solution)
     return context.filters.find_soft_friction(
         best_group.effect, float(np.copysign(1.0, coefficient))
     )

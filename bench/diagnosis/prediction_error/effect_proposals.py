@@ -201,7 +201,7 @@ class EffectProposals:
             too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
             if len(proposals) == MAX_SIMULATED_PROPOSALS or too_little:
                 break
-            solution = regression.solve([group])[1][0]
+            (solution,) = regression.solve([group]).coefficients
             proposals[group.effect] = self.columns.coefficients(group, solution)
         return proposals
 

@@ -35,7 +35,7 @@ EFFECTS_AT_SEVERAL_JOINTS = frozenset({"joint.axis", "joint.coupling", "joint.ze
 
 
 def get_joint_name(evaluator: RunEvaluator, joint: int) -> str:
-    """Return the name of a joint.
+    """Return the name of a joint, that of its coordinate ``q.NAME`` without the prefix.
 
     Args:
         evaluator: the runs.
@@ -46,7 +46,7 @@ def get_joint_name(evaluator: RunEvaluator, joint: int) -> str:
 
 
 def get_servo_input(evaluator: RunEvaluator, joint: int) -> str:
-    """Return the input of the position servo of a joint; empty if it has none.
+    """Return the name of the input of a joint's position servo, such as ``u.elbow``; empty if none.
 
     Args:
         evaluator: the runs.
@@ -64,6 +64,7 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
         joints: indices of the joints.
     """
     names = {get_joint_name(evaluator, joint) for joint in joints}
+    # Effects at sensors have no coordinate, but a signal such as ``q.elbow``.
     return any(
         member.coordinate in joints or member.signal.partition(".")[2] in names
         for member in members_of(evaluator.available_effects[name])
@@ -77,15 +78,17 @@ def _list_joints(evaluator: RunEvaluator, name: str) -> set[int]:
 
 
 def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
-    """Return the single joint at which an effect changes the generalised force.
+    """Return the index of the single joint at which an effect changes the generalised force.
+
+    The result is None for
+
+    - effects at bodies (without a coordinate) and at sensors;
+    - families, which act at every place, and effects that change forces at other joints as well;
+    - joints in series with others, and joints of a kinematic loop.
 
     Args:
         evaluator: the runs.
         name: name of the effect.
-
-    Returns:
-        Index of the joint; None for effects at bodies and sensors, and of families, series joints
-        and joints of a kinematic loop, which change the forces at other joints as well.
     """
     member, *others = members_of(evaluator.available_effects[name])
     if (
@@ -109,7 +112,7 @@ def _list_coupled_joints(evaluator: RunEvaluator) -> list[set[int]]:
 
 
 def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
-    """Return the effects of the joint and servo models at the joint where an effect acts.
+    """Return the effects of the joint and servo models at the joints where an effect acts.
 
     These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
     often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
@@ -134,9 +137,10 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
 def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
     """Return the delays and lags that may change the readings as a given delay or lag does.
 
-    A command that comes late changes the readings nearly as sensors that read late do. Similar are
-    delays and lags at the same joint, and those at all places. An effect that has a single place,
-    as the command of a robot with one drive, is similar to both.
+    A command that comes late changes the readings nearly as sensors that read late do. Similar to
+    an effect at a joint are those at the same joint, and to one at all places (``@*``) those at all
+    places. An effect that exists at a single place only, as the command of a robot with one drive,
+    is similar to both.
 
     Args:
         evaluator: the runs.
@@ -147,6 +151,7 @@ def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
     joints = _list_joints(evaluator, name)
 
     def has_one_place(effect: str) -> bool:
+        """Return whether the effect has no family ``@*``, because it has a single place."""
         return f"{effect.partition('@')[0]}@*" not in evaluator.library
 
     return [
@@ -169,7 +174,7 @@ def is_time_shift(effect: Effect) -> bool:
 
 
 def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:
-    """Return the joints that move a body against the body before it.
+    """Return the indices of the joints that move a body against its parent body.
 
     The inertia of such a body and the armature of its joint may have the same effect.
 
@@ -179,16 +184,16 @@ def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:
     """
     assert isinstance(evaluator.simulator, RobotSimulator)
     model = evaluator.simulator.robot.compiled
-    owners = [
+    moved_bodies = [
         model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]
     ]
-    return {joint for joint, owner in enumerate(owners) if owner == body}
+    return {joint for joint, moved_body in enumerate(moved_bodies) if moved_body == body}
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     """Return the names of an effect at the other joints of its kinematic loop.
 
-    It may act equivalently there, because a filter gives little information on unmeasured joints.
+    It may act equivalently there: the joints of a loop move together, and some are not measured.
 
     Args:
         evaluator: the runs.

@@ -53,13 +53,15 @@ LINEARISATION_ERROR = 0.03
 
 
 def compute_comparison_margin(gain: float) -> float:
-    """Return the maximum distance from a set at which simulation decides between two sets.
+    """Return by how much a set may be less likely than the best one and still be simulated.
+
+    A filter is linear, so simulation decides between sets that are this close.
 
     Args:
-        gain: gain of the set over the base model.
+        gain: gain of the best set over the base model.
 
     Returns:
-        The distance, like the gain, in twice the log-likelihood.
+        The difference, like the gain, in twice the log-likelihood.
     """
     return COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * gain
 
@@ -118,7 +120,7 @@ class ModelFilters:
         return theta
 
     def make_theta_with(self, name: str, coefficients: Array) -> Array:
-        """Return parameters (P,) with one effect.
+        """Return the reference parameters (P,) with the coefficients of one effect replaced.
 
         Args:
             name: name of the effect.
@@ -155,11 +157,14 @@ class ModelFilters:
     def act_where_forces_are_missing(self, names: Iterable[str]) -> bool:
         """Return whether effects act at all joints at which the base model misses a force.
 
-        If a force is missing at two joints, friction at one of them explains nothing alone.
+        If a force is missing at two joints, friction at one of them explains nothing alone. An
+        effect that does not change the force of a single joint only, such as a payload, is taken to
+        act at all joints.
 
         Args:
             names: names of the effects.
         """
+        # None for an effect at several joints.
         joints = [get_only_joint(self.evaluator, name) for name in names]
         return None in joints or self._joints_missing_force <= set(joints)
 
@@ -172,7 +177,7 @@ class ModelFilters:
         """Return the Kalman filter of the runs with a fitted model; it is cached.
 
         The filter starts from the newest one with the same effects, or from that of the base model,
-        about whose smoothed motion the model is linearised. A first filter with these effects is
+        about whose smoothed motion the model is linearised. The first filter with these effects is
         linearised once more, about its own motion with the same Jacobians. The share `numerics` of
         the integrator's step errors is subtracted from the defects of the steps (by how much a step
         of the model misses the next state), so that they are not taken for a missing force.
@@ -223,7 +228,8 @@ class ModelFilters:
     def _follow_about_base(self, theta: Array) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about the motion of the base model.
 
-        The newest filter is kept, because a model that is likelier than the base model is refined.
+        The newest filter is kept, because a model that is likelier than the base model is asked for
+        again at once, to be refined.
         """
         if self._newest is None or not np.array_equal(self._newest.theta, theta):
             self._newest = self.base.with_parameters(theta)
@@ -260,26 +266,32 @@ class ModelFilters:
         return FilteredSet(followed, current.names)
 
     def _follow_near(self, theta: Array, neighbour: FollowedRuns) -> FollowedRuns:
-        """Follow the runs with other parameters, linearised about a known motion.
+        """Follow the runs with other parameters, linearised about the motion of a known filter.
+
+        If the new filter smooths the motion far away from that one, the model is linearised once
+        more, about the new motion.
 
         Args:
             theta: (P,) parameters.
-            neighbour: a filter with similar parameters, whose motion is the operating point.
+            neighbour: a filter with similar parameters, whose smoothed motion is used.
         """
         is_base = neighbour is self.base
         followed = self._follow_about_base(theta) if is_base else neighbour.with_parameters(theta)
         deviations = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
-        # With an encoder offset, the true motion is far from the readings.
+        # This happens with an encoder offset: the true motion is far from the readings.
         is_far = deviations.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
         return followed.with_parameters(theta) if is_far else followed
 
     def estimate_first_states(self, followed: FollowedRuns) -> Array:
         """Return states at the first samples (R, s) of the R runs, estimated from the readings.
 
-        They are the guesses of the evaluator. A position is replaced by the smoothed one of the
-        filter where this differs by far more than noise, because an encoder offset is then in the
-        readings. The states of the base fit are not used, because they are biased by the effects
-        that it lacks.
+        They are the guesses of the evaluator. A position that is not known exactly is replaced by
+        the smoothed one of the filter where this differs by far more than noise, because an encoder
+        offset is then in the readings. The states of the base fit are not used, because they are
+        biased by the effects that it lacks.
+
+        Args:
+            followed: the runs, followed by a filter.
         """
         states = self.evaluator.initial_state_guesses.copy()
         positions = followed.get_first_positions()
@@ -295,14 +307,19 @@ class ModelFilters:
         return states
 
     def estimate_start(self, start: FitStart) -> FitStart:
-        """Return a start with the first states of its own model, and derivatives by them.
+        """Return a start with first states for its parameters, and derivatives by these states.
 
         For a robot on the ground, another radius or mass has contacts of another depth, and the
-        derivatives depend on which contacts are closed. Coefficients and first states are improved
-        in turn, because a joint fit leaves the states with settled contacts, and stops there.
+        derivatives depend on which contacts are closed. First states are estimated by a filter with
+        the start's parameters, then coefficients, then states again. A fit of both together would
+        leave the states in which contacts are in equilibrium, and stop there. The improved
+        coefficients and states are used if their residual is smaller.
 
         Args:
             start: start of a fit.
+
+        Returns:
+            The start; the given one for elastic joints, or if the filter diverges.
         """
         # Elastic joints have states that no reading shows; their fits begin as given.
         if has_series(self.evaluator, start.effects):
@@ -326,7 +343,11 @@ class ModelFilters:
         )
 
     def penalty(self, name: str) -> float:
-        """Return the minimum gain of an effect in twice the log-likelihood."""
+        """Return the minimum gain of an effect with k coefficients in twice the log-likelihood.
+
+        It is the penalty of the search for k parameters, plus 2 log M for the best of the M effects
+        of the library.
+        """
         count = len(self.evaluator.get_coefficient_indices(name))
         return float(
             count * self.models.parameter_penalty + 2.0 * np.log(len(self.evaluator.library))
@@ -340,10 +361,11 @@ class ModelFilters:
     def find_soft_friction(self, name: str, sign: float) -> FitStart | None:
         """Return the likeliest model of dry friction in MuJoCo's soft form, by filters.
 
-        The likelihood has one maximum over the force, which is searched from the middle.
+        The likelihood has one maximum over the force, which is searched from the middle of a few
+        forces. The result is cached.
 
         Args:
-            name: dry friction at a joint.
+            name: name of the effect: dry friction at a joint.
             sign: 1 for more friction than in the model file, -1 for less.
 
         Returns:
@@ -375,6 +397,7 @@ class ModelFilters:
         followed: dict[int, FollowedRuns] = {}
 
         def log_likelihood(number: int) -> float:
+            """Return the log-likelihood of a model; its filter is made when it is needed."""
             if number not in followed:
                 # Jacobians depend little on the force.
                 similar = next(iter(followed.values()), None)

@@ -281,13 +281,13 @@ def _add_next_effect(
     best = regression.groups[int(np.argmax(gains))]
     if not gains.max() > 0.0 or not regression.generalises([], [best]):
         return None
-    name, (solution,) = best.effect, regression.solve([best])[1]
+    (solution,) = regression.solve([best]).coefficients
     coefficients = group_coefficients(evaluator, columns.probes, best, solution)
     present_start = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
-    start = add_effect_to_start(evaluator, present_start, name, coefficients)
+    start = add_effect_to_start(evaluator, present_start, best.effect, coefficients)
     larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
-    return larger if gain > _compute_min_gain(context, larger, name) else None
+    return larger if gain > _compute_min_gain(context, larger, best.effect) else None
 
 
 def _list_single_effects(context: SearchContext) -> Columns:

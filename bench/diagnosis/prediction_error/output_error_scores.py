@@ -104,7 +104,7 @@ class OutputErrorScores:
             if net_gains[i] <= 0.0 or len(starts) == MAX_SIMULATED:
                 break
             if group.effect not in starts:
-                coefficients = regression.solve([group])[1]
+                coefficients = regression.solve([group]).coefficients
                 starts[group.effect] = self.context.columns.start([group], coefficients)
         costs = [self.simulations.compute_cost(start.theta) for start in starts.values()]
         ordered = list(starts.values())

@@ -36,6 +36,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,16 +76,29 @@ SMALLEST_RSS = 1e-9
 """Minimum residual sum of squares, as a share of the sum of squares of the innovations."""
 
 
+class LeastSquaresFit(NamedTuple):
+    """Fit of a set of groups of columns.
+
+    Attributes:
+        rss: residual sum of squares.
+        coefficients: coefficients of each group, one for each of its columns.
+    """
+
+    rss: float
+    coefficients: list[Array]
+
+
 @dataclass
 class Regression:
     """Regression of innovations on responses.
 
     Attributes:
-        groups: columns that act together; a set has at most one group of each effect.
+        groups: columns that act together: one shape of an effect, with a column for each of its
+            coefficients. A set has at most one group of each effect.
         products: G, h and eᵀ e of each run.
         count: N.
-        contains: effects that each effect contains, by name.
-        always: columns that are part of every set and belong to no effect.
+        contains: effects that each effect contains as special cases, by name.
+        always: columns that are part of every set and belong to no effect ("nuisance").
         only_proposed: columns of single effects that are not selected together with others.
     """
 
@@ -119,46 +133,48 @@ class Regression:
     def nuisance(self, chosen: Sequence[DirectionGroup]) -> float:
         """Return the coefficient of the first column of `always`, fitted together with a set."""
         _, parts = self._fit_groups([*chosen, self._nuisance])
+        # The nuisance group is the last one; its first column is meant.
         return float(parts[-1][0]) if self.always else 0.0
 
     def make_regression_without(self, own_columns: Sequence[int]) -> Regression:
-        """Return the regression without an effect that is in the model.
+        """Return the regression of the innovations that a model without one of its effects has.
 
         Args:
-            own_columns: columns of the effect, which are part of every set; the first one is its
-                whole change.
+            own_columns: columns of the effect, which are part of every set; the first one is the
+                response w to the effect as it is in the model.
         """
         whole, always = own_columns[0], tuple(c for c in self.always if c not in own_columns)
-        # Innovations without the effect: e + w of its whole change.
+        # The effect has removed w from the innovations e, so they are e + w without it.
         return replace(self, products=self.products.add_to_innovations(whole), always=always)
 
     def compute_gain(self, own: Sequence[int]) -> float:
         """Return the gain of columns in twice the log-likelihood, with any signs."""
         group = DirectionGroup("", tuple(own), (False,) * len(own))
-        return self.compute_log_ratio(self.solve([])[0], self.solve([group])[0])
+        return self.compute_log_ratio(self.solve([]).rss, self.solve([group]).rss)
 
     def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
         """Return whether the data show the first column of `always`, in addition to a set.
 
-        That column is the discretisation error of the integrator. Its coefficient must be nearer to
-        one (the full error) than to zero, and it must improve the fit.
+        That column is the response to the integrator's step errors. Its coefficient must be nearer
+        to one (the full error) than to zero, and it must improve the fit.
         """
-        with_it, parts = self._fit_groups([*chosen, self._nuisance])
         others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
-        without, _ = self._fit_groups([*chosen, others])
+        rss_with, coefficients = self._fit_groups([*chosen, self._nuisance])
+        rss_without = self._fit_groups([*chosen, others]).rss
+        # The nuisance group is the last one; its first column is meant.
         return (
-            float(parts[-1][0]) > 0.5
-            and self.compute_log_ratio(without, with_it) > MIN_VISIBLE_GAIN
+            float(coefficients[-1][0]) > 0.5
+            and self.compute_log_ratio(rss_without, rss_with) > MIN_VISIBLE_GAIN
         )
 
-    def solve(self, chosen: Sequence[DirectionGroup]) -> tuple[float, list[Array]]:
-        """Fit a set of groups, and return the residual sum of squares and all coefficients."""
-        rss, parts = self._fit_groups([*chosen, self._nuisance])
-        return rss, parts[:-1]
+    def solve(self, chosen: Sequence[DirectionGroup]) -> LeastSquaresFit:
+        """Fit a set of groups together with `always`, whose coefficients are left out."""
+        rss, coefficients = self._fit_groups([*chosen, self._nuisance])
+        return LeastSquaresFit(rss, coefficients[:-1])
 
     def _fit_groups(
         self, chosen: Sequence[DirectionGroup], left_out: int | None = None
-    ) -> tuple[float, list[Array]]:
+    ) -> LeastSquaresFit:
         """Fit a set of groups by least squares, with some coefficients that must be nonnegative.
 
         Constrained coefficients that are negative are fixed at zero one by one, the most negative
@@ -166,10 +182,8 @@ class Regression:
 
         Args:
             chosen: the groups.
-            left_out: run that is not fitted; None to fit all runs.
-
-        Returns:
-            The residual sum of squares, and the coefficients of each group.
+            left_out: run that is not fitted; None to fit all runs. The residual sum of squares is
+                valid for all runs only.
         """
         columns = list_columns(chosen)
         positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
@@ -190,13 +204,13 @@ class Regression:
             active[negative[np.argmin(sizes)]] = False
             solution[:] = 0.0
         explained_squares = float(solution @ cross)
-        # The formula also holds for a solution with some coefficients fixed at zero.
+        # rss = e'e - c'h, eq. (1), also holds for coefficients c some of which are fixed at zero.
         rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
         parts, begin = [], 0
         for group in chosen:
             parts.append(solution[begin : begin + len(group.column_indices)].copy())
             begin += len(group.column_indices)
-        return rss, parts
+        return LeastSquaresFit(rss, parts)
 
     def compute_log_ratio(self, before: float, after: float) -> float:
         """Return twice the gain in log-likelihood, N log(before / after).
@@ -225,27 +239,30 @@ class Regression:
     def gains(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the gain (n,) in twice the log-likelihood of each group in addition to a set.
 
-        The columns of the set are projected out of the others first, so that all n groups are
-        fitted at once without solving for the set again. Groups that are collinear with the set, or
-        that the set contains, gain nothing.
+        The columns of the set are projected out of the others first (Schur complement), so that all
+        n groups are fitted at once without solving for the set again. Groups that are collinear
+        with the set, and those of effects that the set contains, gain nothing.
 
         Args:
             chosen: groups of the set; empty for gains over the model itself.
         """
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
-        squares, cross, (rss, _) = self._squares, self._cross, self.solve(chosen)
+        rss = self.solve(chosen).rss
+        # Products (c, K) of the c columns of the set, scaled to unit length, with all K columns.
         rows = self.products.select_rows(columns)
         normal, scale = _normalise_gram(rows[:, columns])
         rows = rows / scale[:, None]
-        solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
-        squares = squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
-        cross = cross - rows.T @ solved[:, -1]
+        # Coefficients of the set that explain each column and, in the last column, the innovations.
+        solved = np.linalg.solve(normal, np.c_[rows, self._cross[columns] / scale])
+        squares = self._squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
+        cross = self._cross - rows.T @ solved[:, -1]
         # Almost nothing of a collinear column remains after the projection.
         remains = squares > COLLINEARITY_TOLERANCE * self._squares
         contained_effects = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
         cross = np.where(remains, cross, 0.0)
+        # A batch has groups with the same number of columns.
         for batch, products in zip(self._batches, self._products_within_groups, strict=True):
             projected = np.einsum("cgi,cgj->gij", rows[:, batch.columns], solved[:, batch.columns])
             kept = remains[batch.columns]
@@ -275,14 +292,16 @@ class Regression:
     def select(self, max_groups: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
         """Select effects by forward and backward steps.
 
-        The effect with the largest gain above its price, the right side of (2) of the module
-        docstring, is added; then effects that no longer gain their price are removed. The selection
-        ends when no effect gains its price, when the best one does not predict left-out runs
-        better, or when it is removed again at once.
+        The effect whose gain exceeds its minimum gain (`price`) most is added; then effects that no
+        longer gain their price are removed. The selection ends when no effect gains its price, when
+        the best one does not predict left-out runs better, or when it is removed again at once.
 
         Args:
             max_groups: maximum number of effects.
             begin: initial set.
+
+        Returns:
+            The set: groups of columns, one for each effect.
         """
         chosen = list(begin)
         while len(chosen) < max_groups:
@@ -313,11 +332,12 @@ class Regression:
             smaller: the smaller set.
             larger: the larger set.
         """
+        # A single run cannot be left out.
         if len(self.products.totals) < 2:
             return True
         if self._compute_left_out_gain(smaller, larger) > MIN_LEFT_OUT_GAIN:
             return True
-        gain = self.compute_log_ratio(self.solve(smaller)[0], self.solve(larger)[0])
+        gain = self.compute_log_ratio(self.solve(smaller).rss, self.solve(larger).rss)
         shrunk_gain = self._compute_left_out_gain(smaller, larger, is_shrunk=True)
         return shrunk_gain > max(MIN_LEFT_OUT_GAIN, MIN_SHRUNK_GAIN_SHARE * gain)
 
@@ -349,10 +369,10 @@ class Regression:
     ) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs.
 
-        The products of eq. (1) of a run are subtracted from those of all runs, which gives the fit
-        without that run: rss = e'e - 2 c'h + c'G c with the products G, h of the run and
-        coefficients c of the others. Shrunk coefficients are those of a fit in which the left-out
-        run stays, but with zero innovations: those that it mainly determines become small.
+        With the products G = W'W and h = W'e of the left-out run, and coefficients c that are
+        fitted to the other runs, rss = e'e - 2 c'h + c'G c. Shrunk coefficients are those of a fit
+        in which the left-out run stays, but with zero innovations: those that it mainly determines
+        become small.
 
         Args:
             chosen: the groups.
@@ -363,8 +383,7 @@ class Regression:
         columns = list_columns(groups)
         grams = self.products.select(columns)
         for run, total in enumerate(self.products.totals):
-            _, parts = self._fit_groups(groups, left_out=run)
-            coefficients = np.concatenate(parts) if parts else np.zeros(0)
+            coefficients = np.concatenate(self._fit_groups(groups, left_out=run).coefficients)
             used = coefficients != 0
             if is_shrunk and used.any():
                 normal, scale = _normalise_gram(grams[:, used][:, :, used].sum(axis=0))
@@ -379,19 +398,22 @@ class Regression:
         return np.array(residual_squares)
 
     def prune(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
-        """Remove effects one by one whose gain is below their price, the right side of (2).
+        """Remove effects one by one whose gain is below their minimum gain (`price`).
 
         The gain of an effect is the loss in twice the log-likelihood without it. The effect with
         the smallest gain minus price is removed first, and the gains of the others are computed
         again.
+
+        Args:
+            chosen: the set, with one group of columns for each effect.
         """
         remaining = list(chosen)
         while remaining:
-            rss, _ = self.solve(remaining)
+            rss = self.solve(remaining).rss
             net_gains = []
             for group in remaining:
                 others = [other for other in remaining if other is not group]
-                rss_without = self.solve(others)[0]
+                rss_without = self.solve(others).rss
                 net_gains.append(self.compute_log_ratio(rss_without, rss) - self.price(group))
             weakest = int(np.argmin(net_gains))
             if net_gains[weakest] > 0:
@@ -447,6 +469,9 @@ NULL_DRAWS = 200
 def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
     """Return the p-value of the largest gain among several candidates.
 
+    The gain of each has a chi-squared law; the p-value is multiplied by the number of candidates
+    (Bonferroni correction).
+
     Args:
         gain: gain in twice the log-likelihood.
         coefficients: number of coefficients of each candidate.
@@ -468,17 +493,20 @@ def score_by_regression(
         regression: regression about the model that lacks the effects.
         names: names of the effects to score; those without a column in the regression are left out.
         rng: random numbers for draws from the null distribution.
+
+    Returns:
+        The scores of the effects, the highest first.
     """
     gains = regression.gains([])
     by_effect: dict[str, list[int]] = {}
     for i, group in enumerate(regression.groups):
         if group.effect in names:
             by_effect.setdefault(group.effect, []).append(i)
+    # An effect has one group of columns for each of its shapes.
     names = list(by_effect)
     score = np.array([max(gains[i] for i in by_effect[name]) for name in names])
     null_quantiles, null_draws, p_values, peaks = [], [], [], []
-    for name, largest_gain in zip(names, score.tolist(), strict=True):
-        group_indices = by_effect[name]
+    for group_indices, largest_gain in zip(by_effect.values(), score.tolist(), strict=True):
         degrees_of_freedom = max(len(regression.groups[i].column_indices) for i in group_indices)
         shapes = len(group_indices)
         null_quantiles.append(
@@ -490,7 +518,9 @@ def score_by_regression(
         )
         p_values.append(compute_p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
         peak: DirectionGroup = regression.groups[max(group_indices, key=lambda i: gains[i])]
-        peaks.append(((peak, regression.solve([peak])[1][0]),))
+        (peak_coefficients,) = regression.solve([peak]).coefficients
+        # `CandidateScores` may have several peaks of an effect; here there is one.
+        peaks.append(((peak, peak_coefficients),))
     order = np.argsort(-score, kind="stable")
     quantiles = np.array(null_quantiles)
     null_excesses = np.array(null_draws).reshape(len(names), NULL_DRAWS) - quantiles[:, None]
@@ -567,6 +597,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     refitted, selected_before = followed, list[DirectionGroup]()
     coefficients: list[Array] = []
     result: Selected | None = None
+    # Share of the integrator's step errors in the linear model.
     numerics = 0.0
     for _ in range(MAX_REGRESSIONS):
         regression = first or regress(refitted, [columns], selected_before, coefficients, numerics)
@@ -574,7 +605,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
         # Drop effects that are not needed any more, and add others.
         selected = regression.prune(selected_before) if selected_before else []
         selected = regression.select(MAX_SET_SIZE, selected)
-        _, new_coefficients = regression.solve(selected)
+        new_coefficients = regression.solve(selected).coefficients
         numerics = regression.nuisance(selected)
         refitted = follow_linear_with_effects(
             followed, columns, selected, new_coefficients, numerics
@@ -608,10 +639,10 @@ def regress(
 ) -> Regression:
     """Set up the regression of all that effects explain, including those in the linear model.
 
-    The innovations of the filter are what the chosen effects do not explain. Their responses, and
-    the share `numerics` of the response to the integrator's step errors, are added to the
-    innovations. So all effects compete on equal terms. The last column is the response to the step
-    errors.
+    The innovations of the filter are what the chosen effects do not explain. The responses to these
+    effects, and the share `numerics` of the response to the integrator's step errors, are added to
+    the innovations. So all effects compete on equal terms. The last column is the response to the
+    step errors; it is part of every set.
 
     Args:
         followed: the runs, filtered with the chosen effects in the linear model.
@@ -631,6 +662,7 @@ def regress(
     )
     run_count, _, _, count = responses.shape
     rows = responses.reshape(run_count, -1, count)
+    # Coefficients of the columns that are in the linear model.
     weights = np.zeros(count)
     weights[list_columns(chosen)] = np.concatenate([*coefficients, np.zeros(0)])
     weights[-1] = numerics
@@ -655,7 +687,10 @@ def follow_linear_with_effects(
     coefficients: Sequence[Array],
     numerics: float,
 ) -> FollowedRuns:
-    """Subtract the forces and readings of effects from the runs, and fit the process noise again.
+    """Put effects into the linear models of the runs, and fit the process noise again.
+
+    Their forces are subtracted from the defects (by how much a step misses the next state), and
+    their changes of the readings from the residuals.
 
     Args:
         followed: the runs, without any effect.

@@ -89,6 +89,7 @@ class GramMatrices:
             column: index of the column w; the new innovations are e + w.
         """
         row = self.grams[:, column]
+        # (e + w)'(e + w) = e'e + 2 w'e + w'w
         totals = self.totals + 2.0 * self.crosses[:, column] + row[:, column]
         return GramMatrices(self.grams, self.crosses + row, totals)
 
@@ -129,9 +130,12 @@ class ResponseProducts:
                 yield run, samples, responses[samples].astype(np.float64)
 
     def select_rows(self, columns: IndexArray) -> Array:
-        """Return the products (c, K) of c columns with all columns, summed over all runs.
+        """Return the products (c, K) of c columns with all K columns, summed over all runs.
 
         Known products are reused, because a selection adds one group of columns after another.
+
+        Args:
+            columns: (c,) indices of the columns.
         """
         new_columns = [c for c in dict.fromkeys(columns.tolist()) if c not in self._known_rows]
         if new_columns:
@@ -153,9 +157,14 @@ class ResponseProducts:
         return np.array(products)
 
     def sum_within(self, groups: IndexArray) -> Array:
-        """Return the products (n, k, k) within n groups of k columns, summed over all runs."""
+        """Return the products (n, k, k) within n groups of k columns, summed over all runs.
+
+        Args:
+            groups: (n, k) indices of the columns of each group.
+        """
         group_count, size = groups.shape
         result = np.zeros((group_count, size, size))
+        # The sums of squares are known.
         if size == 1:
             result[:, 0, 0] = self.squares.sum(axis=0)[groups[:, 0]]
             return result
@@ -164,8 +173,9 @@ class ResponseProducts:
             for i in range(size):
                 for j in range(i, size):
                     result[:, i, j] += np.einsum("sn,sn->n", members[i], members[j])
-        lower = np.tril_indices(size, -1)
-        result[:, lower[0], lower[1]] = result[:, lower[1], lower[0]]
+        # The products are symmetric.
+        rows, columns = np.tril_indices(size, -1)
+        result[:, rows, columns] = result[:, columns, rows]
         return result
 
     def add_to_innovations(self, column: int) -> ResponseProducts:
@@ -179,5 +189,6 @@ class ResponseProducts:
             for responses, e in zip(self._responses, self._innovations, strict=True)
         ]
         products = ResponseProducts(self._responses, innovations)
+        # Products of columns with columns do not depend on the innovations.
         products._known_rows = self._known_rows
         return products

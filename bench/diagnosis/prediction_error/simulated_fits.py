@@ -417,7 +417,7 @@ def drop_surplus_effects(
         if is_slow or count > kept_count + MAX_SURPLUS:
             break
         groups = selected.groups[:count]
-        coefficients = selected.regression.solve(groups)[1]
+        coefficients = selected.regression.solve(groups).coefficients
         theta = context.columns.start(groups, coefficients).theta
         gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
         penalty = sum(filters.penalty(group.effect) for group in groups)
