@@ -70,12 +70,13 @@ class _CompetingEffect(NamedTuple):
 
     Attributes:
         effect: its name.
-        c: (k,) its coefficients from the regression.
-        loss: loss in twice the log-likelihood; infinite if it is not computed.
+        coefficients: (k,) its coefficients from the regression.
+        loss: loss in twice the log-likelihood by the replacement, from the regression; infinite if
+            it is not computed.
     """
 
     effect: str
-    c: Array
+    coefficients: Array
     loss: float
 
 
@@ -86,7 +87,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     few. If a model with several effects explains the runs, or nearly, it is compared with the best
     single effect and its competitors, and the model with the higher penalised log-likelihood is
     returned. The single effect comes from the fits of all proposed effects by simulation; if they
-    were not all fitted, from filters.
+    were not all fitted, from filters. If it is far worse, its competitors are not fitted.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -129,10 +130,10 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 
-    Each effect of the best model is replaced in turn by the effects that a regression, and a filter
-    if the regression is not certain, finds nearly as good. The effects are also moved to other
-    joints of their kinematic loop, and payloads to neighbouring bodies. Models that remain close to
-    the best are fitted to convergence.
+    Each effect of the best model is replaced in turn by the effects that a regression finds nearly
+    as good; where the regression is not certain, a filter or simulations confirm it. The effects
+    are also moved to other joints of their kinematic loop, and payloads to neighbouring bodies.
+    Models that remain close to the best are fitted to convergence.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -151,7 +152,7 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
         for competing_effect in _find_competing_effects(context, best, name):
             competing_effects.add(competing_effect.effect)
             start = make_replacing_start(
-                evaluator, best, [name], competing_effect.effect, competing_effect.c
+                evaluator, best, [name], competing_effect.effect, competing_effect.coefficients
             )
             if frozenset(start.effects) in search.models:
                 continue
@@ -180,7 +181,8 @@ def _refine_at_force_limits(
     """Fit single effects of the joint and servo models further, if they may reach the best model.
 
     Fits at force limits may stop in local minima. A fit that leaves much of the base model's excess
-    residual where the best model leaves only noise is not such a case.
+    residual where the best model leaves only noise is not such a case. The results are stored in
+    `search.models`.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -208,9 +210,12 @@ def _find_competing_effects(
 
     The regression is about the fitted model without the given effect, so that its gain and that of
     every other effect are comparable. Compared are gains in twice the log-likelihood minus the
-    penalty of the effect. An effect of the joint or servo model at the same joint may be much
-    worse, because the linear regression is inaccurate for large effects. In place of a delay or a
-    lag, similar ones are always compared, with the same coefficient.
+    penalty of the effect. The result contains
+
+    - at most `MAX_COMPETING_EFFECTS` effects whose gain is nearly as large;
+    - effects of the joint or servo model at the same joint that gain much less, because the linear
+      regression is inaccurate for large effects;
+    - in place of a delay or a lag, all similar ones, with the same coefficient.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -225,6 +230,7 @@ def _find_competing_effects(
     own_gain = remaining.compute_gain(columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
+    # In descending order of the gain, so the first group of an effect is its best shape.
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
         effect, loss = group.effect, own_gain - float(gains[i])
@@ -237,43 +243,47 @@ def _find_competing_effects(
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
             (solution,) = remaining.solve([group]).coefficients
-            c = context.columns.coefficients(group, solution)
-            competing_effects[effect] = _CompetingEffect(effect, c, loss)
-    c = model.fit.theta[evaluator.coefficient_slices[name]]
+            coefficients = context.columns.coefficients(group, solution)
+            competing_effects[effect] = _CompetingEffect(effect, coefficients, loss)
+    coefficients = model.fit.theta[evaluator.coefficient_slices[name]]
     for effect in list_similar_shifts(evaluator, name):
         if effect not in model.effects:
-            competing_effects[effect] = _CompetingEffect(effect, c, np.inf)
+            competing_effects[effect] = _CompetingEffect(effect, coefficients, np.inf)
     return list(competing_effects.values())
 
 
 def _confirm(
     context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
-    """Return a start with a competing model that may be as good as the best one, else None.
+    """Return the start of a competing model if it may be as good as the best one, else None.
 
-    - The start is returned at once if the regression puts the competing model within
-      `COMPETING_MODEL_MARGIN` of the best one. So is a payload, whose response is far from linear
-      in its place.
-    - Simulations decide about delays and lags, because a filter does not follow late readings; and
-      about an effect with one coefficient if the best model explains the runs, because they are
+    The regression that proposes the model is linear. So further tests decide, unless its loss of
+    likelihood is small:
+
+    - Loss within `COMPETING_MODEL_MARGIN`, or a payload, whose response is far from linear in its
+      place: the start is returned as it is, without a test.
+    - Delay or lag: simulations decide, because a filter does not follow late readings.
+    - One coefficient, and the best model explains the runs: simulations decide, because they are
       faster and show more then.
-    - A filter decides about all others.
+    - All others: a filter decides.
 
     Args:
         context: search, filters and regressions of the recording.
         best: the best model.
         competing_effect: the effect that replaces one of its effects, with its loss in the
             regression.
-        start: the competing model, with the coefficients from the regression.
+        start: start of a fit of the competing model, with the coefficients from the regression.
 
     Returns:
-        The start, with improved coefficients; None if the competing model is far worse.
+        The start, with coefficients that the test improved; None if the competing model is far
+        worse.
     """
     is_payload = competing_effect.effect.startswith("payload@")
     if competing_effect.loss <= COMPETING_MODEL_MARGIN or is_payload:
         return start
     effect = context.evaluator.available_effects[competing_effect.effect]
-    if is_time_shift(effect) or (competing_effect.c.size == 1 and is_explained(context, best)):
+    has_one_coefficient = competing_effect.coefficients.size == 1
+    if is_time_shift(effect) or (has_one_coefficient and is_explained(context, best)):
         return _confirm_by_simulation(context, best, competing_effect, start)
     return _confirm_by_filter(context, best, competing_effect, start)
 
@@ -281,10 +291,15 @@ def _confirm(
 def _confirm_by_simulation(
     context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
-    """Return a competing model with the best of several simulated coefficients.
+    """Return the start of a competing model with the best of several simulated coefficients.
 
-    Arguments are those of `_confirm`. None is returned if even the lowest cost leaves much of the
-    residual of the base model.
+    None is returned if its cost exceeds that of the best model by much of that of the base model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+        competing_effect: the effect, with one coefficient, that replaces one of its effects.
+        start: start of a fit of the competing model; its coefficient is scaled.
     """
     starts = [
         scale_effect(context, start, competing_effect.effect, factor)
@@ -298,13 +313,20 @@ def _confirm_by_simulation(
 def _confirm_by_filter(
     context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
-    """Return a start with a competing model that a filter confirms, else None.
+    """Return the start of a competing model that a filter confirms, else None.
 
-    A filter with the effect in its model improves the coefficients, and its log-likelihood must
-    come close to that of the best model. Arguments are those of `_confirm`.
+    A filter with the effect in its model improves the coefficients by Gauss-Newton steps, unless
+    there are many, and its log-likelihood must come close to that of the best model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+        competing_effect: the effect that replaces one of its effects.
+        start: start of a fit of the competing model, with the coefficients from the regression.
     """
     filters = context.filters
-    steps = GAUSS_NEWTON_STEPS if competing_effect.c.size <= MAX_IMPROVED_SIZE else 0
+    has_few = competing_effect.coefficients.size <= MAX_IMPROVED_SIZE
+    steps = GAUSS_NEWTON_STEPS if has_few else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
     if (
         len(start.effects) == 1
@@ -315,14 +337,11 @@ def _confirm_by_filter(
     highest = filters.get_filter(best).log_likelihood
     gained = followed.log_likelihood - filters.log_likelihood(start.theta)
     if 0.5 * COMPETING_MODEL_MARGIN < highest - followed.log_likelihood < gained:
-        # The coefficient was far from its best value.
+        # The steps gained more than what is still missing, so further steps may reach the best one.
         followed, names = filters.follow_with_effects(followed.theta, names, FURTHER_STEPS)
-    loss = highest - followed.log_likelihood
-    return (
-        None
-        if 2.0 * loss > COMPETING_MODEL_MARGIN
-        else FitStart(names, followed.theta, start.initial_states)
-    )
+    if 2.0 * (highest - followed.log_likelihood) > COMPETING_MODEL_MARGIN:
+        return None
+    return FitStart(names, followed.theta, start.initial_states)
 
 
 def _fit_at_related_places(context: SearchContext, size: int) -> None:
@@ -340,10 +359,11 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
     starts: dict[frozenset[str], FitStart] = {}
     for model in _list_models_near_the_best(context, size):
         for name in model.effects:
-            c = model.fit.theta[evaluator.coefficient_slices[name]]
-            moved = [(other, c) for other in list_at_coupled_joints(evaluator, name)]
-            for other, coefficients in moved + list_moved_payloads(evaluator, name, c):
-                start = make_replacing_start(evaluator, model, [name], other, coefficients)
+            coefficients = model.fit.theta[evaluator.coefficient_slices[name]]
+            moved = [(other, coefficients) for other in list_at_coupled_joints(evaluator, name)]
+            moved += list_moved_payloads(evaluator, name, coefficients)
+            for other, other_coefficients in moved:
+                start = make_replacing_start(evaluator, model, [name], other, other_coefficients)
                 key = frozenset(start.effects)
                 if other not in model.effects and key not in search.models:
                     starts[key] = start
@@ -352,10 +372,10 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
 
 
 def _refine_near(context: SearchContext, size: int) -> None:
-    """Fit the models of a size whose merit is nearly the best one to convergence.
+    """Fit the models of a size whose penalised log-likelihood is nearly the best to convergence.
 
     Otherwise, incomplete fits would decide between them. Improved fits replace those in
-    `search.models`. Merit is the penalised log-likelihood.
+    `search.models`. A single model near the best is not fitted again.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -374,7 +394,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
 
 
 def _list_models_near_the_best(context: SearchContext, size: int) -> list[FittedModel]:
-    """Return the models with `size` effects whose merit is close to the highest.
+    """Return the models with `size` effects whose penalised log-likelihood is near the highest.
 
     Args:
         context: search, filters and regressions of the recording.

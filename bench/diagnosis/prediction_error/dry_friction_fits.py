@@ -59,10 +59,15 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
 
     MuJoCo simulates dry friction with a compliant constraint ("soft form"), so that joints creep;
     the other form ("stiff") lets them stick. The form decides about the simulator of the whole
-    search, so it is tested before anything but dry friction is fitted. Stiff friction is simulated:
-    that of the selection, and that at the joint where soft friction would act. If filters find soft
-    friction likelier, this is simulated too. Soft friction is not considered if another effect at
-    the joint promises more.
+    search, so it is tested before anything but dry friction is fitted:
+
+    1. Simulate the stiff friction of the selection. If it explains the runs, it is the result.
+    2. Find soft friction by filters. It is not considered if another effect at its joint promises
+       more.
+    3. Simulate stiff friction at this joint. If it explains the runs, it is the result.
+    4. If filters find soft friction likelier than the selection, simulate it and compare.
+
+    Nothing is done if the search has the soft form already, or if the base model lacks no force.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -72,7 +77,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         Stiff dry friction that explains the runs; None if it does not, or need not be tested.
 
     Raises:
-        SoftFrictionError: soft friction is likelier than the selection.
+        SoftFrictionError: simulated soft friction explains the runs, or is clearly likelier than
+            stiff friction.
     """
     filters = context.filters
     if filters.is_soft or not filters.base.has_missing_force:
@@ -94,6 +100,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         stiff_friction = context.search.fit_one(soft_start, FIRST_ITERATIONS)
         if is_explained(context, stiff_friction):
             return remove_idle_effects(context, stiff_friction)
+    # Filters with more and more effects of the selection are slow, so they are made only if it is
+    # not far behind.
     if not _is_far_less_likely(context, selected, soft_log_likelihood):
         useful_selection = drop_surplus_effects(context, selected)
         start = context.columns.start(useful_selection.groups, useful_selection.coefficients)
@@ -145,8 +153,9 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
 def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
     """Return whether a selection is far less likely than another model.
 
-    The likelihood of the selection is that of the regression, and that of a filter with its first
-    effect.
+    This is a quick estimate: both the likelihood of the regression and that of a filter with the
+    first effect of the selection must be far lower. The margin is a share of the gain of the other
+    model over the base model.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -182,8 +191,10 @@ def check_filter(context: SearchContext, log_likelihood: float) -> None:
 def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
     """Raise `SoftFrictionError` if soft dry friction may explain the runs as a richer law does.
 
-    A law with several coefficients in the stiff form may imitate the soft form, which has one.
-    Filters are linear, so simulation decides if soft friction is nearly as likely.
+    A law with several coefficients in the stiff form may imitate soft friction, which has one
+    coefficient. Filters are linear, so soft friction need only be nearly as likely by a filter: the
+    simulations of the search in the soft form decide. Nothing is done if the search has the soft
+    form already, or if the model has no dry friction.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -197,6 +208,7 @@ def check_simple_friction(context: SearchContext, model: FittedModel) -> None:
         return
     count = sum(len(context.evaluator.get_coefficient_indices(name)) for name in model.effects)
     followed = filters.get_filter(model)
+    # In twice the log-likelihood; soft friction saves all coefficients but one.
     margin = compute_comparison_margin(filters.compute_gain(followed))
     margin += (count - 1) * context.search.parameter_penalty
     check_filter(context, followed.log_likelihood - 0.5 * margin)
@@ -236,7 +248,8 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit the dry friction of a selection alone, before its other effects.
 
     Where joints stick, friction is far from linear, so the coefficients of the regression are poor
-    starts for a fit of all effects at once.
+    starts for a fit of all effects at once. A fit of the same friction laws from before is reused:
+    it is the result if it explains the runs, and else the start.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -244,7 +257,7 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
 
     Returns:
         The fitted model, also if it does not explain the runs. The base model if the selection has
-        no friction or leaves no force missing.
+        no friction, or leaves no force missing, so that it is fitted whole.
     """
     friction = make_dry_friction_start(context, selected)
     if not friction.effects or not selected.followed.has_missing_force:
@@ -291,11 +304,12 @@ def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitSt
 def is_friction_sufficient(
     context: SearchContext, selected: Selected, friction: FittedModel
 ) -> bool:
-    """Return whether dry friction without a state follows the data as well as the selection.
+    """Return whether dry friction without an internal state follows the data as well.
 
-    The filter is run with the whole selection, in which laws with an internal state are replaced by
-    laws without: in the stiff form and in MuJoCo's soft form. One of these log-likelihoods must be
-    indistinguishable from that of the selection, which is minus infinity if nothing was replaced.
+    A filter follows the runs with the whole selection, and with friction laws that have an internal
+    state (such as bristles) replaced by laws without, in the stiff form and in MuJoCo's soft form.
+    The better log-likelihood of these two must not be clearly lower than that of the selection. The
+    result is true if nothing was replaced.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -303,7 +317,7 @@ def is_friction_sufficient(
         friction: its dry friction, fitted alone.
 
     Raises:
-        SoftFrictionError: the soft form is clearly likelier, and `check_fit` confirms it.
+        SoftFrictionError: the soft form is clearly likelier, and simulations confirm it.
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
@@ -311,24 +325,15 @@ def is_friction_sufficient(
         context.evaluator, start.effects, start.theta
     )
     stiff_log_likelihood = filters.log_likelihood(stateless_theta)
-    soft_log_likelihood = (
-        -np.inf if filters.is_soft else filters.log_likelihood(stateless_theta, is_soft=True)
-    )
-    selected_log_likelihood = (
-        -np.inf
-        if np.array_equal(stateless_theta, start.theta)
-        else filters.log_likelihood(start.theta)
-    )
+    soft_log_likelihood = selected_log_likelihood = -np.inf
+    if not filters.is_soft:
+        soft_log_likelihood = filters.log_likelihood(stateless_theta, is_soft=True)
+    if not np.array_equal(stateless_theta, start.theta):
+        selected_log_likelihood = filters.log_likelihood(start.theta)
     # The ratio is twice the difference of log-likelihoods.
-    if (
-        not max(stiff_log_likelihood, soft_log_likelihood)
-        > selected_log_likelihood - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-    ):
+    margin = 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    if not max(stiff_log_likelihood, soft_log_likelihood) > selected_log_likelihood - margin:
         return False
-    if (
-        soft_log_likelihood
-        > max(stiff_log_likelihood, selected_log_likelihood)
-        + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-    ):
+    if soft_log_likelihood > max(stiff_log_likelihood, selected_log_likelihood) + margin:
         check_fit(context, friction)
     return True

@@ -112,7 +112,8 @@ class EffectProposals:
         """Return models with one more effect than a set: the effects worth trying next.
 
         Proposals by regression come first, then those of the standard joint and servo models.
-        Proposals for the base model are cached for each number of candidates.
+        Proposals for the base model are cached; they are made anew when candidates are added to the
+        library.
 
         Args:
             current: the set of effects in the model, with its filter; no effects mean the base
@@ -124,19 +125,23 @@ class EffectProposals:
             Starts of fits, each with the effects of the set and one more, with a first coefficient.
         """
         evaluator, count = self.filters.evaluator, len(self.columns.library.probes)
-        proposed = self._propose_effects(current) if current.names else self._for_base.get(count)
+        proposed = None if current.names else self._for_base.get(count)
         if proposed is None:
-            proposed = self._for_base[count] = self._propose_effects(current)
-        names = proposed.by_regression | proposed.offset_and_friction
+            proposed = self._propose_effects(current)
+        if not current.names:
+            self._for_base[count] = proposed
+        coefficients = proposed.by_regression | proposed.offset_and_friction
         if not is_fitted:
-            names = proposed.only_simulated | names
-        joint_model = [(name, c) for name, c in proposed.joint_model.items() if name not in names]
+            coefficients = proposed.only_simulated | coefficients
+        further_names = [name for name in proposed.joint_model if name not in coefficients]
+        for name in further_names[:max_joint_proposals]:
+            coefficients[name] = proposed.joint_model[name]
         present_model = FitStart(
             current.names, current.followed.theta, evaluator.initial_state_guesses
         )
         return [
-            add_effect_to_start(evaluator, present_model, name, c)
-            for name, c in [*names.items(), *joint_model[:max_joint_proposals]]
+            add_effect_to_start(evaluator, present_model, name, first_coefficients)
+            for name, first_coefficients in coefficients.items()
         ]
 
     def list_alone(
@@ -157,13 +162,18 @@ class EffectProposals:
         ]
 
     def _propose_effects(self, current: FilteredSet) -> ProposedEffects:
-        """Return all effects that are proposed in addition to a set."""
+        """Return all effects that are proposed in addition to a set, by the reason.
+
+        Args:
+            current: the set, with its filter. Effects of the joint and servo models are proposed at
+                the joint where this filter misses most.
+        """
         ranked = list(self._propose_by_regression(current).items())
         by_regression = dict(ranked[:MAX_REGRESSION_PROPOSALS])
         # A filter does not follow late readings, so that the regression misjudges them.
         similar_shifts = {
-            similar: c
-            for name, c in by_regression.items()
+            similar: coefficients
+            for name, coefficients in by_regression.items()
             for similar in list_similar_shifts(self.filters.evaluator, name)
         }
         only_simulated = dict(ranked[MAX_REGRESSION_PROPOSALS:]) | similar_shifts
@@ -171,7 +181,7 @@ class EffectProposals:
         joint = current.followed.joints_by_loss[0]
         return ProposedEffects(
             by_regression,
-            {name: c for name, c in only_simulated.items() if name not in excluded},
+            {name: only_simulated[name] for name in only_simulated if name not in excluded},
             self._propose_offset_and_friction(joint, excluded),
             self._propose_joint_model(current.followed, joint, excluded),
         )
@@ -198,20 +208,21 @@ class EffectProposals:
             is_surplus = group.effect.endswith("@*") and len(families) == MAX_FAMILY_PROPOSALS
             if is_surplus or group.effect in (*current.names, *proposals):
                 continue
-            too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
-            if len(proposals) == MAX_SIMULATED_PROPOSALS or too_little:
+            # Gains are in descending order, so all further ones are too small, too.
+            is_small = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
+            if len(proposals) == MAX_SIMULATED_PROPOSALS or is_small:
                 break
             (solution,) = regression.solve([group]).coefficients
             proposals[group.effect] = self.columns.coefficients(group, solution)
         return proposals
 
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
-        """Return an encoder offset of a joint, and less dry friction than the model file specifies.
+        """Propose an encoder offset at a joint, and less dry friction than in the model file.
 
         A regression misses both: an offset of the encoder changes the pose, and the derivative by
         more friction does not show the effect of less friction. The offset is that of the readings
-        from the servo's command. A coefficient of zero, because there is no offset or no friction
-        to remove, is not proposed.
+        from the servo's command. The decrease of friction is a share of that in the file. A
+        coefficient of zero, because there is no offset or no friction to remove, is not proposed.
 
         Args:
             joint: index of the joint.
@@ -225,9 +236,9 @@ class EffectProposals:
         }
         friction = f"friction.coulomb@{place}"
         if friction in evaluator.library:
-            coefficients[friction] = FIRST_SHARE * min(
-                compute_coefficient_bounds(evaluator, friction)[0][0], 0.0
-            )
+            # The lower bound is minus the friction of the file.
+            ((low, _),) = compute_coefficient_bounds(evaluator, friction)
+            coefficients[friction] = FIRST_SHARE * min(low, 0.0)
         return {
             name: np.array([c])
             for name, c in coefficients.items()
@@ -237,12 +248,11 @@ class EffectProposals:
     def _propose_joint_model(
         self, followed: FollowedRuns, joint: int, excluded: Collection[str]
     ) -> Proposals:
-        """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
+        """Propose friction, damping and armature of a joint, and gains of its servo.
 
-        A delay of all commands is added if no actuator acts at the joint alone. The coefficient of
-        an effect is that of its first Gauss-Newton step on the innovations, or a typical size if
-        that step hardly gains. Effects are in descending order of the gain in log-likelihood that
-        the step predicts.
+        A lag of all commands is added if no actuator acts at the joint alone. The coefficient of an
+        effect is that of its first Gauss-Newton step on the innovations, or a typical size if that
+        step hardly gains.
 
         Args:
             followed: the runs, followed by the filter of the set that is extended.
@@ -250,7 +260,8 @@ class EffectProposals:
             excluded: names of effects that are not proposed.
 
         Returns:
-            Names and coefficients of the effects.
+            Names and coefficients of the effects, in descending order of the gain in log-likelihood
+            that the step predicts.
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
@@ -258,7 +269,7 @@ class EffectProposals:
             float(np.abs(linear_run.trajectory.v[:, joint]).max()) for linear_run in followed.linear
         )
         interval = float(np.median(np.diff(evaluator.runs[0].times)))
-        # Sizes to try if the data give none.
+        # Sizes to try if the data give none; for other effects, a share with the sign of the step.
         typical = {
             **dict.fromkeys(COMMAND_MODEL, FIRST_LAG_INTERVALS * interval),
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
@@ -266,7 +277,7 @@ class EffectProposals:
                 compute_joint_scales(evaluator.simulator.robot).inertia[joint]
             ),
         }
-        proposals = []
+        changes, gains = dict[str, Array](), dict[str, float]()
         for name in self._list_effects_at(joint):
             if name not in excluded:
                 change, gain = self._compute_first_change(followed, name)
@@ -275,9 +286,8 @@ class EffectProposals:
                 # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
-                proposals.append((gain, name, np.array([change])))
-        proposals.sort(key=lambda proposal: -proposal[0])
-        return {name: c for _, name, c in proposals}
+                changes[name], gains[name] = np.array([change]), gain
+        return {name: changes[name] for name in sorted(gains, key=lambda name: -gains[name])}
 
     def _compute_first_change(self, followed: FollowedRuns, name: str) -> tuple[float, float]:
         """Return the first Gauss-Newton change of an effect alone, and its gain."""
@@ -287,17 +297,18 @@ class EffectProposals:
     def _compare_with_servo_damping(
         self, followed: FollowedRuns, joint: int, change: float, gain: float
     ) -> tuple[float, float]:
-        """Return the change and gain of viscous damping, or those of its servo's damping.
+        """Return the first change of a joint's viscous damping, and its gain in log-likelihood.
 
         The damping of a servo and that of its joint are the same force unless the servo is at its
         force limit. If the servo's damping gains much more, the linear response to the joint's is
-        not valid, because the joint chatters at the limit.
+        not valid, because the joint chatters at the limit. The change and gain of the servo's
+        damping are then returned in place of the joint's, the change in units of the joint.
 
         Args:
             followed: the runs, followed by the filter of the set that is extended.
             joint: index of the joint.
             change: first change of the joint's damping, in N·m·s/rad or N·s/m.
-            gain: gain in log-likelihood of that change.
+            gain: gain in log-likelihood that this change predicts.
         """
         evaluator = self.filters.evaluator
         assert isinstance(evaluator.simulator, RobotSimulator)
@@ -308,6 +319,8 @@ class EffectProposals:
         servo_change, servo_gain = self._compute_first_change(followed, name)
         if servo_gain < gain + self.filters.penalty(name):
             return change, gain
+        # MuJoCo's servo has the force -(damping) times velocity in its third bias parameter; the
+        # coefficient of the effect is a relative change of it.
         actuator = robot.actuator(servo).id
         gear = float(robot.compiled.actuator_gear[actuator, 0])
         damping = -float(robot.compiled.actuator_biasprm[actuator, 2])
@@ -316,11 +329,11 @@ class EffectProposals:
     def compute_largest_gain_of_others(self, friction: str) -> float:
         """Return the largest gain in log-likelihood by another effect where dry friction acts.
 
-        The effects are those of the joint and servo models at the same joint, alone and added to
-        the base model; the gains are those that a Gauss-Newton step predicts.
+        The other effects are those of the joint and servo models at the same joint, each added
+        alone to the base model; the gains are those that a Gauss-Newton step predicts.
 
         Args:
-            friction: name of the dry friction.
+            friction: name of the dry friction, such as ``friction.coulomb@elbow``.
         """
         evaluator, base = self.filters.evaluator, self.filters.base
         place = friction.partition("@")[2]
@@ -330,7 +343,14 @@ class EffectProposals:
         return max((self._compute_likelihood_step(base, name)[1] for name in others), default=0.0)
 
     def _list_effects_at(self, joint: int) -> list[str]:
-        """Return the effects of the joint model of a joint, of its servo, and of all commands."""
+        """Return names of the effects of the joint model of a joint, and of its servo's model.
+
+        Effects of all commands are added if no drive acts at the joint alone. Effects that the
+        library does not have are left out.
+
+        Args:
+            joint: index of the joint.
+        """
         evaluator = self.filters.evaluator
         place = get_joint_name(evaluator, joint)
         servo = get_servo_input(evaluator, joint).removeprefix("u.")

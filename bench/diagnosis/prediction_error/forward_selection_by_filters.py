@@ -66,11 +66,14 @@ ALL_SERVOS_STEPS = 6
 
 
 def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Add effects to a fitted model as long as each pays, and fit the set.
+    """Add effects to a fitted model as long as each gains more than its penalty, and fit the set.
 
     Args:
         context: search, filters and regressions of the recording.
         model: the fitted model.
+
+    Returns:
+        The larger fitted model; the given one if no effect gains enough.
     """
     current = FilteredSet(context.filters.get_filter(model), model.effects)
     larger = _grow_set(context, current)
@@ -82,7 +85,10 @@ def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
 def add_to_dry_friction(
     context: SearchContext, selected: Selected, friction: FittedModel
 ) -> FittedModel:
-    """Add effects to the dry friction of a selection.
+    """Add effects to the dry friction of a selection, and fit the best sets.
+
+    Friction laws with an internal state are replaced by laws without. Nothing is added if such
+    friction follows the runs worse than the selection does.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -90,7 +96,7 @@ def add_to_dry_friction(
         friction: its dry friction, fitted alone.
 
     Returns:
-        The best model, or the base model if the selection has no friction or is likelier.
+        The best model; the base model if the selection has no friction or is likelier.
 
     Raises:
         SoftFrictionError: the friction has MuJoCo's soft form.
@@ -103,10 +109,11 @@ def add_to_dry_friction(
 def select_in_model(context: SearchContext, friction: FitStart | None = None) -> FittedModel:
     """Add effects one after another to dry friction, or to the base model, and fit the best sets.
 
-    Filters with one more effect in the model are compared first, since they are fast. The sets that
-    are nearly as likely as the best are then fitted by simulation, until one explains the runs, if
-    they act at all joints where forces are missing. If none explains the runs, all servos are
-    fitted together, and then the likeliest set is extended by further effects.
+    1. Compare filters with one more effect in the model, since they are fast.
+    2. Fit the sets that are nearly as likely as the best one by simulation, until one explains the
+       runs. Sets that do not act at all joints where forces are missing are skipped.
+    3. If none explains the runs, fit all servos together (without dry friction only).
+    4. If that does not help either, extend the likeliest set by further effects, and fit it.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -160,8 +167,9 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
 
     Args:
         context: search, filters and regressions of the recording.
-        current: the set to begin with; it may be empty.
+        current: the set to begin with.
     """
+    # Number of the last effects in a row that replace no missing force.
     imitations = 0
     for _ in range(MAX_STEPS - 1):
         is_force_missing = current.followed.missing_forces.any()
@@ -208,7 +216,8 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 
     The effects with the largest gains by regression are tried first. If one of them replaces a
     missing force, the others, which a regression may have missed, are not tried. The result is
-    cached, because sets that grow from different effects may become equal.
+    cached, because sets that grow from different effects may become equal. It is reused unless
+    effects were added to the library, or the set now follows the runs much better.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -231,12 +240,18 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 
 
 def _compare_larger_sets(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
-    """Return the sets with one more effect, with improved coefficients, ranked by likelihood."""
+    """Return the likeliest sets with one more effect, with improved coefficients, the best first.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set.
+    """
     starts = context.proposals.of(current)
     context.evaluator.search_control.begin_stage(
         "testing the effects of the model one by one", len(starts)
     )
     followed, compared = list[FilteredSet](), list[FilteredSet]()
+    # First the effects with the largest gains by regression, then all others.
     for part in (starts[:MAX_IMPROVED_TRIALS], starts[MAX_IMPROVED_TRIALS:]):
         followed += _follow_each(context, part)
         compared = _improve_likeliest(context, followed, compared)
@@ -260,12 +275,16 @@ def _improve_likeliest(
 ) -> list[FilteredSet]:
     """Improve the coefficients of the likeliest sets by Gauss-Newton steps, and rank them.
 
-    A good effect with a wrong coefficient would lose without these steps.
+    A good effect with a wrong coefficient would lose without these steps. They are saved if another
+    set already explains the runs and is far better.
 
     Args:
         context: search, filters and regressions of the recording.
         followed: sets with the coefficients of the regression.
         improved: those among them whose coefficients are already improved.
+
+    Returns:
+        At most `MAX_IMPROVED_TRIALS` sets, the one with the best information criterion first.
     """
 
     def compute_criterion(larger_set: FilteredSet) -> float:
@@ -296,7 +315,7 @@ def _compute_remaining_share(current: FilteredSet, larger: FilteredSet) -> float
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
-    """Return whether a set explains the runs, and another one is far worse.
+    """Return whether a set lacks no force, and another one is far worse.
 
     The coefficients of the other set then need not be improved.
 
@@ -315,7 +334,7 @@ def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -
 def _select_nearly_as_likely(
     context: SearchContext, larger_sets: Sequence[FilteredSet]
 ) -> Sequence[FilteredSet]:
-    """Return the sets whose likelihood in the filter is too close to that of the best set.
+    """Return the sets that a filter cannot distinguish from the likeliest one.
 
     The filter uses a linearised model, so these sets are then fitted by simulation. The likeliest
     is the first; at least `MAX_FIRST_EFFECTS` sets are returned if there are that many.
@@ -351,7 +370,8 @@ def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedMod
     """Fit stiffness and damping of all servos together, if forces are missing at several joints.
 
     Another effect may gain more than the stiffness or the damping alone. If that effect leaves a
-    force missing at one joint only, the servos of the other joints are right.
+    force missing at one joint only, the servos of the other joints are right. The base model is
+    then returned, and also if the library has no effects of all servos.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -359,8 +379,10 @@ def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedMod
     """
     names = [f"{effect}@*" for effect in SERVO_MODEL]
     filters = context.filters
-    several = all(f.missing_forces.sum() > 1 for f in (filters.base, likeliest.followed))
-    if not several or not set(names) <= set(context.evaluator.library):
+    are_missing_at_several = all(
+        followed.missing_forces.sum() > 1 for followed in (filters.base, likeliest.followed)
+    )
+    if not are_missing_at_several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
     return fit_filtered(
         context, filters.follow_with_effects(filters.reference, names, ALL_SERVOS_STEPS)

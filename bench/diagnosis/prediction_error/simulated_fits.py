@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,8 +53,17 @@ The model of a real robot is never complete, and long recordings show this with 
 MAX_NOISE_LIKE_COST = 1.5
 """Maximum mean squared residual, in units of the noise, at which no better start is searched."""
 
-RatedStart = tuple[float, FitStart]
-"""Cost of a simulation without a fit (sum of squares in units of the noise), and its start."""
+
+class RatedStart(NamedTuple):
+    """A start that was simulated without a fit.
+
+    Attributes:
+        cost: sum of squared residuals in units of the noise; infinite if the simulation fails.
+        start: the start.
+    """
+
+    cost: float
+    start: FitStart
 
 
 def fit_by_simulation(
@@ -61,11 +71,13 @@ def fit_by_simulation(
 ) -> FittedModel:
     """Fit a set of effects by simulation, with restarts if it does not explain the runs.
 
-    If the residual is large, the fit is repeated with derivatives by the first states about the
-    simulated motion, because those about the measured motion may be invalid. Dry friction is then
-    fitted again from nearby coefficients, because its fit may stop in a local minimum. A set that
-    leaves much of the discrepancy is not fitted again if it is incomplete, or if a force is missing
-    at a joint where none of its effects acts.
+    1. Fit the set once. For a robot on the ground, its first states are estimated before.
+    2. Stop if it explains the runs, if its simulation fails, or if it leaves much of the
+       discrepancy because it is incomplete: a force is missing in addition to its effects, or at a
+       joint where none of them acts.
+    3. Fit it again with derivatives by the first states about the simulated motion, because those
+       about the measured motion may be invalid.
+    4. Fit dry friction again from nearby coefficients, because its fit may stop in a local minimum.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -85,6 +97,7 @@ def fit_by_simulation(
     is_incomplete = is_incomplete or not context.filters.act_where_forces_are_missing(start.effects)
     if is_incomplete and not is_nearly_explained(context, fitted):
         return fitted
+    # A fit takes the derivatives by first states from the evaluator.
     derivatives_before = evaluator.state_derivatives
     compute_state_jacobian(
         evaluator, fitted.fit.theta, fitted.fit.initial_states, is_recomputed=True
@@ -134,6 +147,7 @@ def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedM
         model: the fitted model.
         name: name of the effect.
     """
+    # All starts have the same effects, so one of them is selected.
     ((cost, start),) = select_lowest_of_each(context, list_nearby_starts(context, model, name))
     return context.search.fit_one(start) if cost < model.fit.cost else model
 
@@ -172,8 +186,8 @@ def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) ->
         starts: the starts.
 
     Returns:
-        The cost (sum of squared residuals in units of the noise) and the start for each set, in
-        ascending order of the cost. A start that cannot be simulated has an infinite cost.
+        The start with its cost for each set, in ascending order of the cost (sum of squared
+        residuals in units of the noise). A start that cannot be simulated has an infinite cost.
     """
     if not starts:
         return []
@@ -181,30 +195,32 @@ def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) ->
         context.evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
     )
     best_of_each_set: dict[tuple[str, ...], RatedStart] = {}
+    # In ascending order of the cost, so the first start of a set is its best one.
     for i in np.argsort(costs, kind="stable").tolist():
-        best_of_each_set.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
+        best_of_each_set.setdefault(starts[i].effects, RatedStart(float(costs[i]), starts[i]))
     return list(best_of_each_set.values())
 
 
 def has_noise_like_cost(context: SearchContext, rated_starts: Sequence[RatedStart]) -> bool:
-    """Return whether the first start leaves little more than noise without any fit.
+    """Return whether the best of some simulated starts leaves little more than noise without a fit.
 
     Args:
         context: search, filters and regressions of the recording.
-        rated_starts: starts in ascending order of the cost; there may be none.
+        rated_starts: costs and starts in ascending order of the cost; there may be none.
     """
     if not rated_starts:
         return False
     sample_count = int(context.filters.base.runs.recorded.sum())
-    return rated_starts[0][0] < MAX_NOISE_LIKE_COST * sample_count
+    return rated_starts[0].cost < MAX_NOISE_LIKE_COST * sample_count
 
 
 def is_explained(context: SearchContext, model: FittedModel) -> bool:
     """Return whether a fitted model leaves only noise, or a negligible share of a large residual.
 
-    The excess residual, which is compared, is the RMS residual in units of the noise, minus one. A
-    model with stiff dry friction must leave only noise: a small remaining residual may show that
-    the friction has MuJoCo's soft form (`filters.is_soft` if the simulator has that form already).
+    The excess residual is the RMS residual in units of the noise, minus one. It is negligible if it
+    is below both an absolute limit and a share of that of the base model. A model with stiff dry
+    friction must leave only noise: a small remaining residual may show that the friction has
+    MuJoCo's soft form (`filters.is_soft` if the simulator has that form already).
 
     Args:
         context: search, filters and regressions of the recording.
@@ -241,6 +257,9 @@ def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
 def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
     """Return whether a model removes most of the discrepancy.
 
+    Its excess residual (RMS residual in units of the noise, minus one) is compared with that of the
+    base model.
+
     Args:
         context: search, filters and regressions of the recording.
         model: the fitted model.
@@ -252,7 +271,7 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
 
 
 def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
-    """Return the model with the higher merit; the first one if they are equal.
+    """Return the model with the higher penalised log-likelihood; the first one if they are equal.
 
     Args:
         one: a fitted model.
@@ -262,7 +281,10 @@ def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
 
 
 def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Remove effects that do not pay, and replace a family by a member that is as good.
+    """Remove effects that gain less than their penalty, and simplify families.
+
+    The same effect at every place becomes one effect for all places, its family (``@*``). A family
+    is replaced by a single member that is as good.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -294,17 +316,15 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
         coefficients = np.concatenate(
             [model.fit.theta[evaluator.coefficient_slices[name]] for name in members]
         )
+        # A family that shares coefficients between places cannot begin at those of its members.
         if coefficients.size != len(evaluator.get_coefficient_indices(family)):
             continue
         fitted = context.search.fit_one(
             make_replacing_start(evaluator, model, members, family, coefficients)
         )
-        model = (
-            fitted
-            if fitted.penalised_log_likelihood
-            > model.penalised_log_likelihood - INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-            else model
-        )
+        limit = model.penalised_log_likelihood - INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+        if fitted.penalised_log_likelihood > limit:
+            model = fitted
     return model
 
 
@@ -315,7 +335,9 @@ def make_replacing_start(
     new_effect: str,
     coefficients: Array,
 ) -> FitStart:
-    """Return a start in which one effect replaces several others.
+    """Return a start of a fit in which one effect replaces several others of a model.
+
+    All other parameters and the first states are those of the model.
 
     Args:
         evaluator: the runs.
@@ -351,7 +373,9 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
 
 
 def _is_too_slow(context: SearchContext, selected: Selected, count: int) -> bool:
-    """Return whether simulation is slow, although the selection lacks a force.
+    """Return whether a selection is too slow to simulate for a set that is incomplete anyway.
+
+    It has many effects, one of them is slow to simulate, and a force is missing in addition.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -400,13 +424,17 @@ def drop_surplus_effects(
 
     Far from the base model, the linear regression is wrong. So the first one, two, three, ...
     effects of the selection are put into a filter's model. The number of effects with the largest
-    gain minus penalty is kept. The trials end when several further effects do not gain enough.
+    gain minus penalty is kept. The trials end when `MAX_SURPLUS` further effects do not gain
+    enough.
 
     Args:
         context: search, filters and regressions of the recording.
-        selected: the selection.
+        selected: the selection, in the order in which effects were added.
         is_simulated: whether the set is kept for a simulation, so that the trials also end when it
             is too slow to simulate.
+
+    Returns:
+        The selection with its first effects only, with the coefficients of a regression on them.
     """
     filters = context.filters
     base_log_likelihood = filters.base.log_likelihood
@@ -431,9 +459,10 @@ def drop_surplus_effects(
 
 
 def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
-    """Return whether effects are slow to simulate.
+    """Return whether one of some effects is slow to simulate.
 
-    This is the case if forces are computed in every step, or have their own states.
+    Slow are forces that Python computes in every step, and effects with their own states. Those
+    that are fields of MuJoCo's model or depend on time alone are fast.
 
     Args:
         context: search, filters and regressions of the recording.

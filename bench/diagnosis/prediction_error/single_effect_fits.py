@@ -64,9 +64,9 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
 
     Where a servo is at its limit or chatters, the cost is flat at the base model and steep far from
     it, so that a fit from the coefficient of a regression stays where it is. Each effect is
-    therefore simulated at several factors of its proposed coefficient. This is skipped if one of
-    them explains the runs with the coefficient itself. Effects at one joint are left out if a force
-    is missing at another joint.
+    therefore simulated at its proposed coefficient and, unless one of them explains the runs with
+    it, at several factors of it. Effects at one joint are left out if a force is missing at another
+    joint.
 
     Returns:
         Costs and starts with one effect each, in ascending order of the cost.
@@ -77,59 +77,59 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
         replace(start, initial_states=states)
         for start in context.proposals.list_alone(is_fitted=False)
     ]
-    costs = select_lowest_of_each(context, proposed)
-    if not has_noise_like_cost(context, costs):
-        costs = _try_scaled(context, costs, SCANNED_FACTORS)
+    rated_starts = select_lowest_of_each(context, proposed)
+    if not has_noise_like_cost(context, rated_starts):
+        rated_starts = _try_scaled(context, rated_starts, SCANNED_FACTORS)
     limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
-    return _drop_families(context, [(cost, start) for cost, start in costs if cost < limit])
+    return _drop_families(context, [rated for rated in rated_starts if rated.cost < limit])
 
 
 def _drop_families(context: SearchContext, rated_starts: Sequence[RatedStart]) -> list[RatedStart]:
     """Drop effects at all places that leave hardly less than the same effect at one place.
 
-    Their fits take longer, because they have a coefficient for each place.
+    Fits of such a family take longer, because it has a coefficient for each place.
 
     Args:
         context: search, filters and regressions of the recording.
         rated_starts: costs and starts with one effect each.
     """
-    costs = {start.effects[0]: cost for cost, start in rated_starts}
+    costs = {rated.start.effects: rated.cost for rated in rated_starts}
     effects = context.evaluator.available_effects
-    return [
-        (cost, start)
-        for cost, start in rated_starts
-        if not any(
-            member.name != start.effects[0]
-            and costs.get(member.name, np.inf) < (1.0 + MIN_FAMILY_SQUARES_SHARE) * cost
-            for member in members_of(effects[start.effects[0]])
-        )
-    ]
+    remaining = []
+    for rated in rated_starts:
+        (name,) = rated.start.effects
+        members = [member.name for member in members_of(effects[name]) if member.name != name]
+        limit = (1.0 + MIN_FAMILY_SQUARES_SHARE) * rated.cost
+        if not any(costs.get((member,), np.inf) < limit for member in members):
+            remaining.append(rated)
+    return remaining
 
 
 def _try_scaled(
-    context: SearchContext, costs: Sequence[RatedStart], factors: Sequence[float]
+    context: SearchContext, rated_starts: Sequence[RatedStart], factors: Sequence[float]
 ) -> list[RatedStart]:
-    """Simulate starts with one coefficient also at factors of it, and keep the best of each effect.
+    """Simulate starts also at factors of their coefficient, and keep the best of each effect.
+
+    Effects with several coefficients are kept as they are.
 
     Args:
         context: search, filters and regressions of the recording.
-        costs: costs and starts with one effect each.
+        rated_starts: costs and starts with one effect each.
         factors: factors of the coefficient.
 
     Returns:
         Cost and start of each effect, in ascending order of the cost.
     """
-    scaled = [
-        scale_effect(context, start, start.effects[0], factor)
-        for _, start in costs
-        if len(context.evaluator.get_coefficient_indices(start.effects[0])) == 1
-        for factor in factors
-    ]
-    lowest = {start.effects: (cost, start) for cost, start in costs}
-    for cost, start in select_lowest_of_each(context, scaled):
-        if cost < lowest[start.effects][0]:
-            lowest[start.effects] = (cost, start)
-    return sorted(lowest.values(), key=lambda pair: pair[0])
+    scaled = []
+    for _, start in rated_starts:
+        (name,) = start.effects
+        if len(context.evaluator.get_coefficient_indices(name)) == 1:
+            scaled += [scale_effect(context, start, name, factor) for factor in factors]
+    lowest = {rated.start.effects: rated for rated in rated_starts}
+    for rated in select_lowest_of_each(context, scaled):
+        if rated.cost < lowest[rated.start.effects].cost:
+            lowest[rated.start.effects] = rated
+    return sorted(lowest.values(), key=lambda rated: rated.cost)
 
 
 def scale_effect(context: SearchContext, start: FitStart, name: str, factor: float) -> FitStart:
@@ -149,10 +149,10 @@ def scale_effect(context: SearchContext, start: FitStart, name: str, factor: flo
 
 
 def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStart]) -> FittedModel:
-    """Fit the effects that alone remove most of the residual.
+    """Fit the effects that alone remove most of the residual, one after another.
 
-    A coefficient far from the linear range is first improved by simulations alone, because the
-    cost has local minima.
+    A coefficient far from the linear range is first improved by simulations at factors of it,
+    because the cost has local minima. The fits end with the first model that explains the runs.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -163,11 +163,12 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
     """
     best = context.search.base_model
     for likely_start in likely_starts[:MAX_SCANNED_FITS]:
-        costs = [likely_start]
+        rated_starts = [likely_start]
         for factors in CLOSER_FACTORS:
-            if not has_noise_like_cost(context, costs):
-                costs = _try_scaled(context, costs, factors)
-        fitted = fit_by_simulation(context, costs[0][1])
+            if not has_noise_like_cost(context, rated_starts):
+                rated_starts = _try_scaled(context, rated_starts, factors)
+        ((_, start),) = rated_starts
+        fitted = fit_by_simulation(context, start)
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
             fitted = fit_nearby(context, fitted, fitted.effects[0])
         if np.isfinite(fitted.fit.cost):
@@ -185,10 +186,12 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     joint are left out if a force is missing at another joint.
 
     Returns:
-        The best model without effects that do not pay, or the base model if none explains the runs.
+        The best model if it explains the runs, without an effect that gains too little; otherwise
+        the base model.
 
     Raises:
-        SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
+        SoftFrictionError: none explains the runs, and dry friction is likelier in MuJoCo's soft
+            form.
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
@@ -198,9 +201,13 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     fitted, best = list[FittedModel](), search.base_model
     for is_slow in (False, True):
         # Slow effects are fitted only if no other effect explains the runs.
-        group = [one for one in starts if is_slow_to_simulate(context, one.effects) == is_slow]
-        if group and not is_explained(context, best):
-            fitted += search.fit_all([replace(start, initial_states=states) for start in group])
+        batch = [
+            replace(start, initial_states=states)
+            for start in starts
+            if is_slow_to_simulate(context, start.effects) == is_slow
+        ]
+        if batch and not is_explained(context, best):
+            fitted += search.fit_all(batch)
             best = max(fitted, key=lambda model: model.penalised_log_likelihood)
     if not is_explained(context, best):
         best = select_more_likely(best, refine_single_effects(context, fitted))
@@ -214,9 +221,10 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
 def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel]) -> FittedModel:
     """Fit some effects alone to convergence, and return the likeliest model after penalties.
 
-    Those with the lowest cost are fitted first, from the fit and from nearby coefficients. Fits may
-    stop in local minima where joints stick and at force limits, and likelihoods with coloured noise
-    are unreliable if the residual is large.
+    Those with the lowest cost are fitted first, each from its fit or from a nearby coefficient,
+    whichever has the lowest cost. Fits may stop in local minima where joints stick and at force
+    limits. The cost ranks them, since likelihoods with coloured noise are unreliable if the
+    residual is large.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -226,6 +234,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         The best model, or the base model if that is likelier.
     """
     starts: list[FitStart] = []
+    # Effects with many coefficients have too many nearby ones.
     small = [
         model
         for model in fitted
@@ -248,8 +257,9 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
 def fit_series_effects(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit elastic joints and backlash between drive and links at the most affected joint.
 
-    These effects have their own states, so a regression cannot score them. Each shape is simulated;
-    the best of each effect is fitted; the likeliest is fitted to convergence.
+    These effects have their own states, so a regression cannot score them. Each of their trial
+    coefficients is simulated; the best of each effect is fitted; the likeliest is fitted to
+    convergence.
 
     Args:
         context: search, filters and regressions of the recording.
