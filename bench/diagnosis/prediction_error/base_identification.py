@@ -90,10 +90,15 @@ def identify_base(
     """Identify the base parameters of a robot from the innovations (prediction errors) of a filter.
 
     An effect that the model lacks biases the estimates. So up to three fits are tried, until one
-    leaves no force missing: the parameters alone; together with friction and constant forces at the
-    joints; together with the effect of the library that explains most. The likeliest fit gives the
-    parameters. The effects are then removed again, and the runs are filtered with the parameters
-    alone.
+    leaves no force missing:
+
+    1. the parameters alone;
+    2. together with friction and constant forces at the joints;
+    3. together with the effect of the library that explains most.
+
+    The likeliest fit gives the parameters. Fits that do not follow the runs, or end at the widest
+    bounds of a parameter, do not count. The effects are then removed again, and the runs are
+    filtered with the parameters alone.
 
     Args:
         evaluator: the runs for fitting; ranges that do not contain an estimate are replaced.
@@ -103,13 +108,14 @@ def identify_base(
             forces is made.
 
     Returns:
-        The filter and the identified parameters. `parameters` is None and the filter is the given
-        one, with nominal parameters, if the likelihood gains nothing, an estimate is at its widest
-        bound, or the search has to end.
+        The filter and the identified parameters, with the effects of the third fit if it is the
+        likeliest and leaves no force missing. `parameters` is None and the filter is the given one,
+        with nominal parameters, if no fit counts or gains enough, or if the search has to end.
     """
     search_control = evaluator.search_control
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
+        """Filter the runs with other parameters; the process noise starts from a known filter."""
         search_control.begin_stage("identifying the base parameters")
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
@@ -162,7 +168,13 @@ def identify_base(
 
 
 def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
-    """Return effects that resist the motion of the joints with the largest missing forces."""
+    """Return names of effects that resist the motion of the joints with the largest missing forces.
+
+    These are friction, drag and a constant force, as far as the evaluator has them.
+
+    Args:
+        followed: the runs, filtered without these effects.
+    """
     evaluator = followed.evaluator
     coordinates = evaluator.simulator.system.coordinates
     joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
@@ -174,8 +186,8 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
     """Return a start with the effect that explains most while base parameters are nominal.
 
     A regression of the innovations ranks the effects of the library. The best few are put into the
-    filter's model one by one, and their coefficients are improved. The start contains the likeliest
-    one.
+    filter's model one by one, and their coefficients are improved. An effect that ends at a bound
+    other than zero is left out. The start contains the likeliest one.
 
     Args:
         followed: the runs, filtered with the nominal parameters.

@@ -96,7 +96,7 @@ class InactiveDrive:
         joint: name of the driven joint.
         actuators: names of the actuators of the joint.
         is_held: whether the joint is held still, as by a brake, and not free.
-        masks: inactive samples (T,) of each run.
+        masks: inactive samples (T,) of each run, the likeliest ones.
         costs: (2, T / every) costs in each run, of a drive that is on and of an inactive one.
         every: interval, in samples, at which costs are computed.
     """
@@ -109,12 +109,12 @@ class InactiveDrive:
     every: int
 
     def is_likely(self, masks: Sequence[Mask]) -> bool:
-        """Return whether the drive is inactive in the given samples, and only there.
+        """Return whether the drive may be inactive in the given samples, and only there.
 
-        Used to test whether a column of the recording shows when the drive is off. A drive with
-        small commands does not show exactly when it is switched off, so the masks may cost more
-        than the likeliest ones, in proportion to the number of changes. Masks with too many
-        intervals are refused.
+        Used to test whether a column of the recording shows when the drive is off. A sample costs
+        more the larger the residual force of its hypothesis is. A drive with small commands does
+        not show exactly when it is switched off, so the masks may cost more than the likeliest
+        ones, in proportion to the number of changes. Masks with too many intervals are refused.
 
         Args:
             masks: (T,) samples of each run in which the drive would be inactive.
@@ -133,10 +133,12 @@ class InactiveDrive:
 def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
     """Switch off inactive drives or omit these samples, and add notes to the recording.
 
-    A fit would explain samples without drive force by wrong effects. If a column of the recording
-    shows when a drive is off, the drive is switched off in the model there; otherwise, or if a
-    brake holds the joint, the samples are omitted. They are kept if no run for fitting would
-    remain.
+    A fit would explain samples without drive force by wrong effects.
+
+    - If a column of the recording shows when a drive is off, the drive is switched off in the model
+      there.
+    - Otherwise, or if a brake holds the joint, the samples are omitted. They are kept if no run for
+      fitting would remain.
 
     Args:
         recording: the recording as it was read, before its runs are divided.
@@ -147,16 +149,14 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
         return recording
     notes = list(recording.notes)
     runs = recording.runs
-    inactive_masks = [np.zeros(run.times.size, dtype=bool) for run in runs]
+    omitted_masks = [np.zeros(run.times.size, dtype=bool) for run in runs]
     unexplained: list[InactiveDrive] = []
     for drive in drives:
         switches = [] if drive.is_held else _find_switches(recording, drive)
         if not switches:
             unexplained.append(drive)
-            inactive_masks = [
-                present | _widen_mask(added)
-                for present, added in zip(inactive_masks, drive.masks, strict=True)
-            ]
+            for omitted_mask, inactive_mask in zip(omitted_masks, drive.masks, strict=True):
+                omitted_mask |= _widen_mask(inactive_mask)
             continue
         # A column shows when this drive is off.
         runs, texts = apply_drive_switches(recording.path, runs, switches)
@@ -167,16 +167,19 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
             f"it in {description}: {switch_lines}"
             for text in texts
         ]
-    pairs = zip(runs, inactive_masks, strict=True)
-    remaining_runs = [part for run, mask in pairs for part in split_without_masked(run, mask)]
+    remaining_runs = [
+        part
+        for run, omitted_mask in zip(runs, omitted_masks, strict=True)
+        for part in split_without_masked(run, omitted_mask)
+    ]
     if unexplained and any(not run.held_out for run in remaining_runs):
-        notes += [_format_message(recording, unexplained, inactive_masks)]
+        notes += [_format_message(recording, unexplained, omitted_masks)]
         runs = tuple(remaining_runs)
     return replace(recording, runs=tuple(runs), notes=tuple(notes))
 
 
 def _format_message(
-    recording: Recording, drives: Sequence[InactiveDrive], inactive_masks: Sequence[Mask]
+    recording: Recording, drives: Sequence[InactiveDrive], omitted_masks: Sequence[Mask]
 ) -> str:
     """Write the note on samples that were omitted because drives are inactive.
 
@@ -186,10 +189,10 @@ def _format_message(
     Args:
         recording: the recording.
         drives: drives that are inactive in a part of it; all of them are held, or none.
-        inactive_masks: (T,) mask of each run, of the samples that were left out.
+        omitted_masks: (T,) mask of each run, of the samples that were left out.
     """
     joints = ", ".join(drive.joint for drive in drives)
-    sample_text = format_run_spans(recording.runs, inactive_masks)
+    sample_text = format_run_spans(recording.runs, omitted_masks)
     noun = "joint" if len(drives) == 1 else "joints"
     symptom_text = (
         "the joints stand still" if drives[0].is_held else "the motion shows no force of them"
@@ -208,6 +211,9 @@ def _format_message(
 
 def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
     """Return switches of a drive's actuators from the first column that shows when it is off.
+
+    Each column is tried as one that is zero where the drive is off, and as one that is zero where
+    it is on. The result is empty if no column shows it.
 
     Args:
         recording: the recording, whose further columns may be state words of the drives.
@@ -237,6 +243,7 @@ def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive])
             values = run.extra[column]
             changes = np.flatnonzero(np.diff(values) != 0) + 1
             inactive_mask = np.any([drive.masks[number] for drive in drives], axis=0)
+            # Near the beginning or the end of an inactive interval.
             is_near_change = _widen_mask(inactive_mask) & _widen_mask(~inactive_mask)
             changes_near += int(is_near_change[changes].sum())
             other_changes += int((~is_near_change[changes]).sum())
@@ -246,7 +253,7 @@ def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive])
 
 
 def _widen_mask(mask: Mask) -> Mask:
-    """Return a mask that is extended by some samples on either side."""
+    """Return a mask (T,) whose intervals are extended by `EDGE_SAMPLES` on either side."""
     wide: Mask = np.convolve(mask, np.ones(2 * EDGE_SAMPLES + 1), mode="same") > 0.5
     return wide
 
@@ -254,9 +261,10 @@ def _widen_mask(mask: Mask) -> Mask:
 def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
     """Find drives that are inactive in some samples, by (1) of the module docstring.
 
-    Forces are computed from the recorded motion, at every k-th sample of long recordings. Each
-    joint is tested alone for a drive that is off. If no drive is off, all joints together are
-    tested for a brake or an emergency stop that holds them. Masks are then extended to all samples.
+    Forces are computed from the recorded motion, at every k-th sample of long recordings, and
+    compared with those of the model. Each joint is tested alone for a drive that is off. If no
+    drive is off, all joints together are tested for a brake or an emergency stop that holds them.
+    Masks are then extended to all samples.
 
     Args:
         recording: the recording as it was read.
@@ -264,7 +272,7 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
 
     Returns:
         The drives; empty if the positions of some joints are not recorded, if there is a floating
-        base, or if joints are coupled by equalities.
+        base, if joints are coupled by equalities, or if a run is too short.
     """
     robot = getattr(kind, "robot", None)
     if not kind.has_model or robot is None or not has_joint_forces(robot, recording):
@@ -333,10 +341,10 @@ class _Intervals:
     def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
         """Find the most likely intervals of the hypothesis, and keep those that are plausible.
 
-        Each sample costs more under the hypothesis that fits it worse, and each change costs too;
-        dynamic programming finds the cheapest sequence. Costs of all joints are added, since the
-        hypothesis is that they are inactive together. If the intervals are too many, the hypothesis
-        explains noise, and none is kept.
+        The alternative is that the drives are active. Each sample costs more under the hypothesis
+        that fits it worse, and each change costs too; dynamic programming finds the cheapest
+        sequence. Costs of all joints are added, since the hypothesis is that they are inactive
+        together. If the intervals are too many, the hypothesis explains noise, and none is kept.
 
         Args:
             forces: forces in the runs.
@@ -346,13 +354,15 @@ class _Intervals:
         """
         self.state = state
         self._forces, self._joints = forces, joints
+        # Residual forces (3, T) under the three hypotheses, by joint and run.
         self._residuals = [
             [run_forces.residuals(joint) for run_forces in forces] for joint in joints
         ]
         self.costs = [np.zeros((2, len(run_forces.needed))) for run_forces in forces]
-        for of_runs in self._residuals:
-            for cost, joint_costs in zip(self.costs, _compute_costs(of_runs, state), strict=True):
-                cost += joint_costs
+        for residuals_by_run in self._residuals:
+            joint_costs = _compute_costs(residuals_by_run, state)
+            for run_costs, added_costs in zip(self.costs, joint_costs, strict=True):
+                run_costs += added_costs
         masks = [_remove_short_intervals(_choose_second_hypothesis(cost)) for cost in self.costs]
         if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
             masks = [np.zeros_like(mask) for mask in masks]
@@ -367,9 +377,8 @@ class _Intervals:
 
         All intervals are rejected together if they are too long or too short, if the model's drive
         is not clearly worse inside them than outside, or if the hypothesis leaves large forces.
-        Then single intervals that the hypothesis does not explain are removed; a joint held by a
-        brake must also be at rest. Changes themselves are not compared, because the smoothed motion
-        is blurred there.
+        Then single intervals that the hypothesis does not explain are removed. Samples near the
+        ends of intervals are not compared, because the smoothed motion is blurred there.
 
         Args:
             masks: samples of each run in which the hypothesis is the likelier one.
@@ -378,9 +387,11 @@ class _Intervals:
         active_masks = [~_widen_mask(mask) for mask in masks]
         interior_masks = [_remove_edges(mask) for mask in masks]
         inactive_share = np.concatenate(masks).mean()
-        if inactive_share > MAX_INACTIVE_SHARE or (
-            min(sum(int(m.sum()) for m in of_runs) for of_runs in (active_masks, interior_masks))
-            < MIN_SAMPLES // 2
+        active_count = sum(int(mask.sum()) for mask in active_masks)
+        interior_count = sum(int(mask.sum()) for mask in interior_masks)
+        if (
+            inactive_share > MAX_INACTIVE_SHARE
+            or min(active_count, interior_count) < MIN_SAMPLES // 2
         ):
             return empty_masks
         drive_error_outside = self._compute_residual_magnitudes(ON, active_masks)
@@ -390,6 +401,7 @@ class _Intervals:
         # A wrong damping has large errors wherever the joint is fast, not in one interval alone.
         length = int(np.median([end - first for mask in masks for first, end in spans(mask)]))
         drive_error_in_windows = self._compute_largest_errors(active_masks, length)
+        # One joint is enough: another one may press against a stop and not move, either.
         is_worse = any(
             inside >= MIN_MISSED_RATIO * outside and inside >= MIN_WINDOW_RATIO * in_windows
             for inside, outside, in_windows in zip(
@@ -408,12 +420,31 @@ class _Intervals:
             and sum(hypothesis_error_inside) <= MAX_RESIDUAL_SHARE * sum(drive_error_inside)
         ):
             return empty_masks
-        # Single intervals.
+        return self._accept_intervals(masks, active_masks, interior_masks)
+
+    def _accept_intervals(
+        self, masks: Sequence[Mask], active_masks: Sequence[Mask], interior_masks: Sequence[Mask]
+    ) -> list[Mask]:
+        """Return masks (T,) with only those intervals that the hypothesis explains.
+
+        It must leave much less force than that of an active drive. If it is that a brake holds the
+        joints, they must also be at rest.
+
+        Args:
+            masks: samples of each run in which the hypothesis is the likelier one.
+            active_masks: samples that are clearly outside these intervals.
+            interior_masks: samples of the intervals that are not near their ends.
+        """
         typical_speeds = [
             _compute_magnitude(
-                np.concatenate([f.velocity[m, j] for f, m in self._pair_with_forces(active_masks)])
+                np.concatenate(
+                    [
+                        run_forces.velocity[active_mask, joint]
+                        for run_forces, active_mask in zip(self._forces, active_masks, strict=True)
+                    ]
+                )
             )
-            for j in self._joints
+            for joint in self._joints
         ]
         result = []
         for run, (mask, interior_mask) in enumerate(zip(masks, interior_masks, strict=True)):
@@ -431,22 +462,23 @@ class _Intervals:
             result.append(accepted_mask)
         return result
 
-    def _pair_with_forces(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
-        """Pair forces of runs with masks."""
-        return zip(self._forces, masks, strict=True)
-
     def _compute_residual_magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
-        """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint.
+        """Return the magnitude of the residual forces of a hypothesis within masks, by joint.
 
         Args:
-            state: number of the hypothesis, ``OFF`` or ``HELD``.
+            state: the hypothesis, ``ON``, ``OFF`` or ``HELD``: a row of the residuals.
             masks: (T,) samples of each run that count.
         """
         return [
             _compute_magnitude(
-                np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)])
+                np.concatenate(
+                    [
+                        residuals[state, mask]
+                        for residuals, mask in zip(residuals_by_run, masks, strict=True)
+                    ]
+                )
             )
-            for of_runs in self._residuals
+            for residuals_by_run in self._residuals
         ]
 
     def _compute_largest_errors(self, masks: Sequence[Mask], length: int) -> list[float]:
@@ -478,12 +510,13 @@ class _Intervals:
 
         Args:
             run: index of the run.
-            mask: (T,) samples of the interval.
+            mask: (T,) samples of the interval that are not near its ends.
             ends: first sample of the interval, and the sample after its last one.
             typical_speeds: typical speed of each joint of the hypothesis, in its unit per second.
         """
         velocity = self._forces[run].velocity
-        at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
+        first, end = ends
+        at_end = first <= EDGE_SAMPLES or end >= mask.size - EDGE_SAMPLES
         is_joint_at_rest = [
             _compute_magnitude(velocity[mask, j]) <= MAX_REST_SPEED * typical_speed
             for j, typical_speed in zip(self._joints, typical_speeds, strict=True)
@@ -511,11 +544,13 @@ def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
         state: number of the hypothesis.
     """
     hypotheses = [ON, state]
+    # Residuals (2, n) of all samples in which both are known.
     pooled_residuals = np.concatenate(residuals, axis=1)[hypotheses]
     pooled_residuals = pooled_residuals[:, np.isfinite(pooled_residuals).all(axis=0)]
     if not pooled_residuals.size:
         return [np.zeros((2, run_residuals.shape[1])) for run_residuals in residuals]
     scale = float(np.median(np.abs(pooled_residuals).min(axis=0)))
+    # Without noise, the smaller residual may be zero at most samples.
     scale = max(scale, MIN_SCALE_SHARE * _compute_magnitude(pooled_residuals[1]))
     if not scale > 0:
         return [np.zeros((2, run_residuals.shape[1])) for run_residuals in residuals]
@@ -536,8 +571,10 @@ def _choose_second_hypothesis(costs: Array) -> Mask:
     the choices that led there.
     """
     # Python's own numbers: an operation of NumPy takes ten times as long for two of them.
+    # `first_total` is the lowest cost of a sequence so far that ends in the first hypothesis.
     first_costs, second_costs = costs.tolist()
     first_total, second_total = first_costs[0], second_costs[0]
+    # Whether the best sequence that ends in the first or second hypothesis changed to it here.
     from_other = [(False, False)]
     for first_cost, second_cost in zip(first_costs[1:], second_costs[1:], strict=True):
         first_with_change = second_total + CHANGE_COST
@@ -555,7 +592,7 @@ def _choose_second_hypothesis(costs: Array) -> Mask:
 
 
 def _remove_short_intervals(mask: Mask) -> Mask:
-    """Return a mask without intervals that are too short."""
+    """Return a mask (T,) without intervals of fewer than `MIN_SAMPLES` samples."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
         result[first:end] = end - first >= MIN_SAMPLES
@@ -563,9 +600,10 @@ def _remove_short_intervals(mask: Mask) -> Mask:
 
 
 def _compute_magnitude(values: Array) -> float:
-    """Return a quantile of magnitudes (n,).
+    """Return a typical magnitude of values (n,), the quantile `MAGNITUDE_QUANTILE`; 0 without any.
 
-    It excludes impacts, which the smoothed motion does not reproduce.
+    The quantile excludes impacts, which the smoothed motion does not reproduce. Values that are not
+    finite are left out.
     """
     finite = np.abs(values[np.isfinite(values)])
     return float(np.quantile(finite, MAGNITUDE_QUANTILE)) if finite.size else 0.0

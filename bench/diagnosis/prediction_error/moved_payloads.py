@@ -15,18 +15,22 @@ from sims.core.simulator import Array
 from sims.robot.robot_simulator import RobotSimulator
 
 
-def list_moved_payloads(evaluator: RunEvaluator, name: str, c: Array) -> list[tuple[str, Array]]:
-    """Return a payload moved to the bodies at the joints of its body.
+def list_moved_payloads(
+    evaluator: RunEvaluator, name: str, coefficients: Array
+) -> list[tuple[str, Array]]:
+    """Return a payload moved to the bodies that joints connect with its body.
 
-    The payload stays where it is in space in the mean pose in which the runs begin.
+    The payload stays where it is in space in the mean pose in which the runs begin; its position is
+    clipped to the bounds of the other body.
 
     Args:
         evaluator: the runs.
         name: name of the effect, such as ``payload@forearm``.
-        c: (4,) mass in kg, and position in m from the centre of mass of the body.
+        coefficients: (4,) mass in kg, and position in m from the centre of mass of the body, in its
+            frame.
 
     Returns:
-        Names and coefficients of payloads in the evaluator; empty for any other effect.
+        Names and coefficients (4,) of payloads in the evaluator; empty for any other effect.
     """
     law, _, place = name.partition("@")
     simulator = evaluator.simulator
@@ -44,17 +48,19 @@ def list_moved_payloads(evaluator: RunEvaluator, name: str, c: Array) -> list[tu
     data.qpos[simulator.addresses.positions] = begin
     mujoco.mj_kinematics(model, data)
     body = bodies[place]
-    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ (model.body_ipos[body] + c[1:])
-    # Bodies without joints move with the body that carries them.
-    carrier = model.body_weldid[model.body_parentid]
+    mass, position = coefficients[:1], coefficients[1:]
+    # The point mass in the frame of the world.
+    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ (model.body_ipos[body] + position)
+    # Parent of each body. A body without joints moves with the body to which it is welded.
+    parent = model.body_weldid[model.body_parentid]
     moved = []
-    for other, number in bodies.items():
-        effect = f"payload@{other}"
-        is_linked = carrier[number] == body or carrier[body] == number
-        if not is_linked or effect not in evaluator.coefficient_slices:
+    for other_name, other in bodies.items():
+        effect = f"payload@{other_name}"
+        are_linked = parent[other] == body or parent[body] == other
+        if not are_linked or effect not in evaluator.coefficient_slices:
             continue
-        frame = data.xmat[number].reshape(3, 3)
-        offset = frame.T @ (point - data.xpos[number]) - model.body_ipos[number]
+        rotation = data.xmat[other].reshape(3, 3)
+        other_position = rotation.T @ (point - data.xpos[other]) - model.body_ipos[other]
         low, high = np.array(compute_coefficient_bounds(evaluator, effect)).T
-        moved.append((effect, np.clip(np.concatenate([c[:1], offset]), low, high)))
+        moved.append((effect, np.clip(np.concatenate([mass, other_position]), low, high)))
     return moved

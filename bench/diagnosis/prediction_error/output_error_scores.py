@@ -49,13 +49,16 @@ MAX_FITTED = 3
 
 
 def fit_best_scored(scores: OutputErrorScores) -> FittedModel:
-    """Fit the single effects that explain most of the simulation residual.
+    """Fit the single effects that explain most of the simulation residual, one after another.
+
+    Coefficients of the best effects are refined first. The fits end with the first model that
+    explains the runs, from which needless effects are removed.
 
     Args:
         scores: scores of the effects of a robot on the ground.
 
     Returns:
-        The best model, or the base model.
+        The best model, which may be the base model.
     """
     context = scores.context
     best = context.search.base_model
@@ -94,8 +97,8 @@ class OutputErrorScores:
     def list_starts(self) -> list[FitStart]:
         """Return starts with one effect each, the one with the smallest residual first.
 
-        The effects that gain most by regression are simulated, because a response is linear only
-        for small coefficients.
+        The effects that gain most by regression are simulated with their coefficients from it,
+        because a response is linear only for small coefficients.
         """
         regression, starts = self.regression, dict[str, FitStart]()
         net_gains = regression.compute_net_gains()
@@ -120,6 +123,7 @@ class OutputErrorScores:
         """Regression (1) of the residual of the base model on the candidates of the library."""
         context, followed = self.context, self.context.filters.base
         library = context.columns.library
+        # Responses (R, T, C, K) of K candidates.
         responses = compute_sensitivities(followed, library)
         for column, probe in enumerate(library.probes):
             if self._changes_geometry(probe):
@@ -129,6 +133,7 @@ class OutputErrorScores:
         projected = self.simulations.project(
             np.concatenate([fitter.scale_by_noise(responses), target[..., None]], axis=3)
         )
+        # Inner products of all columns; the last one is the residual.
         products = projected.transpose(0, 2, 1) @ projected
         contains = {
             name: effect.contains for name, effect in context.evaluator.available_effects.items()
@@ -141,18 +146,23 @@ class OutputErrorScores:
         )
 
     def _changes_geometry(self, probe: CandidateDirection) -> bool:
-        """Return whether a candidate moves the points at which wheels and feet touch."""
+        """Return whether a candidate moves the points at which wheels and feet touch.
+
+        It does if a member of its effect writes one of the fields `GEOMETRY_FIELDS` of the model.
+        """
         effect = self.context.evaluator.available_effects[probe.effect]
+        laws = [member.of or member.name for member in members_of(effect)]
         return any(
-            not GEOMETRY_FIELDS.isdisjoint(MODEL_FIELD_EFFECTS[member.of or member.name].fields)
-            for member in members_of(effect)
-            if (member.of or member.name) in MODEL_FIELD_EFFECTS
+            not GEOMETRY_FIELDS.isdisjoint(MODEL_FIELD_EFFECTS[law].fields)
+            for law in laws
+            if law in MODEL_FIELD_EFFECTS
         )
 
     def _simulate_geometry(self, probe: CandidateDirection) -> Array:
         """Return the response (R, T, C) to another geometry, per unit of the coefficient.
 
-        It is a central difference of simulations that begin with settled contacts.
+        It is a central difference of simulations, each from first states whose contacts are in
+        equilibrium for its geometry. A reading that diverges has no response.
 
         Args:
             probe: candidate whose coefficient changes.
@@ -161,9 +171,10 @@ class OutputErrorScores:
         place = evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
         step = self.simulations.get_difference(place)
         simulated = []
-        for sign in (1.0, -1.0):
+        for change in (step, -step):
             changed = theta.copy()
-            changed[place] += sign * step
+            changed[place] += change
             simulated.append(self.simulations.simulate_settled(changed))
-        response: Array = np.nan_to_num((simulated[0] - simulated[1]) / (2.0 * step))
+        increased, decreased = simulated
+        response: Array = np.nan_to_num((increased - decreased) / (2.0 * step))
         return response

@@ -178,12 +178,15 @@ class LibraryColumns:
         return group_coefficients(self.filters.evaluator, self.library.probes, group, solution)
 
     def regression(self, model: FittedModel) -> ModelRegression:
-        """Return the cached regression with the effects of a fitted model in the filter's model.
+        """Return the regression with the effects of a fitted model in the filter's model.
 
         The candidates are the library and forces of any shape. The derivatives by the coefficients
         of the model are part of every set, so that a regression about nearly the same coefficients
-        gives the same gains to first order. The cached one is therefore reused if coefficients
-        hardly differ.
+        gives the same gains to first order. A regression about the same effects is therefore cached
+        and reused if no parameter differs by more than the share `RELATIVE_DIFFERENCE`.
+
+        Args:
+            model: the fitted model.
         """
         theta, names = model.fit.theta, model.effects
         if names in self._regressions:
@@ -201,6 +204,9 @@ class LibraryColumns:
         Each effect is simulated in the linear model as it is, and with one coefficient displaced at
         a time. The derivative is the difference of the two responses divided by the displacement.
         Responses are about the measured motion.
+
+        Args:
+            start: the model, with the coefficients at which derivatives are taken.
         """
         evaluator, followed = self.filters.evaluator, self.filters.base
         tangents = [_make_tangent_probes(evaluator, name, start.theta) for name in start.effects]
@@ -208,10 +214,11 @@ class LibraryColumns:
             followed, [probe for effect_probes in tangents for probe in effect_probes]
         )
         responses = compute_sensitivities(followed, columns)
+        # The columns of an effect begin with the effect as it is.
         indices, derivatives, first_column = list[int](), [], 0
         for name, (whole_change, *displaced) in zip(start.effects, tangents, strict=True):
             for k, probe in enumerate(displaced):
-                # A coefficient without a range has no derivative.
+                # A coefficient whose bounds are equal is not displaced; its derivative is zero.
                 step = float(probe.coefficients[k] - whole_change.coefficients[k]) or np.inf
                 change = responses[..., first_column + 1 + k] - responses[..., first_column]
                 derivatives.append(change / step)
@@ -225,8 +232,8 @@ def list_probes(
 ) -> list[CandidateDirection]:
     """Return small trial coefficients (probes) of effects; their responses are regressors.
 
-    An effect with several shapes has several probes, for example one for each period of a periodic
-    force.
+    An effect has a probe for each of its coefficients in which it is linear, and these for each of
+    its shapes, for example for each period of a periodic force.
 
     Args:
         evaluator: the runs.
@@ -238,10 +245,9 @@ def list_probes(
         bounds = compute_coefficient_bounds(evaluator, name)
         for probe in iterate_first_probes(evaluator, model_effects, name):
             # The value in the model file may be too large, so the correction may be negative.
-            signed = probe.can_be_negative or (
-                bounds[probe.coefficient_index][0] < 0 and not probe.is_single_size
-            )
-            probes.append(replace(probe, can_be_negative=signed))
+            low, _ = bounds[probe.coefficient_index]
+            can_be_negative = probe.can_be_negative or (low < 0 and not probe.is_single_size)
+            probes.append(replace(probe, can_be_negative=can_be_negative))
     return probes
 
 
@@ -253,9 +259,14 @@ def group_coefficients(
 ) -> Array:
     """Return the coefficients (k,) of an effect from the regression, within their bounds.
 
-    The regression gives one factor for each column (response to one probe). Most effects are linear
-    in one or more coefficients, which these factors are. An effect with probe points, whose
-    coefficients are not linear, combines the points of its probes.
+    The regression gives one factor for each column, which is the response to one probe: trial
+    coefficients of the effect.
+
+    - Most effects are linear in one or more coefficients, which these factors are. The others, such
+      as a period, are those of the probe.
+    - An effect that is valid only at the size of its probe keeps the coefficients of the probe.
+    - An effect with probe points is not linear in its coefficients. It combines the points of its
+      probes, weighted by the factors.
 
     Args:
         evaluator: the runs.
@@ -271,7 +282,6 @@ def group_coefficients(
         return clip_coefficients(evaluator, group.effect, effect.combine(points, solution / sizes))
     coefficients = group_probes[0].coefficients.copy()
     for column, value in zip(group.column_indices, solution, strict=True):
-        # A fixed change is valid only at its own size.
         if not probes[column].is_single_size:
             coefficients[probes[column].coefficient_index] = value
     return clip_coefficients(evaluator, group.effect, coefficients)
@@ -282,9 +292,9 @@ def build_regression_about(
 ) -> ModelRegression:
     """Set up the regression of innovations on candidates, with effects in the filter's model.
 
-    The columns of the present effects, as a whole and by each coefficient, are added after those of
-    the candidates and are part of every set. So a candidate gains only by what a change of the
-    present coefficients cannot explain.
+    The columns of the effects that are in the model, as they are and with each coefficient
+    displaced, are added after those of the candidates and are part of every set. So a candidate
+    gains only by what a change of the present coefficients cannot explain.
 
     Args:
         current: the runs, filtered with these effects.
@@ -293,6 +303,7 @@ def build_regression_about(
     """
     own_columns: dict[str, list[int]] = {}
     probes: list[CandidateDirection] = []
+    # Number of columns of the candidates.
     count = sum(len(part.probes) for part in columns)
     for name in current.names:
         tangents = _make_tangent_probes(followed.evaluator, name, current.followed.theta)
@@ -309,9 +320,9 @@ def _make_tangent_probes(
 ) -> list[CandidateDirection]:
     """Return probes for an effect of the model: as it is, and with each coefficient displaced.
 
-    The first shows the whole change by the effect; the differences of the others from it are the
-    derivatives by the coefficients. A displacement goes downwards if the coefficient is at its
-    upper bound.
+    The first shows the whole change by the effect; the differences of the others from it show the
+    derivatives by the coefficients. A displacement is a small share of the coefficient, or of its
+    range if the coefficient is small; it goes downwards at the upper bound.
 
     Args:
         evaluator: the runs.

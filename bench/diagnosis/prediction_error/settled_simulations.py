@@ -75,13 +75,17 @@ class SettledSimulations:
     def refine(self, start: FitStart) -> FitStart:
         """Return a start with coefficients that minimise the projected residual (1).
 
+        They are improved by a few Gauss-Newton steps with difference quotients, until a step does
+        not decrease the sum of squares much. A step that increases it is not made.
+
         Args:
-            start: start whose coefficients are improved by Gauss-Newton steps.
+            start: start of a fit; its first states are kept.
         """
         theta = start.theta
         bounds = get_bounds_by_index(self.fitter.evaluator, start.effects)
         residual = self.compute_residual(theta)
         for _ in range(MAX_REFINEMENTS):
+            # Derivatives of the residual by each coefficient.
             columns = []
             for place, (_, high) in bounds.items():
                 step = self.get_difference(place)
@@ -89,6 +93,7 @@ class SettledSimulations:
                 changed[place] += step if theta[place] + step <= high else -step
                 difference = self.compute_residual(changed) - residual
                 columns.append(difference / (changed[place] - theta[place]))
+            # A simulation may diverge.
             if not np.isfinite(columns).all():
                 break
             change = np.linalg.lstsq(np.stack(columns, axis=1), -residual, rcond=None)[0]
@@ -141,9 +146,14 @@ class SettledSimulations:
         return self.fitter.settle(theta, self.states, True, self._known_jacobians)
 
     def project(self, values: Array) -> Array:
-        """Return P v of (1), (R, n, K), for values v (R, T, C, K) in units of the noise."""
+        """Return values without what first states explain: P v of (1), (R, n, K).
+
+        Args:
+            values: v (R, T, C, K), K changes of the readings in units of the noise.
+        """
         bases = self.fitter.factors.q
         runs, samples, channels, count = values.shape
+        # The last of the n rows belong to the prior of first states, which are not changed here.
         rows = np.zeros((runs, bases.shape[1], count))
         rows[:, : samples * channels] = values.reshape(runs, -1, count)
         projected: Array = rows - bases @ (bases.transpose(0, 2, 1) @ rows)
@@ -154,6 +164,11 @@ def refine_with_wide_differences(
     fitter: FirstStateFitter, fit: TrajectoryFit, bounds: Mapping[int, Bounds]
 ) -> TrajectoryFit:
     """Refine the coefficients of a robot on the ground by wide difference quotients (2).
+
+    The simulated motion jumps where contacts open or close. Derivatives by small differences of the
+    coefficients show these jumps; differences over a wide change hardly do. A few Gauss-Newton
+    steps are made with them, each with first states fitted anew, while they decrease the sum of
+    squares.
 
     Args:
         fitter: simulates the pieces, and fits first states with a linearisation near the fit.
@@ -175,6 +190,7 @@ def refine_with_wide_differences(
         if place not in bounds:
             continue
         places.append(place)
+        # The derivative by small differences tells about how wide the change must be.
         norm = np.sqrt(_sum_squares(fitter.scale_by_noise(fit.parameter_jacobian[..., column])))
         quotient = _compute_wide_quotient(fitter, theta, states, place, bounds[place], norm)
         if not np.isfinite(quotient[np.isfinite(fitter.evaluator.observed)]).all():
@@ -195,6 +211,7 @@ def refine_with_wide_differences(
             break
         theta, states, residual = tried, tried_states, tried_residual
         squares = _sum_squares(residual)
+    # First states with settled contacts may be worse than those of the fit.
     if squares > _sum_squares(fitter.scale_by_noise(fitter.evaluator.observed - fit.simulated)):
         return replace(fit, jacobian=jacobian, is_own_jacobian=True)
     return replace(
@@ -212,6 +229,10 @@ def _compute_wide_quotient(
 ) -> Array:
     """Compute the difference quotient (2) by one coefficient, (R, T, C).
 
+    It is the change of the simulated readings between an increased and a decreased coefficient,
+    with first states fitted anew on both sides, divided by the change of the coefficient. The width
+    is adapted until the readings change by about `TARGET_RESPONSE` on either side.
+
     Args:
         fitter: simulates the pieces, and fits their first states.
         theta: (P,) parameters.
@@ -221,6 +242,7 @@ def _compute_wide_quotient(
         norm: norm of the derivative by small differences, in units of the noise, as a first guess.
     """
     low, high = bounds
+    # Half the change of the coefficient.
     half = float(TARGET_RESPONSE / max(norm, TARGET_RESPONSE / (high - low)))
     for _ in range(MAX_TRIED_DIFFERENCES):
         ends, simulated = [], []
@@ -234,11 +256,11 @@ def _compute_wide_quotient(
         response = 0.5 * np.sqrt(_sum_squares(fitter.scale_by_noise(difference)))
         if MIN_RESPONSE < response < MAX_RESPONSE or not np.isfinite(response):
             break
-        # Inverted, because the response may be zero.
-        share = np.clip(
+        # The width is divided by the clipped ratio, because the response may be zero.
+        ratio = np.clip(
             response / TARGET_RESPONSE, 1.0 / MAX_DIFFERENCE_RATIO, MAX_DIFFERENCE_RATIO
         )
-        half /= float(share)
+        half /= float(ratio)
     return quotient
 
 
