@@ -96,9 +96,10 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     """Identify the effects and the base parameters of a long recording by prediction errors.
 
     The textbook effects (Coulomb friction, drag, inertia of the bodies) are fitted in the filter's
-    model and pruned. Then up to `MAX_ADDED` further effects are added, each with the largest gain
-    by regression, until the missing forces are negligible or no effect pays. The result is
-    simulated, but not fitted by simulation: an incomplete model drifts away over a long run.
+    model, and those that gain too little are removed. Then up to `MAX_ADDED` further effects are
+    added, each with the largest gain by regression, until the missing forces are negligible or no
+    effect gains enough. The result is simulated, but not fitted by simulation: an incomplete model
+    drifts away over a long run.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -146,16 +147,18 @@ def is_long(evaluator: RunEvaluator) -> bool:
 def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
     """Return whether a set leaves a negligible share of the base model's missing forces.
 
+    Missing forces are the standard deviations of the process noise of a filter.
+
     Args:
         context: search, filters and regressions of the recording.
         current: the set, with its filter.
     """
-    share = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
-    return not current.followed.has_missing_force or bool((current.followed.force < share).all())
+    limits = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
+    return not current.followed.has_missing_force or bool((current.followed.force < limits).all())
 
 
 def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
-    """Return the bounds of the base parameters and of some effects, by index in theta.
+    """Return the bounds of the free base parameters and of some effects, by index in theta.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -196,10 +199,13 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
 def _compute_min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
     """Return the minimum gain of an effect of a set in twice the log-likelihood.
 
+    It is the penalty of the effect, or a small share of the gain of the set over the base model if
+    that is larger.
+
     Args:
         context: search, filters and regressions of the recording.
         current: the set, with its filter.
-        name: name of the effect, whose penalty is the least gain.
+        name: name of the effect.
     """
     filters = context.filters
     return max(
@@ -213,9 +219,10 @@ def _prune_set(
     """Remove the effects that gain too little, the least first, and maximise the likelihood again.
 
     The gain of an effect is its Wald statistic: the loss in twice the log-likelihood without it, to
-    second order. If the removed effects together lose more than twice the gain at which a
-    maximisation ends (`MIN_STEP_GAIN`), the other coefficients may have moved: the likelihood is
-    maximised again, and the remaining effects are tested again.
+    second order. If the removed effects together lose little, the set without them is the result.
+    If they lose more than twice the gain at which a maximisation ends (`MIN_STEP_GAIN`), the best
+    values of the other coefficients may have changed: the likelihood is maximised again, and the
+    remaining effects are tested again.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -249,7 +256,6 @@ def _prune_set(
         theta[context.evaluator.coefficient_slices[name]] = 0.0
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
-    # The other coefficients may have moved.
     if lost_gain > 2.0 * MIN_STEP_GAIN:
         return _prune_set(context, _fit_set(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains
@@ -260,9 +266,9 @@ def _add_next_effect(
 ) -> FilteredSet | None:
     """Add the effect that gains most by regression, in place of the effects that it contains.
 
-    The regression about the present set chooses the effect and its first coefficients. The larger
-    set is fitted, and must gain enough. The effect must also predict left-out runs better, because
-    a model that stays incomplete lets an effect imitate a missing force in some of the runs.
+    The regression about the present set chooses the effect and its first coefficients. The effect
+    must predict left-out runs better, because a model that stays incomplete lets an effect imitate
+    a missing force in some of the runs. The larger set is then fitted, and must gain enough.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -277,6 +283,7 @@ def _add_next_effect(
     regression, _ = build_regression_about(current, [columns], current.followed)
     gains = regression.compute_net_gains()
     for i, group in enumerate(regression.groups):
+        # Effects of the set cannot be added again.
         gains[i] *= group.effect not in current.names
     best = regression.groups[int(np.argmax(gains))]
     if not gains.max() > 0.0 or not regression.generalises([], [best]):
@@ -304,6 +311,9 @@ def _list_single_effects(context: SearchContext) -> Columns:
 
 def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
     """Simulate the runs with identified parameters, from fitted initial states.
+
+    Only the initial states are fitted, in a few iterations. The fit with the derivatives by all
+    parameters, which the search needs, then makes no step.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -136,10 +136,13 @@ class PredictionErrorSearch(EffectSearch):
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show.
 
-        A likely model from before is fitted first, if there is one; else a long recording is
-        identified by filters without simulation. If neither explains the runs, effects are
-        searched. The result is also stored in `best_supported_model`, for a search that is stopped
-        later.
+        - If a likely model is known from before, it is fitted, and returned if it explains the
+          runs.
+        - Otherwise, a long recording whose model stays incomplete is identified by filters without
+          simulation.
+        - If neither gives a result, effects are searched.
+
+        The result is also stored in `best_supported_model`, for a search that is stopped later.
 
         Raises:
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
@@ -162,7 +165,12 @@ class PredictionErrorSearch(EffectSearch):
     def _correct_shown_step_errors(self, model: FittedModel) -> FittedModel:
         """Correct the errors of the integrator's steps if the filter with a model shows them.
 
-        Without the effects of the model, the missing force could imitate these errors.
+        Without the effects of the model, the missing force could imitate these errors. Nothing is
+        done if they are already corrected, for a model without effects or without a successful fit,
+        and for joints in series, which the filter does not follow.
+
+        Args:
+            model: the fitted model.
         """
         if (
             self.evaluator.discretisation_correction is not None
@@ -189,16 +197,21 @@ class PredictionErrorSearch(EffectSearch):
     def _search_effects(self) -> FittedModel:
         """Select effects by regression and fit them by simulation, until only noise remains.
 
-        A robot with unknown servos is identified servo by servo, and nothing else is done.
-        Otherwise each further method is slower, so it is tried only if the best model does not
-        explain the runs: dry friction alone, the selected set, likely effects alone (first of all
-        if servos reach their limits), effects with many shapes, effects that regression missed
-        (singly, then one by one), one effect in place of several, and at last series effects
-        (elastic or slack transmissions). If no effect was accepted, the selected set is fitted
-        whole.
+        Each further method is slower, so it is tried only if the best model so far does not explain
+        the runs:
 
-        The functions named ``check_``, and `compare_friction_forms`, end the search by raising
-        `SoftFrictionError` if dry friction is likelier in MuJoCo's soft form.
+        1. single effects of a robot on the ground, by the residual of simulations;
+        2. likely effects alone, if servos reach their limits (otherwise after 4);
+        3. identification servo by servo, after which nothing else is done if it succeeds;
+        4. dry friction alone, then the set that regression selects;
+        5. effects with many shapes, such as forces of any period;
+        6. effects that regression missed: singly, then one by one in addition to others;
+        7. one effect in place of several;
+        8. series effects (elastic or slack transmissions).
+
+        If no effect was accepted, the selected set is fitted whole. The functions named ``check_``,
+        and `compare_friction_forms`, end the search by raising `SoftFrictionError` if dry friction
+        is likelier in MuJoCo's soft form.
 
         Raises:
             SoftFrictionError: dry friction has MuJoCo's soft form; the caller searches again in
@@ -251,9 +264,9 @@ class PredictionErrorSearch(EffectSearch):
     def _identify_servos(self, selected: Selected) -> IdentifiedSet | None:
         """Identify the servos of a real arm, whose model is incomplete at most joints.
 
-        This takes many simulations, so it is done only if neither the base model, one effect, nor
-        the selected effects come near the data. The result is used only if it adds effects at most
-        joints and leaves a smaller residual than the selection.
+        This takes many simulations, so it is done only if neither the base model, one effect alone,
+        nor the selected effects come near the data. The result is used only if it adds effects at
+        most joints and leaves a smaller residual than the selection.
 
         Args:
             selected: the selection by regression.
@@ -339,8 +352,9 @@ class PredictionErrorSearch(EffectSearch):
     def fit_to_convergence(self, model: FittedModel) -> FittedModel:
         """Return the model fitted to final convergence.
 
-        For a robot on the ground, wide differences then replace the derivatives, since small ones
-        show the jumps of contacts and would make the intervals of the coefficients too narrow.
+        For a robot on the ground, derivatives by differences over wide changes of the coefficients
+        then replace those by small changes, since these show the jumps of contacts and would make
+        the intervals of the coefficients too narrow.
 
         Args:
             model: model whose coefficients are reported.
@@ -357,7 +371,8 @@ class PredictionErrorSearch(EffectSearch):
         )
         cost = TrajectoryFitter(self.evaluator, self.noise).compute_cost(fit)
         refined = self._rate_fit(replace(fit, cost=cost))
-        # Central differences would be small again.
+        # Store the fit as its own refinement, since a refinement by small central differences would
+        # undo this.
         self.refined_jacobians[id(refined.fit)] = refined.fit, refined.fit
         self.models[frozenset(model.effects)] = refined
         return refined
@@ -366,7 +381,8 @@ class PredictionErrorSearch(EffectSearch):
         """Fit a model that leaves more than noise again from better first states, if there are any.
 
         A joint that sticks, or a motion that amplifies errors, may leave the first states of a run
-        in a local minimum, which looks like a missing effect.
+        in a local minimum, which looks like a missing effect. A model whose simulation fails is
+        returned as it is.
 
         Args:
             model: the fitted model.
@@ -403,8 +419,12 @@ class PredictionErrorSearch(EffectSearch):
     def take_over(self, other: PredictionErrorSearch) -> None:
         """Reuse the filter and the responses of another search of the same base model.
 
-        Both searches have the same runs. If the form of the dry friction that effects add differs,
-        the base model has none of it.
+        Both searches have the same runs. The form of the dry friction that effects add may differ,
+        since the base model has none of it. Likelihoods of other models are reused only if the
+        evaluator is the same, so that the form is.
+
+        Args:
+            other: the other search.
         """
         self.evaluator.filtered_runs = replace(
             other._search_context.filters.base, evaluator=self.evaluator
@@ -427,9 +447,16 @@ class PredictionErrorSearch(EffectSearch):
     def compute_p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
 
-        Three tests are made, each slower and more accurate; the p-value of the first that is not
-        significant is returned. They are the linear regression of the innovations, the filter with
-        the effect in its model at a few shares of the coefficient, and the fit by simulation.
+        Three tests are made, each slower and more accurate:
+
+        1. linear regression of the innovations, which also chooses the effect;
+        2. a filter with the effect in its model, at a few shares of the coefficient;
+        3. a fit by simulation.
+
+        The p-value of the first test that is not significant is returned, or that of the last one.
+
+        Args:
+            model: the fitted model; only the first test is made if its simulation fails.
         """
         scores = self.score_missing_effects(model)
         if scores.p_value > EFFECT_P_VALUE_THRESHOLD or not np.isfinite(model.fit.cost):
@@ -437,7 +464,9 @@ class PredictionErrorSearch(EffectSearch):
         filters = self._search_context.filters
         columns = self._search_context.columns
         name = scores.effects[0]
-        coefficients = columns.coefficients(*scores.peaks[0][0])
+        # The best shape of the best effect.
+        (group, solution), *_ = scores.peaks[0]
+        coefficients = columns.coefficients(group, solution)
         start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, coefficients)
         indices = self.evaluator.get_coefficient_indices(name)
         library_size = len(self.evaluator.library)
@@ -460,11 +489,11 @@ class PredictionErrorSearch(EffectSearch):
         model: FittedModel,
         noise_residual: Array | None = None,  # noqa: ARG002
     ) -> CandidateScores:
-        """Score every effect that the model lacks by the innovations.
+        """Score every effect that the model lacks by the innovations; the scores are cached.
 
         Args:
-            model: the model.
-            noise_residual: not used.
+            model: the model; models with the same effects have the same scores.
+            noise_residual: not used; the base class estimates the noise from it.
         """
         key = frozenset(model.effects)
         if key not in self.scores_by_effects:
@@ -472,9 +501,15 @@ class PredictionErrorSearch(EffectSearch):
         return self.scores_by_effects[key]
 
     def _score_missing_effects(self, model: FittedModel) -> CandidateScores:
-        """Score the effects that a model lacks by regression of the innovations of its filter."""
+        """Score the effects that a model lacks by regression of the innovations of its filter.
+
+        A model with joints in series, which the filter does not follow, gets the scores of the base
+        model with the p-value 1, so that no effect counts as missing.
+
+        Args:
+            model: the fitted model.
+        """
         if has_series(self.evaluator, model.effects):
-            # The candidates are linear about the robot without additional joints.
             return replace(self.score_missing_effects(self.base_model), p_value=1.0)
         self._report_scoring(model)
         regression, _ = self._search_context.columns.regression(model)
@@ -485,8 +520,9 @@ class PredictionErrorSearch(EffectSearch):
     def base_scores(self) -> CandidateScores | None:
         """Scores of all effects about the base model; None if no regression was made.
 
-        If the search did not need the scores, those of the regression that selected effects are
-        returned. For a robot on the ground, it is the regression of simulation residuals.
+        Scores that the search computed are returned. Otherwise they are computed from the
+        regression that selected effects: that of simulation residuals for a robot on the ground,
+        or that of innovations.
         """
         regression = (
             self._output_error_scores.known_regression
@@ -499,12 +535,15 @@ class PredictionErrorSearch(EffectSearch):
         return scores
 
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
-        """Return the p-value of the best additional force and the signal it depends on.
+        """Return the p-value of the best additional force, and the signal it depends on.
 
         The candidates are forces that are any piecewise linear function of one signal ("hats"),
         such as a position or the time. A significant one shows a force that no effect of the
-        library describes. The result is None for effects with own states in series, about which the
-        filter is not linear.
+        library describes. The signal is empty without candidates. The result is None for a model
+        with joints in series, which the filter does not follow.
+
+        Args:
+            model: the fitted model.
         """
         if has_series(self.evaluator, model.effects):
             return None
@@ -514,6 +553,7 @@ class PredictionErrorSearch(EffectSearch):
         else:
             current = FilteredSet(filters.get_filter(model), model.effects)
             regression, _ = build_regression_about(current, [columns.hats], filters.base)
+        # Candidates are named by the signals they depend on.
         labels = {probe.effect for probe in columns.hats.probes}
         scores = score_by_regression(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""
@@ -522,25 +562,33 @@ class PredictionErrorSearch(EffectSearch):
         """Return the start of a final fit, with derivatives about the model.
 
         A fit with known derivatives needs fewer simulations. The fit of the model has those by
-        parameters, and its filter those by initial states, if the filter follows the runs.
+        parameters. Its filter has those by initial states, unless the model has no effects or has
+        joints in series, or the filter does not follow the runs.
+
+        Args:
+            model: the fitted model.
         """
         start = model.fit.make_start_with_derivatives()
         if not model.effects or has_series(self.evaluator, model.effects):
             return start
         followed = self._search_context.filters.get_similar_filter(model)
-        return (
-            replace(start, state_jacobian=followed.compute_state_sensitivities())
-            if followed.has_expected_innovations
-            else start
-        )
+        if not followed.has_expected_innovations:
+            return start
+        return replace(start, state_jacobian=followed.compute_state_sensitivities())
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
-        """Return a start with derivatives by its coefficients about the measured motion."""
-        has_free_base = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
+        """Return a start with derivatives by its coefficients about the measured motion.
+
+        The start is returned as it is if it has derivatives or no effects. So it is if base
+        parameters are fitted too, since only derivatives by coefficients are known, and with joints
+        in series, which the filter does not follow.
+
+        Args:
+            start: start of a fit.
+        """
+        free_base_parameters = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
         needs_jacobian = start.known_jacobian is None and start.effects
-        # The derivatives are those by coefficients of effects alone, and linear without states of
-        # elastic joints.
-        if not needs_jacobian or has_free_base or has_series(self.evaluator, start.effects):
+        if not needs_jacobian or free_base_parameters or has_series(self.evaluator, start.effects):
             return start
         return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 

@@ -41,7 +41,13 @@ class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
     def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
-        """Return the p-value of a gain by its chi-squared law; no surrogates are simulated."""
+        """Return the p-value of a gain by its chi-squared law; no surrogates are simulated.
+
+        Args:
+            rest: not used; the model without the effect, to which the base class fits surrogates.
+            effect: name of the effect.
+            gain: its gain in twice the log-likelihood.
+        """
         slot = self.search.evaluator.coefficient_slices[effect]
         return compute_p_value_of_gain(
             gain, slot.stop - slot.start, len(self.search.evaluator.library)
@@ -64,10 +70,14 @@ class Confirmation(Inquiry):
         self._robot = search
 
     def answered(self) -> DiagnosisResult:
-        """Return the result of the complete diagnosis, by the steps of the module docstring.
+        """Return the result of the complete diagnosis.
 
-        The search stops at once if the base model does not fit at all. A set that filters
-        identified in an incomplete model gets its result without competing models and alternatives.
+        - If the base model does not fit at all, the search stops at once.
+        - If filters identified effects in a model that stays incomplete, these are the result.
+        - Otherwise the effects of the search are compared with competing models, validated on
+          held-out runs, tested for an unmodelled force, and compared with alternative causes.
+
+        If the cause is unknown and the effects leave most of the discrepancy, the result has none.
 
         Raises:
             SearchStoppedError: the search had to end early.
@@ -94,14 +104,15 @@ class Confirmation(Inquiry):
         self._model = search.fit_to_convergence(search.refit_first_states(self._model))
         lack_of_fit = assess_lack_of_fit(search, self._model)
         search_control.begin_question("alternatives")
-        found, trial = self._model, self._trial
+        # `_trial` is the validation on held-out runs, if there are any.
+        validation = self._trial
         model, causes = select_preferred_model(
-            self.alternative_finder(search, trial, lack_of_fit.has_structure), found
+            self.alternative_finder(search, validation, lack_of_fit.has_structure), self._model
         )
-        if model is not found:
+        if model is not self._model:
             model = search.fit_to_convergence(model)
-            if trial is not None:
-                trial.evaluate_models([model])
+            if validation is not None:
+                validation.evaluate_models([model])
         search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(causes),
@@ -111,7 +122,7 @@ class Confirmation(Inquiry):
             and is_unexplained(
                 lack_of_fit.has_structure, search.compute_p_value_of_missing_effect(model)
             ),
-            missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
+            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
         )
         verdict = decide_verdict(state)
         if verdict == "unknown" and state.closed < MIN_REMOVED_SHARE:
@@ -124,27 +135,30 @@ class Confirmation(Inquiry):
 
         The causes are the identified effects, in descending order of their gain. The verdict always
         counts an unexplained residual, since the model is known to be incomplete.
+
+        Args:
+            identified: the set, with the simulated model and the gain of each effect.
         """
         search = self._robot
         search_control = self._search_control
         model = identified.model
-        trial = None
+        validation = None
         if self._held_out is not None:
             search_control.begin_question("held_out")
-            trial = self._trial = HeldOutValidation(self._held_out)
-            trial.evaluate_models([search.base_model, model])
+            validation = self._trial = HeldOutValidation(self._held_out)
+            validation.evaluate_models([search.base_model, model])
         search_control.begin_question("structure")
         if identified.is_residual_tested:
             lack_of_fit = assess_lack_of_fit(search, model)
         else:
-            # It is far above the noise, and counts as structure.
+            # The residual is far above the noise, so it counts as structure without a test.
             lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(model.effects),
             closed=compute_gap_closed(search, model, lack_of_fit),
             unexplained=True,
-            missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
+            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
         )
         causes = sorted(
             (self._cause(name, gain) for name, gain in identified.gains.items()),
@@ -155,7 +169,7 @@ class Confirmation(Inquiry):
         return replace(result, is_incomplete=True)
 
     def _cause(self, name: str, gain: float) -> CauseEvidence:
-        """Return the evidence for an effect whose gain is that of filters.
+        """Return the evidence for an effect whose gain is that of filters, without alternatives.
 
         Args:
             name: name of the effect.
@@ -169,9 +183,10 @@ class Confirmation(Inquiry):
     def _evaluate_on_held_out_runs(self) -> None:
         """Predict held-out runs with the model and its competitors, and drop unhelpful effects.
 
-        Competitors are the models of the same size with about the same penalised likelihood.
-        Smaller models are fitted too, so that an effect that does not improve the prediction can be
-        left out. Nothing is done without held-out runs or without a model.
+        Competitors are the fitted models with the same number of effects and about the same
+        penalised likelihood. Models without one of the effects are fitted too, so that an effect
+        that does not improve the prediction can be left out. The model and the validation of this
+        diagnosis are replaced. Nothing is done without held-out runs or without a model.
         """
         if self._held_out is None or self._model is None:
             return
@@ -182,17 +197,16 @@ class Confirmation(Inquiry):
             for name in model.effects:
                 search.remove_effect(model, name)
         smaller_models = [m for m in search.models.values() if set(m.effects) < names and m.effects]
-        size = len(names)
-        competing_models = [
-            m for m in search.models.values() if len(m.effects) == size and m is not model
-        ]
+        limit = model.penalised_log_likelihood - COMPARED_MODEL_MARGIN
         competing_models = [
             m
-            for m in competing_models
-            if m.penalised_log_likelihood > model.penalised_log_likelihood - COMPARED_MODEL_MARGIN
+            for m in search.models.values()
+            if len(m.effects) == len(names)
+            and m is not model
+            and m.penalised_log_likelihood > limit
         ]
-        trial = HeldOutValidation(self._held_out)
-        trial.evaluate_models([search.base_model, model, *smaller_models, *competing_models])
+        validation = HeldOutValidation(self._held_out)
+        validation.evaluate_models([search.base_model, model, *smaller_models, *competing_models])
         self._search_control.check_not_stopped()
-        self._trial = trial
-        self._model = trial.drop_unhelpful_effects(search, model)
+        self._trial = validation
+        self._model = validation.drop_unhelpful_effects(search, model)

@@ -122,13 +122,14 @@ class ServoModel:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A law with simulated coefficients.
+    """A law at a joint that was simulated without a fit.
 
     Attributes:
         gain: estimated decrease of the joint's squared residual, as a share.
-        name: the effect.
+        name: the effect, a law at a place.
         coefficients: (k,) its coefficients.
-        parameters: values of the joint's other parameters that belong to them to first order.
+        parameters: values of the joint's other parameters that fit best together with these
+            coefficients, to first order.
     """
 
     gain: float
@@ -140,8 +141,9 @@ class _Trial:
 def has_unknown_servos(context: SearchContext) -> bool:
     """Return whether a robot has several joints, all with encoders and with servos of unknown gain.
 
-    Only then the servos are identified joint by joint. Gains are unknown if stiffness and damping
-    of every servo are free parameters of the base model.
+    Only then the servos are identified joint by joint. The positions of all joints, and nothing
+    else, must be recorded. Gains are unknown if stiffness and damping of every servo are free
+    parameters of the base model.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -149,6 +151,7 @@ def has_unknown_servos(context: SearchContext) -> bool:
     evaluator = context.evaluator
     coordinates = evaluator.simulator.system.coordinates
     free = {evaluator.parameters[i].name for i in evaluator.base_indices.tolist()}
+    # Servos are named by their inputs, such as ``u.elbow``; a joint without one has an empty name.
     servos = [get_servo_input(evaluator, joint) for joint in range(len(coordinates))]
     gains = {f"{law}@{servo.partition('.')[2]}" for law in SERVO_MODEL for servo in servos}
     return (
@@ -159,11 +162,14 @@ def has_unknown_servos(context: SearchContext) -> bool:
 
 
 def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]:
-    """Identify the servos of a robot that `has_unknown_servos`.
+    """Identify the servos of a robot that `has_unknown_servos`, all joints at once.
 
-    See the module docstring for the method. Laws (effects without their place) are chosen by some
-    of the runs; only joints whose last law helped are considered again in the next round. The
-    parameters are then fitted to all runs, and effects without a gain are removed.
+    1. Fit stiffness and damping of every servo, and dry friction where it helps.
+    2. In each round, add the best law (an effect without its place, such as ``drag.linear``) to
+       each joint whose last law helped, and try the laws of the best joint at all others.
+    3. Fit the parameters to all runs, and remove effects without a gain.
+
+    Steps 1 and 2 use some of the runs only.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -176,8 +182,8 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
     evaluator = context.evaluator
     evaluator.search_control.begin_stage("identifying the servos")
     all_runs = np.arange(len(evaluator.prepared_runs))
-    spread = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
-    fitter = _ServoFitter(context, spread.round().astype(np.intp))
+    searched_runs = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
+    fitter = _ServoFitter(context, searched_runs.round().astype(np.intp))
     joint_model = model = fitter.fit_joint_model()
     growing_joints = set(range(len(evaluator.channels)))
     for number in range(MAX_ROUNDS):
@@ -251,7 +257,7 @@ class _ServoFitter:
 
     @cached_property
     def _places(self) -> list[tuple[str, str, str]]:
-        """List joint, actuator and position channel of each joint, at which effects may act."""
+        """Names of joint, actuator and position channel of each joint, at which effects may act."""
         evaluator = self._evaluator
         return [
             (
@@ -266,8 +272,8 @@ class _ServoFitter:
     def _laws_at_joint(self) -> list[dict[str, str]]:
         """Map laws to effects for each joint, for example ``drag.linear`` to ``drag.linear@elbow``.
 
-        These are the effects of the joint's servo, transmission and sensor with few coefficients
-        and without own states, which the fit by blocks does not know.
+        These are the effects of the library at the joint, its actuator and its position sensor,
+        with few coefficients and without internal states, for which this fit has no first values.
         """
         evaluator = self._evaluator
         result: list[dict[str, str]] = []
@@ -292,14 +298,17 @@ class _ServoFitter:
         ]
 
     def _list_parameters(self, joint: int, laws: Sequence[str]) -> list[int]:
-        """Return the indices of the parameters that are fitted to the position of a joint."""
+        """Return the indices in theta of the parameters that are fitted to the position of a joint.
+
+        They are stiffness and damping of its servo, and the coefficients of its laws.
+        """
         indices = list(self._base_parameters[joint])
         for name in laws:
             indices += self._evaluator.get_coefficient_indices(name)
         return indices
 
     def _get_bounds(self, joint: int, laws: Sequence[str]) -> list[Bounds]:
-        """Return the bounds of the parameters of a joint."""
+        """Return the bounds of the parameters of a joint, in the order of `_list_parameters`."""
         evaluator = self._evaluator
         bounds: list[Bounds] = [
             compute_range_around(evaluator, i) for i in self._base_parameters[joint]
@@ -321,8 +330,9 @@ class _ServoFitter:
         for joint, available in enumerate(self._laws_at_joint):
             if DRY_FRICTION in available:
                 laws[joint] = (*laws[joint], available[DRY_FRICTION])
-                slot = self._evaluator.coefficient_slices[available[DRY_FRICTION]]
-                theta[slot] = TRIED_SHARES[0] * self._evaluator.parameters[slot.start].bounds[1]
+                (index,) = self._evaluator.get_coefficient_indices(available[DRY_FRICTION])
+                _, high = self._evaluator.parameters[index].bounds
+                theta[index] = TRIED_SHARES[0] * high
         larger = self.fit(self.simulate(theta, laws), FIRST_ITERATIONS)
         improved_joints = {
             joint: larger for joint in self._joints if self._helps(model, larger, joint)
@@ -333,8 +343,8 @@ class _ServoFitter:
         """Simulate the runs from the initial states of the base model.
 
         Args:
-            theta: (P,) parameters.
-            laws: names of the effects at each joint, of which the model takes note.
+            theta: (P,) parameters, which determine the simulation.
+            laws: names of the effects at each joint, of which the result takes note.
         """
         states = self.context.search.base_model.fit.initial_states[self.runs]
         thetas = np.tile(theta, (self.runs.size, 1))
@@ -344,7 +354,13 @@ class _ServoFitter:
         return ServoModel(theta, tuple(laws), simulated, costs)
 
     def _compute_residual(self, simulated: Array) -> Array:
-        """Return the residual (R, T, n) in units of the noise; zero where nothing was recorded."""
+        """Return the residual (R, T, n) in units of the noise; zero where nothing was recorded.
+
+        A sample that was recorded but not simulated has the residual `FAILED_RESIDUAL`.
+
+        Args:
+            simulated: (R, T, n) positions of n joints in R runs.
+        """
         residual = np.nan_to_num((self._observed - simulated) / self._sigma, nan=FAILED_RESIDUAL)
         masked: Array = np.where(self._mask, residual, 0.0)
         return masked
@@ -375,6 +391,7 @@ class _ServoFitter:
         }
         size = self._mask[:, :, 0].size
         blocks = {joint: np.empty((size, len(parameter_indices[joint]))) for joint in joints}
+        # Displace the first parameter of every joint, then the second, and so on.
         for column in range(max(map(len, parameter_indices.values()))):
             theta, steps = model.theta.copy(), dict[int, float]()
             for joint, indices in parameter_indices.items():
@@ -388,14 +405,15 @@ class _ServoFitter:
         return blocks
 
     def _compute_difference(self, theta: Array, joint: int, index: int) -> float:
-        """Return the step of a parameter for a difference quotient, away from its upper bound.
+        """Return the step of a parameter for a difference quotient; downwards at its upper bound.
 
-        Base parameters are shares by which gains of the servo change, so 1 + parameter is their
-        size.
+        It is a share of the size of the parameter. Base parameters of the joint are relative
+        changes of the gains of its servo, so their size is 1 + parameter. That of a coefficient is
+        at least its range.
         """
         low, high = self._evaluator.parameters[index].bounds
-        is_share = index in self._base_parameters[joint]
-        size = abs(1.0 + theta[index]) if is_share else max(abs(theta[index]), high - low)
+        is_relative = index in self._base_parameters[joint]
+        size = abs(1.0 + theta[index]) if is_relative else max(abs(theta[index]), high - low)
         step = STEP_SHARE * float(size)
         return step if theta[index] + step <= high else -step
 
@@ -453,6 +471,7 @@ class _ServoFitter:
             for joint in blocks:
                 factor = DAMPING_DECREASE if joint in accepted else DAMPING_INCREASE
                 damping[joint] *= factor
+            # Joints that rejected the step keep their parameters.
             if accepted:
                 return self._join(model, dict.fromkeys(accepted, trial))
         return None
@@ -460,14 +479,14 @@ class _ServoFitter:
     def _step_parameters(
         self, model: ServoModel, joint: int, block: Array, residual: Array, damping: float = 0.0
     ) -> Array:
-        """Return the parameters of a joint after a step of damped least squares, within bounds.
+        """Return the parameters (k,) of a joint after a damped least-squares step, within bounds.
 
         Args:
             model: the present model.
             joint: the joint.
-            block: (R T, k) its block of the Jacobian.
-            residual: (R T,) its residual.
-            damping: damping λ.
+            block: (R T, k) its block of the Jacobian, in units of the noise.
+            residual: (R T,) its residual, in units of the noise.
+            damping: Levenberg-Marquardt damping; none by default.
         """
         laws = model.laws[joint]
         present = model.theta[self._list_parameters(joint, laws)]
@@ -479,6 +498,10 @@ class _ServoFitter:
         """Return the model in which some joints have the parameters and laws of other models.
 
         It is simulated, unless one of the other models has exactly these parameters.
+
+        Args:
+            model: the model of all other joints.
+            model_of_joint: the other model for each of some joints.
         """
         theta, laws = model.theta.copy(), list(model.laws)
         for joint, other in model_of_joint.items():
@@ -496,10 +519,12 @@ class _ServoFitter:
     def add_laws(self, model: ServoModel, joints: Collection[int]) -> ServoModel:
         """Add to each joint the law that reduces its squared residual most, and fit all joints.
 
-        The gain of every law is estimated first; then the best laws of each joint are fitted, in a
-        first fit the best of every joint, in the next fit the second best, and so on. Each fit
-        starts from the parameters of the model, or from those that the estimate changed together
-        with the law, whichever simulate the joint better.
+        1. Estimate the gain of every law at every joint.
+        2. Fit the best laws of each joint: in a first fit the best of every joint, in the next fit
+           the second best, and so on. Each fit starts from the parameters of the model, or from
+           those that the estimate changed together with the law, whichever simulate the joint
+           better.
+        3. Give each joint the law with the lowest cost that helps, and fit all joints.
 
         Args:
             model: the fitted model.
@@ -509,6 +534,7 @@ class _ServoFitter:
             The fitted larger model; the given one if no law reduces a residual enough.
         """
         trials = self._estimate_gains(model, joints) if joints else {}
+        # For each joint, the fitted model with the best further law.
         best = dict[int, ServoModel]()
         for rank in range(MAX_FITTED_LAWS):
             chosen = {
@@ -552,6 +578,7 @@ class _ServoFitter:
             The model in which those joints have these laws that are simulated better with them.
         """
         best_joint = int(np.argmin(model.costs / joint_model.costs))
+        # The joint model with the laws of the best joint, and the joints to which this adds laws.
         theta, laws, joints = joint_model.theta.copy(), list(joint_model.laws), list[int]()
         for joint, available in enumerate(self._laws_at_joint):
             for name in model.laws[best_joint]:
@@ -570,7 +597,7 @@ class _ServoFitter:
         for joint in joints:
             best_joint_indices = self._list_parameters(best_joint, ())
             corrected[self._list_parameters(joint, ())] = model.theta[best_joint_indices]
-        coefficients = [
+        coefficient_indices = [
             i
             for joint in joints
             for i in self._list_parameters(joint, laws[joint])
@@ -580,7 +607,7 @@ class _ServoFitter:
         for start in (theta, corrected):
             for factor in SHARED_FACTORS:
                 scaled = start.copy()
-                scaled[coefficients] *= factor
+                scaled[coefficient_indices] *= factor
                 starts.append(self.simulate(scaled, laws))
         nearest_starts = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
         shared = self.fit(self._join(starts[0], nearest_starts | others), SHARED_ITERATIONS, joints)
@@ -590,7 +617,11 @@ class _ServoFitter:
         return self.fit(self._join(model, dict.fromkeys(better, shared)), TRIAL_ITERATIONS)
 
     def _is_better(self, model: ServoModel, other: ServoModel, joint: int) -> bool:
-        """Return whether a model is better at a joint; each law that it has more must gain."""
+        """Return whether a model is better at a joint than another one.
+
+        For each law that it has in addition, its squared residual must be lower by the share
+        `MIN_GAIN`.
+        """
         added = max(len(model.laws[joint]) - len(other.laws[joint]), 0)
         return bool(model.costs[joint] < (1.0 - MIN_GAIN) ** added * other.costs[joint])
 
@@ -620,8 +651,9 @@ class _ServoFitter:
         """Simulate every law at joints, and return the best trials of each joint, best first.
 
         Each law is simulated with a few coefficients of either sign. Its gain, together with a
-        change of the joint's present parameters, is estimated by linear least squares. Laws that
-        gain far less than the best one of the joint are left out.
+        change of the joint's present parameters, is estimated by linear least squares. The best
+        coefficient of each law is kept. At most `MAX_FITTED_LAWS` laws of a joint are returned;
+        those that gain far less than its best one are left out.
 
         Args:
             model: the fitted model.
@@ -629,6 +661,7 @@ class _ServoFitter:
         """
         blocks = self._compute_jacobians(model, sorted(joints))
         residual = self._compute_residual(model.simulated)
+        # The best trial of each effect, by joint.
         trials: dict[int, dict[str, _Trial]] = {joint: {} for joint in joints}
         for law in sorted(set().union(*self._laws_at_joint)):
             names = {
@@ -660,15 +693,16 @@ class _ServoFitter:
         blocks: Mapping[int, Array],
         residual: Array,
     ) -> Iterator[tuple[_Trial, int]]:
-        """Simulate a law at several joints at once, and yield its estimated gain at each.
+        """Simulate a law at several joints at once, and yield trial and joint for each.
 
-        The joints do not influence each other much, so one simulation is enough. Trials with a
-        small gain are not yielded.
+        The joints do not influence each other much, so one simulation is enough. Trials whose
+        estimated gain is small are not yielded.
 
         Args:
             model: the fitted model.
             names: the law's effect at each joint.
-            share: coefficients as a share of their usual range; negative for the lower end.
+            share: coefficients as a share of the upper end of their range; negative for a share of
+                the lower end, if that is negative.
             blocks: block of the Jacobian of each joint.
             residual: (R, T, n) residual of the model in units of the noise; n joints.
         """
@@ -685,18 +719,19 @@ class _ServoFitter:
         if not coefficients:
             return
         displaced = self.simulate(theta, model.laws)
-        for joint, c in coefficients.items():
+        for joint, joint_coefficients in coefficients.items():
             change = self._compute_change(displaced, model, joint)
             block, joint_residual = blocks[joint], residual[:, :, joint].ravel()
             gain = _estimate_gain(block, change, joint_residual)
             if gain > MIN_ESTIMATED_GAIN:
                 parameters = self._step_parameters(model, joint, block, joint_residual - change)
-                yield _Trial(gain, names[joint], c, parameters), joint
+                yield _Trial(gain, names[joint], joint_coefficients, parameters), joint
 
     def compute_gains(self, model: ServoModel) -> dict[str, float]:
         """Return the loss in twice the log-likelihood without each effect, by the Wald statistic.
 
-        The residual of each joint is taken as white noise, whose variance is its mean square.
+        The residual of each joint is taken as white noise, whose variance is its mean square; its
+        Fisher information is J'J over this variance, with the joint's block J of the Jacobian.
         Effects that gain less than their penalty are left out.
 
         Args:
@@ -716,12 +751,13 @@ class _ServoFitter:
 def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
     """Return the step (k,) of damped (Levenberg-Marquardt) least squares.
 
-    A small part of the largest diagonal is added, too, for columns without any influence.
+    It solves (J'J + λ diag(J'J) + small ridge) x = J'r. The ridge, a small share of the largest
+    diagonal element, is needed for columns without any influence.
 
     Args:
-        block: (m, k) derivatives of the samples.
-        residual: (m,) residual.
-        damping: damping λ as a share of the diagonal of the normal equations.
+        block: J (m, k), derivatives of m samples by k parameters.
+        residual: r (m,).
+        damping: λ.
     """
     normal = block.T @ block
     diagonal = np.diag(normal)
@@ -731,10 +767,11 @@ def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
 
 
 def _estimate_gain(block: Array, change: Array, residual: Array) -> float:
-    """Estimate the gain of a law together with the parameters that are already in the model.
+    """Estimate by how much a law reduces a residual, together with the parameters in the model.
 
-    What these parameters can explain is projected out of the change and of the residual (by a QR
-    decomposition). The rest of the change is then scaled to reduce the rest of the residual.
+    What the parameters can explain is projected out of the change by the law and out of the
+    residual (QR decomposition). The rest of the change is then scaled to reduce the rest of the
+    residual.
 
     Args:
         block: (m, k) derivatives of the samples by these parameters.

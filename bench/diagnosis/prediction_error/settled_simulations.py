@@ -153,7 +153,7 @@ class SettledSimulations:
         """
         bases = self.fitter.factors.q
         runs, samples, channels, count = values.shape
-        # The last of the n rows belong to the prior of first states, which are not changed here.
+        # The rows after the readings are those of the prior of first states, and stay zero.
         rows = np.zeros((runs, bases.shape[1], count))
         rows[:, : samples * channels] = values.reshape(runs, -1, count)
         projected: Array = rows - bases @ (bases.transpose(0, 2, 1) @ rows)
