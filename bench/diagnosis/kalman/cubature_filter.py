@@ -261,7 +261,7 @@ def filter_hypotheses(
     simulator = evaluator.simulator
     assert isinstance(simulator, RobotSimulator)
     points = count_cubature_points(len(simulator.addresses.positions))
-    width = max(LINEARISATION_BATCH_SIZE // points, 1)
+    batch_size = max(LINEARISATION_BATCH_SIZE // points, 1)
     active_effects = simulator.get_active_effects(np.array([one.theta for one in hypotheses]))
     # Indices of the hypotheses that may share a batch, by added elements and sample times.
     groups: dict[tuple[int, bytes], list[int]] = {}
@@ -273,8 +273,8 @@ def filter_hypotheses(
             groups.setdefault((added_elements, times.tobytes()), []).append(index)
     results: dict[int, SmoothedStart] = {}
     for group in groups.values():
-        for first in range(0, len(group), width):
-            part = group[first : first + width]
+        for first in range(0, len(group), batch_size):
+            part = group[first : first + batch_size]
             batch_results = _CubatureFilters(
                 evaluator, sigma, [hypotheses[i] for i in part]
             ).smooth()

@@ -144,6 +144,7 @@ class LinearRuns:
             parts = [getattr(run_maps, name) for run_maps in maps]
             length = samples if name == "readings" else samples - 1
             values = np.zeros((runs, length, *parts[0].shape[1:]))
+            # After the end of a run, the state stays as it is.
             if name == "states":
                 values[:] = np.eye(prior.size)
             for run, part in enumerate(parts):
@@ -229,7 +230,7 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     white_variances = white_variances.copy()
     white_variances[coloured_channels] *= AR_FLOOR
     (run_count, samples, channels), size = runs.residuals.shape, runs.prior.size
-    noise_count = coloured_channels.size
+    force_count, noise_count = runs.forces.shape[3], coloured_channels.size
     transitions = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
     transitions[:, :, :size, :size] = runs.states
     noise_states = size + np.arange(noise_count)
@@ -238,14 +239,12 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     defects = np.concatenate([runs.defects, zeros], axis=2)
     jumps = np.concatenate([runs.jumps, zeros], axis=2)
     # The innovations of the noise act like forces of known variance.
-    forces = np.zeros(
-        (run_count, samples - 1, size + noise_count, runs.forces.shape[3] + noise_count)
-    )
-    forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
+    forces = np.zeros((run_count, samples - 1, size + noise_count, force_count + noise_count))
+    forces[:, :, :size, :force_count] = runs.forces
     innovation_sigmas = noise.sigma[coloured_channels] * np.sqrt(
         1.0 - np.square(noise.phi[coloured_channels])
     )
-    forces[:, :, noise_states, runs.forces.shape[3] + np.arange(noise_count)] = innovation_sigmas
+    forces[:, :, noise_states, force_count + np.arange(noise_count)] = innovation_sigmas
     # A reading contains the noise state of its channel.
     readings = np.concatenate(
         [runs.readings, np.zeros((run_count, samples, channels, noise_count))], axis=3

@@ -263,7 +263,7 @@ class FollowedRuns:
         # false.
         with np.errstate(all="ignore"):
             maps = [run_model.interval_maps() for run_model in linear]
-            # An effect may have its own states.
+            # The state has internal states of effects after positions and velocities.
             prior = _compute_prior_deviations(evaluator, linear, maps[0].states.shape[1])
             runs = LinearRuns.stacked(maps, evaluator.observed, prior)
             fitted = _fit_noise(runs, noise, force, typical)
@@ -666,13 +666,14 @@ def linearise_run(
             there is none.
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives of steps are taken from the neighbour.
-        reuses_loads: whether loads at the joints are taken from the neighbour.
+        reuses_loads: whether the forces that transmissions carry are taken from the neighbour.
         first_state: first state from which a robot on the ground is simulated; None for that of
             the readings.
     """
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
     guess = evaluator.initial_state_guesses[run]
+    # Positions and velocities from which unmeasured joints are simulated.
     start = guess[:half], guess[half:]
     robot = simulator or evaluator.simulator
     assert isinstance(robot, RobotSimulator)
@@ -683,8 +684,15 @@ def linearise_run(
     elif trajectory is None:
         measured = estimate_measured_states(evaluator, noise.sigma, run)
     return MeasuredLinear(
-        *(robot, theta, scenario, start, trajectory, measured, neighbour),
-        *(reuses_jacobians and not is_simulated, reuses_loads),
+        robot,
+        theta,
+        scenario,
+        start,
+        trajectory,
+        measured,
+        neighbour,
+        reuses_jacobians=reuses_jacobians and not is_simulated,
+        reuses_loads=reuses_loads,
     )
 
 

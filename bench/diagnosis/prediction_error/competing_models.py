@@ -223,21 +223,21 @@ def _find_competing_effects(
         name: name of the effect to replace.
     """
     evaluator = context.evaluator
-    regression, columns = context.columns.regression(model)
-    remaining = regression.make_regression_without(columns[name])
-    # Effects with more coefficients gain more under the null hypothesis.
+    regression, own_columns = context.columns.regression(model)
+    remaining = regression.make_regression_without(own_columns[name])
+    # Minus the penalties, since effects with more coefficients gain more by chance.
     gains = remaining.compute_net_gains()
-    own_gain = remaining.compute_gain(columns[name]) - context.filters.penalty(name)
+    own_gain = remaining.compute_gain(own_columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
     # In descending order of the gain, so the first group of an effect is its best shape.
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
         effect, loss = group.effect, own_gain - float(gains[i])
+        # Forces of any shape are candidates too, but no effects of the library.
         if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
             continue
         is_near = loss <= compute_comparison_margin(own_gain) and near_count < MAX_COMPETING_EFFECTS
-        # Regression is inaccurate for a large effect, so effects at the same joint are tried.
         is_promising = effect in same_joint and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:

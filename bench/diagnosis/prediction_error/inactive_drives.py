@@ -150,15 +150,15 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
     notes = list(recording.notes)
     runs = recording.runs
     omitted_masks = [np.zeros(run.times.size, dtype=bool) for run in runs]
-    unexplained: list[InactiveDrive] = []
+    drives_without_column: list[InactiveDrive] = []
     for drive in drives:
         switches = [] if drive.is_held else _find_switches(recording, drive)
         if not switches:
-            unexplained.append(drive)
+            drives_without_column.append(drive)
             for omitted_mask, inactive_mask in zip(omitted_masks, drive.masks, strict=True):
                 omitted_mask |= _widen_mask(inactive_mask)
             continue
-        # A column shows when this drive is off.
+        # A column shows when this drive is off; `texts` say in which samples of which runs.
         runs, texts = apply_drive_switches(recording.path, runs, switches)
         switch_lines = " and ".join(switch.line for switch in switches)
         description = recording.path.with_suffix(".toml").name
@@ -172,8 +172,8 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
         for run, omitted_mask in zip(runs, omitted_masks, strict=True)
         for part in split_without_masked(run, omitted_mask)
     ]
-    if unexplained and any(not run.held_out for run in remaining_runs):
-        notes += [_format_message(recording, unexplained, omitted_masks)]
+    if drives_without_column and any(not run.held_out for run in remaining_runs):
+        notes += [_format_message(recording, drives_without_column, omitted_masks)]
         runs = tuple(remaining_runs)
     return replace(recording, runs=tuple(runs), notes=tuple(notes))
 

@@ -186,10 +186,11 @@ class Regression:
                 valid for all runs only.
         """
         columns = list_columns(chosen)
-        positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
+        is_constrained = np.array([p for group in chosen for p in group.positive], dtype=bool)
         fitted_runs = [r for r in range(len(self.products.totals)) if r != left_out]
         gram = self.products.select(columns)[fitted_runs].sum(axis=0)
         cross = self.products.crosses[fitted_runs].sum(axis=0)[columns]
+        # Coefficients that are not fixed at zero.
         active = np.ones(columns.size, dtype=bool)
         solution = np.zeros(columns.size)
         while active.any():
@@ -197,7 +198,7 @@ class Regression:
             scaled_solution = np.linalg.solve(normal, cross[active] / scale)
             solution[:] = 0.0
             solution[active] = scaled_solution / scale
-            negative = np.flatnonzero(active & positive & (solution < 0))
+            negative = np.flatnonzero(active & is_constrained & (solution < 0))
             if not negative.size:
                 break
             sizes = solution[negative] * np.sqrt(np.diagonal(gram)[negative])
@@ -206,11 +207,8 @@ class Regression:
         explained_squares = float(solution @ cross)
         # rss = e'e - c'h, eq. (1), also holds for coefficients c some of which are fixed at zero.
         rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
-        parts, begin = [], 0
-        for group in chosen:
-            parts.append(solution[begin : begin + len(group.column_indices)].copy())
-            begin += len(group.column_indices)
-        return LeastSquaresFit(rss, parts)
+        ends = np.cumsum([len(group.column_indices) for group in chosen])
+        return LeastSquaresFit(rss, np.split(solution, ends[:-1]))
 
     def compute_log_ratio(self, before: float, after: float) -> float:
         """Return twice the gain in log-likelihood, N log(before / after).
@@ -503,8 +501,8 @@ def score_by_regression(
         if group.effect in names:
             by_effect.setdefault(group.effect, []).append(i)
     # An effect has one group of columns for each of its shapes.
-    names = list(by_effect)
-    score = np.array([max(gains[i] for i in by_effect[name]) for name in names])
+    scored_names = list(by_effect)
+    score = np.array([max(gains[i] for i in indices) for indices in by_effect.values()])
     null_quantiles, null_draws, p_values, peaks = [], [], [], []
     for group_indices, largest_gain in zip(by_effect.values(), score.tolist(), strict=True):
         degrees_of_freedom = max(len(regression.groups[i].column_indices) for i in group_indices)
@@ -523,10 +521,12 @@ def score_by_regression(
         peaks.append(((peak, peak_coefficients),))
     order = np.argsort(-score, kind="stable")
     quantiles = np.array(null_quantiles)
-    null_excesses = np.array(null_draws).reshape(len(names), NULL_DRAWS) - quantiles[:, None]
-    p_value = min(len(names) * min(p_values, default=1.0), 1.0)
+    null_excesses = np.array(null_draws).reshape(-1, NULL_DRAWS) - quantiles[:, None]
+    p_value = min(len(scored_names) * min(p_values, default=1.0), 1.0)
+    # Innovations are white: their autocorrelation phi is zero, and scores for white noise are the
+    # scores themselves.
     return CandidateScores(
-        effects=tuple(names[i] for i in order),
+        effects=tuple(scored_names[i] for i in order),
         score=score[order],
         null_quantiles=quantiles[order],
         peaks=tuple(peaks[i] for i in order),

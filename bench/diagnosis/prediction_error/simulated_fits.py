@@ -97,7 +97,7 @@ def fit_by_simulation(
     is_incomplete = is_incomplete or not context.filters.act_where_forces_are_missing(start.effects)
     if is_incomplete and not is_nearly_explained(context, fitted):
         return fitted
-    # A fit takes the derivatives by first states from the evaluator.
+    # Replace the derivatives by first states in the evaluator, where fits find them.
     derivatives_before = evaluator.state_derivatives
     compute_state_jacobian(
         evaluator, fitted.fit.theta, fitted.fit.initial_states, is_recomputed=True

@@ -98,6 +98,7 @@ def _drop_families(context: SearchContext, rated_starts: Sequence[RatedStart]) -
     remaining = []
     for rated in rated_starts:
         (name,) = rated.start.effects
+        # An effect at a single place has no other members, and remains.
         members = [member.name for member in members_of(effects[name]) if member.name != name]
         limit = (1.0 + MIN_FAMILY_SQUARES_SHARE) * rated.cost
         if not any(costs.get((member,), np.inf) < limit for member in members):
