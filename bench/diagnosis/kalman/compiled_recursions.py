@@ -28,8 +28,8 @@ def multiply_sparse(a: Array, b: Array, out: Array) -> None:
 def propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
     """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
 
-    `half` receives the product a p. Only one triangle is computed; the other one is copied. Zeros
-    of a are skipped, because most entries of a transition matrix are zero.
+    `half` receives the product a p. Only the upper triangle is computed; the lower one is copied.
+    Zeros of a are skipped, because most entries of a transition matrix are zero.
     """
     multiply_sparse(a, p, half)
     size = a.shape[0]

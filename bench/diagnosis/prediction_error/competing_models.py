@@ -225,7 +225,7 @@ def _find_competing_effects(
     evaluator = context.evaluator
     regression, own_columns = context.columns.regression(model)
     remaining = regression.make_regression_without(own_columns[name])
-    # Minus the penalties, since effects with more coefficients gain more by chance.
+    # Minus the penalties: effects with more coefficients gain more under the null hypothesis.
     gains = remaining.compute_net_gains()
     own_gain = remaining.compute_gain(own_columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)

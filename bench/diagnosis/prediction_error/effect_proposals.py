@@ -319,8 +319,8 @@ class EffectProposals:
         servo_change, servo_gain = self._compute_first_change(followed, name)
         if servo_gain < gain + self.filters.penalty(name):
             return change, gain
-        # The third bias parameter of MuJoCo's servo is minus its damping; the coefficient of the effect
-        # is a relative change of it.
+        # The third bias parameter of MuJoCo's servo is minus its damping; the coefficient of the
+        # effect is a relative change of it.
         actuator = robot.actuator(servo).id
         gear = float(robot.compiled.actuator_gear[actuator, 0])
         damping = -float(robot.compiled.actuator_biasprm[actuator, 2])

@@ -298,7 +298,13 @@ def _add_next_effect(
 
 
 def _list_single_effects(context: SearchContext) -> Columns:
-    """Return inputs of the laws that may be added: one place, few coefficients and few shapes."""
+    """Return the columns of the effects that may be added: at one place, with few coefficients.
+
+    Candidates of the library are effects with few shapes; their families (``@*``) are left out.
+
+    Args:
+        context: search, filters and regressions of the recording.
+    """
     library = context.columns.library
     chosen = [
         i

@@ -593,7 +593,7 @@ class PredictionErrorSearch(EffectSearch):
         return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
-        """Return the first-order changes of the base model's runs by every candidate.
+        """Return the fit of the base model, and first-order changes of its runs by every candidate.
 
         They are linearised about the measured motion.
         """

@@ -158,6 +158,7 @@ class Regression:
         That column is the response to the integrator's step errors. Its coefficient must be nearer
         to one (the full error) than to zero, and it must improve the fit.
         """
+        # The other columns of `always` are in both fits.
         others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
         rss_with, coefficients = self._fit_groups([*chosen, self._nuisance])
         rss_without = self._fit_groups([*chosen, others]).rss
