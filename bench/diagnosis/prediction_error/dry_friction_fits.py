@@ -132,7 +132,8 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     columns, evaluator = context.columns, context.evaluator
     regression = columns.base_regression
     gains, groups = regression.gains([]), regression.groups
-    friction_groups = [
+    # Indices of groups, in descending order of the gain.
+    friction_indices = [
         i
         for i in np.argsort(-gains, kind="stable").tolist()
         if gains[i] > MIN_GAIN_SHARE * gains.max()
@@ -140,9 +141,9 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
         and not groups[i].effect.endswith("@*")
         and groups[i].effect in evaluator.library
     ]
-    if not friction_groups:
+    if not friction_indices:
         return None
-    best_group = groups[friction_groups[0]]
+    best_group = groups[friction_indices[0]]
     (solution,) = regression.solve([best_group]).coefficients
     (coefficient,) = columns.coefficients(best_group, solution)
     return context.filters.find_soft_friction(

@@ -113,7 +113,10 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     2. Fit the sets that are nearly as likely as the best one by simulation, until one explains the
        runs. Sets that do not act at all joints where forces are missing are skipped.
     3. If none explains the runs, fit all servos together (without dry friction only).
-    4. If that does not help either, extend the likeliest set by further effects, and fit it.
+    4. If that does not help either, extend the likeliest set by further effects, and fit it: two
+       effects together may explain what neither explains alone.
+
+    If no effect gains enough in step 1, dry friction is fitted alone.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -138,17 +141,17 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         check_filter(context, current.followed.log_likelihood)
         return base
     best = base if larger_sets else fit_filtered(context, current)
-    for trial in _select_nearly_as_likely(context, larger_sets):
-        if not filters.act_where_forces_are_missing(trial.names):
+    for larger_set in _select_nearly_as_likely(context, larger_sets):
+        if not filters.act_where_forces_are_missing(larger_set.names):
             continue
-        best = select_more_likely(best, fit_filtered(context, trial))
+        best = select_more_likely(best, fit_filtered(context, larger_set))
         if is_explained(context, best) or search_control.is_over():
             break
-    # All servos together.
+    # Step 3. Without dry friction, there is a larger set: otherwise the base model was returned.
     if friction is None and not is_explained(context, best) and not search_control.is_over():
         check_filter(context, larger_sets[0].followed.log_likelihood)
         best = select_more_likely(best, _fit_all_servos(context, larger_sets[0]))
-    # Two effects together may explain what neither explains alone.
+    # Step 4.
     if larger_sets and not is_explained(context, best) and not search_control.is_over():
         best = select_more_likely(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
